@@ -1,0 +1,29 @@
+"""The exception tree of the whole project: bad input raises one of these, expected failures are results."""
+
+
+class MapweaveError(Exception):
+    """Anything a user can mend. Caught once, in the command line, and printed as one line."""
+
+
+class InvalidValue(MapweaveError):
+    """A value is out of range, not finite, or of the wrong shape."""
+
+
+class InvalidMessage(MapweaveError):
+    """A message from outside does not decode or does not validate."""
+
+
+class InvalidFile(MapweaveError):
+    """A file is truncated, altered, or of another kind."""
+
+
+class SettingsError(MapweaveError):
+    """A setting is unknown or has a value that cannot work."""
+
+
+class DeviceError(MapweaveError):
+    """A robot, camera or recording cannot be read or commanded."""
+
+
+class NotConnected(MapweaveError):
+    """No router, or nobody answers."""

@@ -1,0 +1,200 @@
+"""Nodes and edges: the elements of a hybrid map."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.errors import InvalidValue
+from hybridmap.pose import Array, PoseGaussian
+
+CODE_BYTES = 16
+"""Bytes of one compact descriptor: 32 dimensions of 4 bits, see hybridmap.descriptor."""
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+"""What an agent, server or fleet may be called: it becomes a chunk of a key expression."""
+
+
+def check_name(name: str) -> str:
+    """Return the name, or raise InvalidValue if it cannot stand in a key."""
+    if not NAME.fullmatch(name):
+        raise InvalidValue(f"name {name!r}: use 1 to 32 of a-z, 0-9, '-' and '_'")
+    return name
+
+
+class MapId(NamedTuple):
+    """Whose map, and which: a fresh epoch starts when a robot starts a map from nothing."""
+
+    agent: str
+    epoch: int
+
+    def __str__(self) -> str:
+        """For example `r0.1`."""
+        return f"{self.agent}.{self.epoch}"
+
+
+class NodeId(NamedTuple):
+    """(agent, epoch, number), never reused. Edges have ids of the same form from the same counter."""
+
+    agent: str
+    epoch: int
+    number: int
+
+    @property
+    def map(self) -> MapId:
+        """The map that the element belongs to."""
+        return MapId(self.agent, self.epoch)
+
+    def __str__(self) -> str:
+        """For example `r0.1.17`."""
+        return f"{self.agent}.{self.epoch}.{self.number}"
+
+    @staticmethod
+    def parse(text: str) -> NodeId:
+        """Read `agent.epoch.number`.
+
+        Raises:
+            InvalidValue: the text is of another form.
+        """
+        parts = text.split(".")
+        if len(parts) != 3 or not parts[1].isdigit() or not parts[2].isdigit():
+            raise InvalidValue(f"{text!r} is no node id; they look like r0.1.17")
+        return NodeId(check_name(parts[0]), int(parts[1]), int(parts[2]))
+
+
+EdgeId = NodeId
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """What a node sees: N landmarks in columns.
+
+    Attributes:
+        pixels: (N, 2) float32, undistorted px in the node's image.
+        codes: (N, 16) uint8, compact SIFT descriptors.
+        depths: (N,) float32, m along the optical axis from the node's optical centre; NaN where the
+            depth is not known (a landmark that only gives a bearing).
+        depth_sigmas: (N,) float32, standard deviation of the depth, m; NaN with the depth.
+    """
+
+    pixels: NDArray[np.float32]
+    codes: NDArray[np.uint8]
+    depths: NDArray[np.float32]
+    depth_sigmas: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        """Check shapes.
+
+        Raises:
+            InvalidValue: shapes that do not belong together.
+        """
+        n = len(self.pixels)
+        shapes = (self.pixels.shape, self.codes.shape, self.depths.shape, self.depth_sigmas.shape)
+        if shapes != ((n, 2), (n, CODE_BYTES), (n,), (n,)):
+            raise InvalidValue(f"landmarks: shapes {shapes} do not belong together")
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.pixels)
+
+    @property
+    def has_depth(self) -> NDArray[np.bool_]:
+        """(N,) which landmarks have a 3D position."""
+        return np.isfinite(self.depths)
+
+    def points_in_robot(self, camera: Camera) -> Array:
+        """(N, 3) m, in the node's robot frame; NaN where there is no depth."""
+        return camera.back_project(self.pixels, self.depths)
+
+    def covariances_in_robot(self, camera: Camera, pixel_sigma: float = 0.7) -> Array:
+        """(N, 3, 3) m^2, in the node's robot frame, from the depth's and the pixel's uncertainty."""
+        x = (self.pixels[:, 0].astype(np.float64) - camera.cx) / camera.fx
+        y = (self.pixels[:, 1].astype(np.float64) - camera.cy) / camera.fy
+        depth = self.depths.astype(np.float64)
+        ray = np.stack([np.ones_like(x), -x, -y], axis=-1)
+        covariances: Array = np.einsum("ni,nj,n->nij", ray, ray, self.depth_sigmas.astype(np.float64) ** 2)
+        covariances[:, 1, 1] += (pixel_sigma * depth / camera.fx) ** 2
+        covariances[:, 2, 2] += (pixel_sigma * depth / camera.fy) ** 2
+        return covariances
+
+    def take(self, index: NDArray[Any]) -> Landmarks:
+        """The landmarks that an index or a mask selects."""
+        return Landmarks(self.pixels[index], self.codes[index], self.depths[index], self.depth_sigmas[index])
+
+    @staticmethod
+    def empty() -> Landmarks:
+        """No landmarks at all."""
+        return Landmarks(
+            np.zeros((0, 2), np.float32),
+            np.zeros((0, CODE_BYTES), np.uint8),
+            np.zeros(0, np.float32),
+            np.zeros(0, np.float32),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """A place: the robot's posture when it took an image, and what it saw.
+
+    Attributes:
+        id: never reused.
+        stamp_ns: when the image was taken.
+        map_from_robot: posture in the agent's own map frame.
+        camera: intrinsics and mount of the camera that took the image.
+        landmarks: what is in the image.
+    """
+
+    id: NodeId
+    stamp_ns: int
+    map_from_robot: PoseGaussian
+    camera: Camera
+    landmarks: Landmarks
+
+    @property
+    def points_in_robot(self) -> Array:
+        """(N, 3) m, landmarks in the node's robot frame; NaN where there is no depth."""
+        return self.landmarks.points_in_robot(self.camera)
+
+
+class EdgeKind(StrEnum):
+    """How an edge was obtained."""
+
+    MAPPED = "mapped"
+    """The robot drove from one node to the other while mapping, with the landmarks in view."""
+    TURNED = "turned"
+    """The robot turned on the spot between the two images."""
+    DRIVEN = "driven"
+    """The edge was driven by visual servoing and measured again."""
+    LOOP = "loop"
+    """A place was recognised again, within one map."""
+    MERGED = "merged"
+    """A place of one map was recognised in another."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """The robot can servo between two nodes.
+
+    Attributes:
+        id: of the agent (or server) that says so.
+        a: one end.
+        b: the other end; for edges within a map the later node.
+        a_from_b: posture of b's robot frame in a's.
+        kind: how it was obtained.
+        shared: (K, 2) int, landmark indices in a and in b that are the same physical point.
+        evidence: numbers that support it, for example inliers; keys are short, values are floats.
+    """
+
+    id: EdgeId
+    a: NodeId
+    b: NodeId
+    a_from_b: PoseGaussian
+    kind: EdgeKind
+    shared: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    evidence: dict[str, float] = field(default_factory=dict)

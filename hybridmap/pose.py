@@ -1,0 +1,133 @@
+"""Planar postures, SE(2), and Gaussian postures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import InvalidValue
+
+Array = NDArray[np.float64]
+
+
+def wrap_angle(angle: float) -> float:
+    """Return the angle in [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Pose2:
+    """A posture in the plane: where frame b stands in frame a. Name it `a_from_b`.
+
+    Attributes:
+        x: m, in a.
+        y: m, in a.
+        heading: rad, counter-clockwise from a's x axis to b's, not necessarily wrapped.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    heading: float = 0.0
+
+    def __matmul__(self, other: Pose2) -> Pose2:
+        """Return `a_from_c = a_from_b @ b_from_c`, heading wrapped."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return Pose2(
+            self.x + c * other.x - s * other.y,
+            self.y + s * other.x + c * other.y,
+            wrap_angle(self.heading + other.heading),
+        )
+
+    def inverse(self) -> Pose2:
+        """Return `b_from_a`."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return Pose2(-c * self.x - s * self.y, s * self.x - c * self.y, wrap_angle(-self.heading))
+
+    def apply(self, points: NDArray[Any]) -> Array:
+        """Map points of frame b into frame a.
+
+        Args:
+            points: (..., 2) or (..., 3) m, in b; a third coordinate is height and stays.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        out = points.copy()
+        out[..., 0] = self.x + c * points[..., 0] - s * points[..., 1]
+        out[..., 1] = self.y + s * points[..., 0] + c * points[..., 1]
+        return out
+
+    @property
+    def vector(self) -> Array:
+        """(3,) [x m, y m, heading rad]."""
+        return np.array([self.x, self.y, self.heading])
+
+    @property
+    def rotation(self) -> Array:
+        """(2, 2) rotation that turns vectors of b into a."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return np.array([[c, -s], [s, c]])
+
+    @property
+    def adjoint(self) -> Array:
+        """(3, 3) Ad with `pose @ delta == (Ad delta) @ pose` to first order, order (x, y, heading)."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return np.array([[c, -s, self.y], [s, c, -self.x], [0.0, 0.0, 1.0]])
+
+    def distance(self, other: Pose2) -> float:
+        """Euclidean distance of the two positions, m."""
+        return math.hypot(self.x - other.x, self.y - other.y)
+
+    @staticmethod
+    def from_vector(vector: NDArray[Any]) -> Pose2:
+        """Build from (3,) [x m, y m, heading rad]."""
+        return Pose2(float(vector[0]), float(vector[1]), float(vector[2]))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGaussian:
+    """A posture with uncertainty, perturbed on the right.
+
+    The true posture is `mean @ Pose2(d)` with d ~ N(0, covariance): the covariance is in the moving
+    frame b of `a_from_b`, order (x m, y m, heading rad). This is also GTSAM's convention.
+    """
+
+    mean: Pose2
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        """Refuse what is no covariance.
+
+        Raises:
+            InvalidValue: wrong shape, not finite, not symmetric or not positive semi-definite.
+        """
+        p = np.asarray(self.covariance, dtype=np.float64)
+        if p.shape != (3, 3) or not np.isfinite(p).all() or not np.isfinite(self.mean.vector).all():
+            raise InvalidValue("a posture needs finite numbers and a (3, 3) covariance")
+        scale = max(float(np.abs(p).max()), 1e-12)
+        if np.abs(p - p.T).max() > 1e-6 * scale or np.linalg.eigvalsh(p)[0] < -1e-6 * scale:
+            raise InvalidValue("a posture's covariance must be symmetric and positive semi-definite")
+        object.__setattr__(self, "covariance", 0.5 * (p + p.T))
+
+    def __matmul__(self, other: PoseGaussian) -> PoseGaussian:
+        """Compose two independent Gaussian postures to first order."""
+        ad = other.mean.inverse().adjoint
+        return PoseGaussian(self.mean @ other.mean, ad @ self.covariance @ ad.T + other.covariance)
+
+    def inverse(self) -> PoseGaussian:
+        """Return the Gaussian of the inverse posture to first order."""
+        ad = self.mean.adjoint
+        return PoseGaussian(self.mean.inverse(), ad @ self.covariance @ ad.T)
+
+    def mahalanobis2(self, other: Pose2) -> float:
+        """Squared Mahalanobis distance of a posture from the mean, 3 degrees of freedom."""
+        d = (self.mean.inverse() @ other).vector
+        return float(d @ np.linalg.solve(self.covariance + 1e-12 * np.eye(3), d))
+
+    @staticmethod
+    def from_sigmas(mean: Pose2, sigma_xy: float, sigma_heading: float) -> PoseGaussian:
+        """Build with independent standard deviations, m and rad."""
+        return PoseGaussian(mean, np.diag([sigma_xy**2, sigma_xy**2, sigma_heading**2]))

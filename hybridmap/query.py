@@ -1,0 +1,93 @@
+"""Questions that a robot asks about the fleet's map, and their answers: plain values, no transport."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.node import EdgeKind, Node, NodeId
+from hybridmap.pose import PoseGaussian
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The features of one image, in columns.
+
+    Attributes:
+        pixels: (N, 2) float32, undistorted px.
+        codes: (N, 16) uint8, compact SIFT descriptors.
+        camera: the camera that took it; may be another than the mapping robot's.
+    """
+
+    pixels: NDArray[np.float32]
+    codes: NDArray[np.uint8]
+    camera: Camera
+
+    def __len__(self) -> int:
+        """How many features."""
+        return len(self.pixels)
+
+
+class Certainty(StrEnum):
+    """What a relocalization says of itself."""
+
+    FOUND = "found"
+    AMBIGUOUS = "ambiguous"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, eq=False)
+class Whereabouts:
+    """One place where the robot may be.
+
+    Attributes:
+        node: the node that was recognised.
+        node_from_robot: the robot's posture in that node's robot frame.
+        merged_from_robot: the same in the merged frame of the node's component, if it has one.
+        component: number of the node's component in the merged map.
+        inliers: landmarks that agree.
+        probability: that this place is the right one, 0 to 1.
+    """
+
+    node: NodeId
+    node_from_robot: PoseGaussian
+    merged_from_robot: PoseGaussian | None
+    component: int
+    inliers: int
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class RelocalizeAnswer:
+    """Where a view was taken: candidates best first, and a reason in words whatever the outcome."""
+
+    certainty: Certainty
+    candidates: tuple[Whereabouts, ...]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class RouteLeg:
+    """One hop of a route: how to get from the node before to this node.
+
+    Attributes:
+        node: the node to reach, with its landmarks.
+        previous_from_node: its posture in the robot frame of the node before; identity for the first.
+        kind: of the edge that is driven; None for the first node, where the route starts.
+    """
+
+    node: Node
+    previous_from_node: PoseGaussian
+    kind: EdgeKind | None
+
+
+@dataclass(frozen=True, eq=False)
+class RouteAnswer:
+    """A way through the merged map. `legs[0]` is the node where the robot is; empty if there is no way."""
+
+    legs: tuple[RouteLeg, ...]
+    reason: str

@@ -1,0 +1,104 @@
+"""The Bus protocol: publish, subscribe, ask, serve, be alive. Implementations stand beside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A published message."""
+
+    key: str
+    payload: bytes
+    attachment: bytes = b""
+
+
+class Request(Protocol):
+    """A question that somebody asked. It is answered exactly once, at once or later, from any thread."""
+
+    @property
+    def key(self) -> str:
+        """The key that was asked."""
+        ...
+
+    @property
+    def payload(self) -> bytes:
+        """What was asked."""
+        ...
+
+    def reply(self, payload: bytes) -> None:
+        """Answer. A second answer is ignored."""
+        ...
+
+    def refuse(self, reason: str) -> None:
+        """Answer with an error that the asker can log."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """One answer to a question. Exactly one of the two is set.
+
+    Attributes:
+        payload: the answer.
+        error: why there is none.
+    """
+
+    payload: bytes = b""
+    error: str = ""
+
+
+class Closing(Protocol):
+    """Something declared on the bus that can be taken back."""
+
+    def close(self) -> None:
+        """Take it back. Twice is no error."""
+        ...
+
+
+class Bus(Protocol):
+    """A connection to the fleet.
+
+    Handlers run one after the other on the bus's own worker thread, never on the transport's threads:
+    a slow handler delays other handlers, not the transport. A handler may call any method of the bus but
+    `ask` and `close`.
+    """
+
+    def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
+        """Send best-effort; never blocks the caller, never raises for a missing connection."""
+        ...
+
+    def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
+        """Call the handler with each message whose key the pattern (`*`, `**`) matches."""
+        ...
+
+    def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
+        """Answer questions. A handler that raises MapweaveError refuses with its text."""
+        ...
+
+    def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+        """Ask everyone who serves the key; waits until all have answered or the time is over.
+
+        Returns:
+            The replies that came. An empty list means that nobody is there (no error tells why).
+        """
+        ...
+
+    def announce(self, key: str) -> Closing:
+        """Be alive under this key until closed or dead."""
+        ...
+
+    def watch(self, pattern: str, handler: Callable[[str, bool], None]) -> Closing:
+        """Call the handler with (key, alive) for those alive now and at each change."""
+        ...
+
+    def connected(self) -> bool:
+        """Whether messages can leave now. Always true on an in-memory bus."""
+        ...
+
+    def close(self) -> None:
+        """Take everything back and disconnect. Twice is no error."""
+        ...
