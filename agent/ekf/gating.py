@@ -1,0 +1,141 @@
+"""Which measurements to believe: chi-square gates and one-point RANSAC.
+
+All tests are made on innovations and their joint covariance S, so that they know what the filter knows: a
+shared error (the robot turned more than its wheels say) moves all landmarks together and is no outlier.
+Everything is computed for all landmarks at once and without chance: of the one-point hypotheses
+(Civera et al., "1-point RANSAC for EKF filtering", 2010) there are only as many as landmarks, so all are
+tried.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Array
+
+Mask = NDArray[np.bool_]
+
+
+def pixel_gate(probability: float) -> float:
+    """Threshold of a chi-square with two degrees of freedom that inliers stay under with a probability."""
+    return -2.0 * math.log1p(-probability)
+
+
+def chi_squares(innovations: Array, covariance: Array) -> Array:
+    """(N,) squared Mahalanobis distance of each innovation by itself.
+
+    Args:
+        innovations: (N, 2) measured minus expected.
+        covariance: (2N, 2N) S, joint, ordered as the innovations' rows.
+    """
+    return _quadratic(_blocks(covariance)[_diagonal(len(innovations))], innovations)
+
+
+def leave_one_out(innovations: Array, information: Array) -> Array:
+    """(N,) squared Mahalanobis distance of each innovation given all the others.
+
+    With Q the inverse of S, an innovation given all others has mean residual Q_ii^-1 (Q r)_i and covariance
+    Q_ii^-1, so that one inverse serves all N tests.
+
+    Args:
+        innovations: (N, 2) measured minus expected.
+        information: (2N, 2N) inverse of S.
+    """
+    pulled = (information @ innovations.ravel()).reshape(-1, 2)
+    return _quadratic(_blocks(information)[_diagonal(len(innovations))], pulled)
+
+
+def one_point_consensus(innovations: Array, covariance: Array, gate: float) -> Mask:
+    """The largest set of innovations that one of them explains.
+
+    For each landmark j in turn the state is corrected by j alone; the others agree with j if what remains of
+    their innovation lies in the gate of its remaining covariance. Unlike a fixed pixel threshold this needs
+    no second pass for landmarks of great uncertainty.
+
+    Args:
+        innovations: (N, 2) measured minus expected.
+        covariance: (2N, 2N) S.
+        gate: chi-square threshold.
+
+    Returns:
+        (N,) members of the best set, empty if no landmark lies within the gate by itself.
+    """
+    n = len(innovations)
+    blocks = _blocks(covariance)
+    own = blocks[_diagonal(n)]
+    plausible = _quadratic(own, innovations) <= gate
+    if not plausible.any():
+        return np.zeros(n, np.bool_)
+    gain = blocks @ _inverse(own)[None, :]
+    left = innovations[:, None] - (gain @ innovations[None, :, :, None])[..., 0]
+    left_covariance = own[:, None] - gain @ np.swapaxes(blocks, -1, -2)
+    # A landmark explains itself: its remaining covariance is zero, so its own test is the plain one.
+    left_covariance[_diagonal(n)] = own
+    left[_diagonal(n)] = innovations
+    distance = _quadratic(left_covariance, left)
+    agrees = distance <= gate
+    score = agrees.sum(axis=0) - np.minimum(distance, gate).mean(axis=0) / (2.0 * gate)
+    return np.asarray(agrees[:, int(np.argmax(np.where(plausible, score, -1.0)))], np.bool_)
+
+
+def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array]:
+    """Which innovations to accept.
+
+    If each agrees with all the others, all of them. Else the one-point consensus, from which the worst is
+    taken until each that is left agrees with all the others left.
+
+    Args:
+        innovations: (N, 2) measured minus expected, N > 0.
+        covariance: (2N, 2N) S.
+        gate: chi-square threshold.
+
+    Returns:
+        (N,) accepted; and the inverse of the accepted ones' joint covariance, (2K, 2K).
+    """
+    accepted: Mask = np.ones(len(innovations), np.bool_)
+    information = inverse(covariance)
+    if (leave_one_out(innovations, information) <= gate).all():
+        return accepted, information
+    accepted = one_point_consensus(innovations, covariance, gate)
+    while True:
+        chosen = np.flatnonzero(np.repeat(accepted, 2))
+        information = inverse(covariance[np.ix_(chosen, chosen)])
+        distances = leave_one_out(innovations[accepted], information)
+        if not len(distances) or distances.max() <= gate:
+            return accepted, information
+        accepted[np.flatnonzero(accepted)[int(np.argmax(distances))]] = False
+
+
+def inverse(covariance: Array) -> Array:
+    """Inverse of a positive definite matrix, symmetric to the last bit."""
+    out = np.linalg.inv(covariance)
+    return np.asarray(0.5 * (out + out.T), np.float64)
+
+
+def _blocks(matrix: Array) -> Array:
+    """(N, N, 2, 2) view of a (2N, 2N) matrix."""
+    n = len(matrix) // 2
+    return matrix.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
+
+
+def _diagonal(n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    index = np.arange(n)
+    return index, index
+
+
+def _inverse(matrices: Array) -> Array:
+    """Inverse of symmetric (..., 2, 2)."""
+    p, q, r = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
+    out = np.stack([np.stack([r, -q], axis=-1), np.stack([-q, p], axis=-1)], axis=-2)
+    return out / (p * r - q * q)[..., None, None]
+
+
+def _quadratic(matrices: Array, vectors: Array) -> Array:
+    """(...) v^T M^-1 v for symmetric (..., 2, 2) and (..., 2)."""
+    p, q, r = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
+    x, y = vectors[..., 0], vectors[..., 1]
+    out: Array = (r * x * x - 2.0 * q * x * y + p * y * y) / (p * r - q * q)
+    return out

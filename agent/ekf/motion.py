@@ -1,0 +1,123 @@
+"""Exact planar motion: of the posture, and of landmarks in the moving camera's inverse-depth coordinates.
+
+A landmark is (a, b, w) = (p1/p3, p2/p3, 1/p3) with p1 right, p2 down and p3 forward of the optical centre
+of the moving camera, m. One step of the wheels, u1 forward and u2 counter-clockwise, carries the optical
+centre by (tx forward, ty left) and turns it by u2:
+
+    tx = u1 cos(u2/2) + m (cos u2 - 1),   ty = u1 sin(u2/2) + m sin u2
+
+with m the way of the optical centre ahead of the axle. With p1' and p3' of paper-notes' exact form divided
+by p3 one gets, all in closed form and without a pole at w = 0 (a landmark at infinity),
+
+    D  = cos u2 (1 - tx w) - sin u2 (a + ty w)
+    a' = (sin u2 (1 - tx w) + cos u2 (a + ty w)) / D,   b' = b / D,   w' = w / D.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from agent.observation import Odometry
+from hybridmap.pose import Array
+
+
+@dataclass(frozen=True, slots=True)
+class WheelNoise:
+    """How uncertain the wheels' ways are.
+
+    Attributes:
+        axle: distance between the wheels L, m.
+        share: standard deviation of a wheel's way as a share of the way: sigma of the paper.
+        floor: standard deviation of a step that has no way at all, m: the encoders' resolution.
+    """
+
+    axle: float
+    share: float
+    floor: float = 1e-5
+
+    def root(self, odometry: Odometry) -> Array:
+        """(2, 2) root R of the covariance R R^T of (u1 m, u2 rad) of one step, one column a wheel."""
+        half = 0.5 * self.axle * odometry.turn
+        right = math.hypot(self.share * (odometry.forward + half), self.floor)
+        left = math.hypot(self.share * (odometry.forward - half), self.floor)
+        return np.array([[0.5 * right, 0.5 * left], [right / self.axle, -left / self.axle]])
+
+
+def move_posture(posture: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
+    """Move a posture by one step of the wheels.
+
+    Args:
+        posture: (3,) [x m, y m, heading rad] in any fixed frame.
+        odometry: the step.
+
+    Returns:
+        The posture after, (3,); its Jacobians by the posture before, (3, 3), and by (u1, u2), (3, 2).
+    """
+    u1, u2 = odometry.forward, odometry.turn
+    c, s = math.cos(posture[2] + 0.5 * u2), math.sin(posture[2] + 0.5 * u2)
+    after = posture + np.array([u1 * c, u1 * s, u2])
+    by_posture = np.array([[1.0, 0.0, -u1 * s], [0.0, 1.0, u1 * c], [0.0, 0.0, 1.0]])
+    by_input = np.array([[c, -0.5 * u1 * s], [s, 0.5 * u1 * c], [0.0, 1.0]])
+    return after, by_posture, by_input
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RayMotion:
+    """Landmarks after a step of the wheels.
+
+    Attributes:
+        rays: (N, 3) [a, b, w 1/m] in the camera after the step.
+        by_ray: (N, 3, 3) Jacobian by the landmark before.
+        by_input: (N, 3, 2) Jacobian by (u1, u2).
+        scale: (N,) D, depth after over depth before; not positive for landmarks now behind the camera,
+            whose other figures mean nothing.
+    """
+
+    rays: Array
+    by_ray: Array
+    by_input: Array
+    scale: Array
+
+
+def move_rays(rays: Array, odometry: Odometry, mount_forward: float) -> RayMotion:
+    """See landmarks from where the camera stands after one step of the wheels.
+
+    Args:
+        rays: (N, 3) [a, b, w 1/m] in the camera before the step.
+        odometry: the step.
+        mount_forward: of the optical centre ahead of the axle, m.
+    """
+    u1, u2 = odometry.forward, odometry.turn
+    c, s = math.cos(u2), math.sin(u2)
+    ch, sh = math.cos(0.5 * u2), math.sin(0.5 * u2)
+    tx, ty = u1 * ch + mount_forward * (c - 1.0), u1 * sh + mount_forward * s
+    tx_by = np.array([ch, -0.5 * u1 * sh - mount_forward * s])
+    ty_by = np.array([sh, 0.5 * u1 * ch + mount_forward * c])
+    a, w = rays[:, 0], rays[:, 2]
+    ahead, right = 1.0 - tx * w, a + ty * w
+    scale = c * ahead - s * right
+    after = rays.copy()
+    after[:, 0] = s * ahead + c * right
+    after /= np.where(np.abs(scale) > 1e-9, scale, 1e-9)[:, None]
+    # Each new coordinate is a quotient n / D, so its derivative is (dn - (n / D) dD) / D.
+    inverse = 1.0 / np.where(np.abs(scale) > 1e-9, scale, 1e-9)
+    scale_by_w = -c * tx - s * ty
+    by_ray = np.empty((len(rays), 3, 3))
+    by_ray[:, :, 0] = s * after
+    by_ray[:, :, 1] = 0.0
+    by_ray[:, :, 2] = -scale_by_w * after
+    by_ray[:, 0, 0] += c
+    by_ray[:, 0, 2] += c * ty - s * tx
+    by_ray[:, 1, 1] = 1.0
+    by_ray[:, 2, 2] += 1.0
+    by_ray *= inverse[:, None, None]
+    scale_by_input = -w[:, None] * (c * tx_by + s * ty_by)
+    scale_by_input[:, 1] -= s * ahead + c * right
+    by_input = -after[:, :, None] * scale_by_input[:, None, :]
+    by_input[:, 0, :] += w[:, None] * (c * ty_by - s * tx_by)
+    by_input[:, 0, 1] += scale
+    by_input *= inverse[:, None, None]
+    return RayMotion(after, by_ray, by_input, scale)
