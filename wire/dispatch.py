@@ -1,0 +1,136 @@
+"""One worker thread a bus, on which all of its handlers run, one after the other.
+
+Transports must never wait for a handler: Zenoh stalls a whole session when a callback falls behind. So a
+callback only puts a task into this queue. The queue is bounded, and nothing falls off its end silently: a
+message that finds it full is counted and logged (replication repairs it), a question is refused so that its
+asker knows, and news of who is alive always find room, because nobody would repeat them.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from hybridmap.errors import MapweaveError
+from wire.bus import Request, Sample
+
+log = logging.getLogger(__name__)
+
+DEFAULT_LIMIT = 16384
+"""Tasks that may wait: half a minute of a hundred robots at five messages a second."""
+
+
+class Dispatcher:
+    """Runs handlers in order on a thread of its own.
+
+    Attributes:
+        lost: messages that found the queue full.
+        refused: questions that found the queue full.
+    """
+
+    def __init__(self, name: str, limit: int = DEFAULT_LIMIT) -> None:
+        """Start the thread.
+
+        Args:
+            name: of the thread, for people who debug.
+            limit: tasks that may wait.
+        """
+        self.lost = 0
+        self.refused = 0
+        self._limit = limit
+        self._tasks: deque[Callable[[], None]] = deque()
+        self._wake = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def message(self, handler: Callable[[Sample], None], sample: Sample, wanted: Callable[[], bool]) -> None:
+        """Hand over a message, unless nobody wants it any more when its turn comes."""
+
+        def task() -> None:
+            if wanted():
+                _guarded(lambda: handler(sample), sample.key)
+
+        if not self._put(task, bounded=True):
+            self.lost += 1
+            # Each power of two: a flood must not become a flood of log lines.
+            if self.lost & (self.lost - 1) == 0:
+                log.warning("slow handlers: %d messages lost so far, last on %s", self.lost, sample.key)
+
+    def question(
+        self, handler: Callable[[Request], None], request: Request, wanted: Callable[[], bool]
+    ) -> None:
+        """Hand over a question; a handler that raises refuses it."""
+
+        def task() -> None:
+            if not wanted():
+                request.refuse("no longer served")
+                return
+            try:
+                handler(request)
+            except MapweaveError as error:
+                request.refuse(str(error))
+            except Exception as error:
+                log.exception("a handler of %s failed", request.key)
+                request.refuse(f"internal error: {type(error).__name__}")
+
+        if not self._put(task, bounded=True):
+            self.refused += 1
+            if self.refused & (self.refused - 1) == 0:
+                log.warning("slow handlers: %d questions refused so far", self.refused)
+            request.refuse("too busy, ask again later")
+
+    def presence(
+        self, handler: Callable[[str, bool], None], key: str, alive: bool, wanted: Callable[[], bool]
+    ) -> None:
+        """Hand over that somebody came or went."""
+
+        def task() -> None:
+            if wanted():
+                _guarded(lambda: handler(key, alive), key)
+
+        self._put(task, bounded=False)
+
+    def close(self) -> None:
+        """Finish the running handler, forget what waits. Twice is no error.
+
+        A handler must not close its own bus; if it does so all the same, it is not waited for.
+        """
+        with self._wake:
+            self._closed = True
+            self._tasks.clear()
+            self._wake.notify()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _put(self, task: Callable[[], None], *, bounded: bool) -> bool:
+        with self._wake:
+            if self._closed:
+                return True
+            if bounded and len(self._tasks) >= self._limit:
+                return False
+            self._tasks.append(task)
+            self._wake.notify()
+            return True
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while not self._tasks and not self._closed:
+                    self._wake.wait()
+                if self._closed:
+                    return
+                task = self._tasks.popleft()
+            task()
+
+
+def _guarded(call: Callable[[], None], key: str) -> None:
+    """Run a handler whose caller is far away: its failure ends here, in the log, once."""
+    try:
+        call()
+    except MapweaveError as error:
+        log.warning("%s: %s", key, error)
+    except Exception:
+        log.exception("a handler of %s failed", key)

@@ -1,0 +1,229 @@
+"""Every key of a fleet: the version first, then who, then what. No data stands in a key.
+
+    mapweave/1/<fleet>/agent/<agent>/change/<epoch>   changes, one a message; attachment: see wire.messages
+    mapweave/1/<fleet>/agent/<agent>/head/<epoch>     beacon: the newest sequence number
+    mapweave/1/<fleet>/agent/<agent>/log/<epoch>      question: a range of the log
+    mapweave/1/<fleet>/agent/<agent>/alive/<epoch>    liveliness
+    mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people
+    mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
+    mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk
+    mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, map
+    mapweave/1/<fleet>/server/<server>/status         likewise alive
+    mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
+    mapweave/1/<fleet>/sim/control                    question to the simulator; likewise alive
+
+The identity is a chunk at a fixed place before the class of the message, so that an access rule can name it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import MapId, check_name
+
+VERSION = "1"
+MAX_EPOCH = 2**53
+
+
+def check_epoch(epoch: int) -> int:
+    """Return the epoch, or raise InvalidValue if it is out of range."""
+    if not 0 <= epoch <= MAX_EPOCH:
+        raise InvalidValue(f"epoch {epoch} is out of range 0..{MAX_EPOCH}")
+    return epoch
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The keys of one fleet. Methods with a plural or `any_` in their name give patterns.
+
+    Attributes:
+        fleet: its name; fleets share a router without seeing each other.
+    """
+
+    fleet: str = "fleet"
+
+    def __post_init__(self) -> None:
+        """Refuse a name that cannot stand in a key (InvalidValue)."""
+        check_name(self.fleet)
+
+    @property
+    def root(self) -> str:
+        """The prefix of every key of the fleet."""
+        return f"mapweave/{VERSION}/{self.fleet}"
+
+    # An agent speaks.
+
+    def change(self, map_id: MapId) -> str:
+        """Where an agent publishes the changes of one map."""
+        return self._of_map("change", map_id)
+
+    def changes(self) -> str:
+        """Pattern: the changes of every map."""
+        return f"{self.root}/agent/*/change/*"
+
+    def head(self, map_id: MapId) -> str:
+        """Where an agent publishes the newest sequence number of a map."""
+        return self._of_map("head", map_id)
+
+    def heads(self) -> str:
+        """Pattern: the beacons of every map."""
+        return f"{self.root}/agent/*/head/*"
+
+    def log(self, map_id: MapId) -> str:
+        """Where an agent answers for ranges of a map's log."""
+        return self._of_map("log", map_id)
+
+    def agent_alive(self, map_id: MapId) -> str:
+        """Under which an agent that makes this map is alive."""
+        return self._of_map("alive", map_id)
+
+    def agents_alive(self) -> str:
+        """Pattern: every agent."""
+        return f"{self.root}/agent/*/alive/*"
+
+    def agent_status(self, agent: str) -> str:
+        """Where an agent publishes what it is doing."""
+        return f"{self.root}/agent/{check_name(agent)}/status"
+
+    def agent_statuses(self) -> str:
+        """Pattern: what every agent is doing."""
+        return f"{self.root}/agent/*/status"
+
+    def mission(self, agent: str) -> str:
+        """Where an agent takes an operator's commands."""
+        return f"{self.root}/agent/{check_name(agent)}/mission"
+
+    # A server speaks.
+
+    def ack(self, server: str, agent: str) -> str:
+        """Where a server says what of an agent's log is on its disk."""
+        return f"{self.root}/server/{check_name(server)}/ack/{check_name(agent)}"
+
+    def acks(self, agent: str) -> str:
+        """Pattern: what any server says to an agent."""
+        return f"{self.root}/server/*/ack/{check_name(agent)}"
+
+    def relocalize(self, server: str) -> str:
+        """Where a server tells from which place a view was taken."""
+        return self._of_server("relocalize", server)
+
+    def any_relocalize(self) -> str:
+        """Pattern: whichever server answers."""
+        return f"{self.root}/server/*/relocalize"
+
+    def route(self, server: str) -> str:
+        """Where a server gives a way from node to node."""
+        return self._of_server("route", server)
+
+    def any_route(self) -> str:
+        """Pattern: whichever server answers."""
+        return f"{self.root}/server/*/route"
+
+    def server_map(self, server: str) -> str:
+        """Where a server hands out the merged map as the bytes of a map file."""
+        return self._of_server("map", server)
+
+    def any_server_map(self) -> str:
+        """Pattern: whichever server answers."""
+        return f"{self.root}/server/*/map"
+
+    def server_status(self, server: str) -> str:
+        """Where a server publishes what it is doing."""
+        return self._of_server("status", server)
+
+    def server_statuses(self) -> str:
+        """Pattern: what every server is doing."""
+        return f"{self.root}/server/*/status"
+
+    def server_alive(self, server: str) -> str:
+        """Under which a server is alive."""
+        return self._of_server("alive", server)
+
+    def servers_alive(self) -> str:
+        """Pattern: every server."""
+        return f"{self.root}/server/*/alive"
+
+    # A body or the simulator speaks.
+
+    def robot_describe(self, robot: str) -> str:
+        """Where a robot's body describes itself."""
+        return f"{self.root}/robot/{check_name(robot)}/describe"
+
+    def robot_step(self, robot: str) -> str:
+        """Where a robot's body takes a command and gives the next observation."""
+        return f"{self.root}/robot/{check_name(robot)}/step"
+
+    def sim_control(self) -> str:
+        """Where the simulator takes commands (kidnap, truth, stop)."""
+        return f"{self.root}/sim/control"
+
+    def sim_alive(self) -> str:
+        """Under which the simulator is alive."""
+        return f"{self.root}/sim/alive"
+
+    # What a key that came from outside says. Each raises InvalidMessage if it is of another form.
+
+    def parse_change(self, key: str) -> MapId:
+        """Whose changes."""
+        return self._parse_map("change", key)
+
+    def parse_head(self, key: str) -> MapId:
+        """Whose beacon."""
+        return self._parse_map("head", key)
+
+    def parse_log(self, key: str) -> MapId:
+        """Whose log."""
+        return self._parse_map("log", key)
+
+    def parse_agent_alive(self, key: str) -> MapId:
+        """Which agent, and which map it makes."""
+        return self._parse_map("alive", key)
+
+    def parse_agent_status(self, key: str) -> str:
+        """Which agent."""
+        return self._parse_names("agent/*/status", key)[0]
+
+    def parse_ack(self, key: str) -> tuple[str, str]:
+        """Which server, to which agent."""
+        server, agent = self._parse_names("server/*/ack/*", key)
+        return server, agent
+
+    def parse_server_alive(self, key: str) -> str:
+        """Which server."""
+        return self._parse_names("server/*/alive", key)[0]
+
+    def parse_server_status(self, key: str) -> str:
+        """Which server."""
+        return self._parse_names("server/*/status", key)[0]
+
+    def _of_map(self, what: str, map_id: MapId) -> str:
+        return f"{self.root}/agent/{check_name(map_id.agent)}/{what}/{check_epoch(map_id.epoch)}"
+
+    def _of_server(self, what: str, server: str) -> str:
+        return f"{self.root}/server/{check_name(server)}/{what}"
+
+    def _parse_map(self, what: str, key: str) -> MapId:
+        agent, epoch = self._chunks(f"agent/*/{what}/*", key)
+        # The text must be the one that `_of_map` makes: "007" and digits of other scripts are none.
+        if not (epoch.isascii() and epoch.isdigit() and str(int(epoch)) == epoch and int(epoch) <= MAX_EPOCH):
+            raise InvalidMessage(f"key {key!r}: {epoch!r} is no epoch")
+        return MapId(_name(agent, key), int(epoch))
+
+    def _parse_names(self, form: str, key: str) -> list[str]:
+        return [_name(chunk, key) for chunk in self._chunks(form, key)]
+
+    def _chunks(self, form: str, key: str) -> list[str]:
+        """The chunks that stand where the form has `*`."""
+        wanted = [*self.root.split("/"), *form.split("/")]
+        given = key.split("/") if len(key) <= 256 else []
+        if len(given) != len(wanted) or any(w not in ("*", g) for w, g in zip(wanted, given, strict=True)):
+            raise InvalidMessage(f"key {key[:256]!r} is not of the form {self.root}/{form}")
+        return [g for w, g in zip(wanted, given, strict=True) if w == "*"]
+
+
+def _name(chunk: str, key: str) -> str:
+    try:
+        return check_name(chunk)
+    except InvalidValue as error:
+        raise InvalidMessage(f"key {key!r}: {error}") from None

@@ -1,0 +1,341 @@
+"""A fleet inside one process: for tests, and for demonstrations without a network."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from hybridmap.errors import NotConnected
+from wire.bus import Closing, Reply, Request, Sample
+from wire.dispatch import Dispatcher
+from wire.keyexpr import check_key, check_pattern, intersects, is_key
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What goes wrong with published messages; questions and liveliness are not touched.
+
+    Attributes:
+        drop: share that is lost, 0 to 1.
+        double: share that comes twice.
+        delay: share that is held back.
+        longest_delay: for how many later messages a held one may wait at most.
+    """
+
+    drop: float = 0.0
+    double: float = 0.0
+    delay: float = 0.0
+    longest_delay: int = 8
+
+
+class MemoryHub:
+    """What a router is to Zenoh: the place where buses meet."""
+
+    def __init__(self) -> None:
+        """Make a hub that nobody is on, and that loses nothing."""
+        self._lock = threading.RLock()
+        self._buses: list[MemoryBus] = []
+        self._faults = Faults()
+        self._random = np.random.default_rng(0)
+        self._held: list[tuple[int, MemoryBus, Sample]] = []
+        self._clock = 0
+
+    def disturb(self, faults: Faults, random: np.random.Generator) -> None:
+        """From now on treat messages badly, by the given source of chance."""
+        with self._lock:
+            self._faults = faults
+            self._random = random
+
+    def calm(self) -> None:
+        """From now on treat messages well; those held back arrive now, oldest last."""
+        with self._lock:
+            self._faults = Faults()
+            held, self._held = self._held, []
+            for _, sender, sample in reversed(held):
+                self._deliver(sender, sample)
+
+    def cut(self, bus: MemoryBus) -> None:
+        """Take a bus off the hub: it hears nothing, is heard by nobody, and the others see its tokens die."""
+        self._change(lambda: setattr(bus, "_cut", True))
+
+    def restore(self, bus: MemoryBus) -> None:
+        """Put a cut bus back."""
+        self._change(lambda: setattr(bus, "_cut", False))
+
+    # What the buses use.
+
+    def _join(self, bus: MemoryBus) -> None:
+        with self._lock:
+            self._buses.append(bus)
+
+    def _leave(self, bus: MemoryBus) -> None:
+        with self._lock:
+            if bus in self._buses:
+                self._change(lambda: self._buses.remove(bus))
+
+    def _change(self, change: Callable[[], object]) -> None:
+        """Do something that may alter who sees whom, and tell the watchers."""
+        with self._lock:
+            change()
+            tokens = [(bus, token.key) for bus in self._buses for token in bus._tokens]
+            for bus in self._buses:
+                alive = {key for owner, key in tokens if not owner._cut and not bus._cut}
+                for watcher in list(bus._watchers):
+                    watcher.see({key for key in alive if intersects(watcher.key, key)})
+
+    def _publish(self, sender: MemoryBus, sample: Sample) -> None:
+        with self._lock:
+            if sender._cut:
+                return
+            self._clock += 1
+            faults = self._faults
+            if self._random.random() >= faults.drop:
+                for _ in range(2 if self._random.random() < faults.double else 1):
+                    if self._random.random() < faults.delay:
+                        due = self._clock + int(self._random.integers(1, faults.longest_delay + 1))
+                        self._held.append((due, sender, sample))
+                    else:
+                        self._deliver(sender, sample)
+            ripe = [held for held in self._held if held[0] <= self._clock]
+            self._held = [held for held in self._held if held[0] > self._clock]
+            for _, late_sender, late in ripe:
+                self._deliver(late_sender, late)
+
+    def _deliver(self, sender: MemoryBus, sample: Sample) -> None:
+        if sender._cut:
+            return
+        for bus in self._buses:
+            for subscription in list(bus._subscriptions):
+                if not bus._cut and intersects(subscription.key, sample.key):
+                    subscription.deliver(sample)
+
+    def _ask(self, asker: MemoryBus, key: str, payload: bytes, collector: _Collector) -> None:
+        with self._lock:
+            if asker._cut:
+                return
+            for bus in self._buses:
+                for service in list(bus._services):
+                    if not bus._cut and intersects(service.key, key):
+                        asked = key if is_key(key) else service.key
+                        service.deliver(_MemoryRequest(asked, payload, bus, asker, collector))
+
+
+class MemoryBus:
+    """One participant's connection to a hub."""
+
+    _numbers = itertools.count(1)
+
+    def __init__(self, hub: MemoryHub) -> None:
+        """Join the hub."""
+        self._hub = hub
+        self._cut = False
+        self._closed = False
+        self._subscriptions: list[_Subscription] = []
+        self._services: list[_Service] = []
+        self._tokens: list[_Token] = []
+        self._watchers: list[_Watcher] = []
+        self._open_requests: set[_MemoryRequest] = set()
+        self._dispatcher = Dispatcher(f"memory-bus-{next(self._numbers)}")
+        hub._join(self)
+
+    def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
+        """Send to all who subscribe, if this bus is on the hub."""
+        check_key(key)
+        if not self._closed:
+            self._hub._publish(self, Sample(key, bytes(payload), bytes(attachment)))
+
+    def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
+        """Call the handler with each matching message."""
+        return self._add(self._subscriptions, _Subscription(self, check_pattern(pattern), handler))
+
+    def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
+        """Answer questions."""
+        return self._add(self._services, _Service(self, check_pattern(key), handler))
+
+    def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
+        """Ask everyone who serves the key (or a key that the pattern matches)."""
+        check_pattern(key)
+        collector = _Collector()
+        if not self._closed:
+            self._hub._ask(self, key, bytes(payload), collector)
+        return collector.wait(timeout)
+
+    def announce(self, key: str) -> Closing:
+        """Be alive under this key."""
+        return self._add(self._tokens, _Token(self, check_key(key)))
+
+    def watch(self, pattern: str, handler: Callable[[str, bool], None]) -> Closing:
+        """Call the handler with who is alive, now and at each change."""
+        return self._add(self._watchers, _Watcher(self, check_pattern(pattern), handler))
+
+    def connected(self) -> bool:
+        """True unless the hub has cut this bus or it is closed."""
+        return not (self._cut or self._closed)
+
+    def wait_connected(self, timeout: float) -> bool:
+        """The same: nothing to wait for."""
+        return self.connected()
+
+    def close(self) -> None:
+        """Leave the hub."""
+        if self._closed:
+            return
+        self._closed = True
+        self._hub._leave(self)
+        self._dispatcher.close()
+        with self._hub._lock:
+            abandoned = list(self._open_requests)
+        for request in abandoned:
+            request.abandon()
+
+    def _add(self, declared_of_kind: list[_D], declared: _D) -> _D:
+        if self._closed:
+            raise NotConnected("this bus is closed")
+        self._hub._change(lambda: declared_of_kind.append(declared))
+        return declared
+
+    def _remove(self, declared: _Declared) -> None:
+        def remove() -> None:
+            everything: tuple[list[_Declared], ...] = (
+                self._subscriptions,  # type: ignore[assignment]
+                self._services,
+                self._tokens,
+                self._watchers,
+            )
+            for kind in everything:
+                if declared in kind:
+                    kind.remove(declared)
+
+        self._hub._change(remove)
+
+
+class _Declared:
+    """Something that a bus has on the hub until it is closed."""
+
+    def __init__(self, bus: MemoryBus, key: str) -> None:
+        self.bus = bus
+        self.key = key
+        self.open = True
+
+    def close(self) -> None:
+        self.open = False
+        self.bus._remove(self)
+
+    def wanted(self) -> bool:
+        return self.open
+
+
+_D = TypeVar("_D", bound=_Declared)
+
+
+class _Token(_Declared):
+    pass
+
+
+class _Subscription(_Declared):
+    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Sample], None]) -> None:
+        super().__init__(bus, key)
+        self._handler = handler
+
+    def deliver(self, sample: Sample) -> None:
+        self.bus._dispatcher.message(self._handler, sample, self.wanted)
+
+
+class _Service(_Declared):
+    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Request], None]) -> None:
+        super().__init__(bus, key)
+        self._handler = handler
+
+    def deliver(self, request: _MemoryRequest) -> None:
+        self.bus._dispatcher.question(self._handler, request, self.wanted)
+
+
+class _Watcher(_Declared):
+    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[str, bool], None]) -> None:
+        super().__init__(bus, key)
+        self._handler = handler
+        self._seen: set[str] = set()
+
+    def see(self, alive: set[str]) -> None:
+        """Tell what is different from what was told before."""
+        for key in sorted(self._seen - alive):
+            self.bus._dispatcher.presence(self._handler, key, False, self.wanted)
+        for key in sorted(alive - self._seen):
+            self.bus._dispatcher.presence(self._handler, key, True, self.wanted)
+        self._seen = alive
+
+
+class _MemoryRequest:
+    """A question on its way to one service."""
+
+    def __init__(
+        self, key: str, payload: bytes, server: MemoryBus, asker: MemoryBus, collector: _Collector
+    ) -> None:
+        self._key = key
+        self._payload = payload
+        self._server = server
+        self._asker = asker
+        self._collector = collector
+        self._answered = False
+        collector.expect()
+        server._open_requests.add(self)
+
+    @property
+    def key(self) -> str:
+        return self._key
+
+    @property
+    def payload(self) -> bytes:
+        return self._payload
+
+    def reply(self, payload: bytes) -> None:
+        self._finish(Reply(payload=bytes(payload)))
+
+    def refuse(self, reason: str) -> None:
+        self._finish(Reply(error=reason or "refused"))
+
+    def abandon(self) -> None:
+        """Nobody will answer: the server has closed."""
+        self._finish(None)
+
+    def _finish(self, reply: Reply | None) -> None:
+        with self._server._hub._lock:
+            if self._answered:
+                return
+            self._answered = True
+            self._server._open_requests.discard(self)
+            lost = self._server._cut or self._asker._cut
+        self._collector.add(None if lost else reply)
+
+
+class _Collector:
+    """Gathers the replies to one question until none is missing."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._missing = 0
+        self._replies: list[Reply] = []
+
+    def expect(self) -> None:
+        with self._changed:
+            self._missing += 1
+
+    def add(self, reply: Reply | None) -> None:
+        with self._changed:
+            self._missing -= 1
+            if reply is not None:
+                self._replies.append(reply)
+            self._changed.notify_all()
+
+    def wait(self, timeout: float) -> list[Reply]:
+        end = time.monotonic() + timeout
+        with self._changed:
+            while self._missing > 0 and (left := end - time.monotonic()) > 0:
+                self._changed.wait(left)
+            return list(self._replies)
