@@ -68,7 +68,7 @@ class Warped:
 
 def load(name: str) -> Image:
     """One of scikit-image's images, grey, at most 640 px wide."""
-    image = getattr(skimage.data, name)()
+    image: Any = getattr(skimage.data, name)()
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     scale = 640 / max(image.shape)
@@ -86,15 +86,15 @@ def warp(image: Image, rng: np.random.Generator) -> tuple[Image, Array]:
     centre = np.array([width, height]) / 2
     moved = (corners - centre) @ turn.T + centre + rng.normal(0, 0.06, (4, 2)) * [width, height] * scale
     b_from_a = cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32))
-    out = cv2.warpPerspective(image, b_from_a, (width, height), flags=cv2.INTER_AREA).astype(np.float64)
-    out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.2))
+    warped = cv2.warpPerspective(image, b_from_a, (width, height), flags=cv2.INTER_AREA)
+    out = cv2.GaussianBlur(warped, (0, 0), rng.uniform(0.3, 1.2)).astype(np.float64)
     out = out * rng.uniform(0.6, 1.2) + rng.uniform(-20, 20) + rng.normal(0, rng.uniform(1, 5), out.shape)
     return np.clip(out, 0, 255).astype(np.uint8), np.asarray(b_from_a, dtype=np.float64)
 
 
 def make_pair(image: Image, rng: np.random.Generator, features: int) -> Warped | None:
     """SIFT of an image and of the same image warped; None if one shows next to nothing."""
-    detector = cv2.SIFT_create(nfeatures=features, contrastThreshold=0.02)
+    detector = cv2.SIFT_create(nfeatures=features, contrastThreshold=0.02)  # type: ignore[attr-defined]
     other, b_from_a = warp(image, rng)
     keypoints_a, sift_a = detector.detectAndCompute(image, None)
     keypoints_b, sift_b = detector.detectAndCompute(other, None)

@@ -1,7 +1,7 @@
 """Compact SIFT: 512 bytes become 16, and most geometric matches survive.
 
-A descriptor is made RootSIFT (Arandjelovic and Zisserman, CVPR 2012: divide by the L1 norm, take square roots,
-so that Euclidean distance compares histograms by the Hellinger kernel), centred, projected on a fixed
+A descriptor is made RootSIFT (Arandjelovic and Zisserman, CVPR 2012: divide by the L1 norm, take square
+roots, so that Euclidean distance compares histograms by the Hellinger kernel), centred, projected on a fixed
 32-dimensional PCA basis, and each coordinate is rounded to one of 16 levels that Lloyd's algorithm chose for
 that coordinate. Two coordinates share a byte, the even one in the low half.
 
@@ -63,17 +63,17 @@ class Table:
         Raises:
             InvalidValue: the input is not (N, 128) finite.
         """
-        out: NDArray[np.float32] = (root_sift(sift) - self.mean) @ self.basis
+        centred: NDArray[np.float32] = root_sift(sift) - self.mean
+        out: NDArray[np.float32] = np.matmul(centred, self.basis)
         return out
 
     def quantise(self, projected: NDArray[np.float32]) -> NDArray[np.uint8]:
         """(N, 32) coordinates -> (N, 16) codes: each coordinate to its nearest level."""
-        thresholds = 0.5 * (self.levels[:, 1:] + self.levels[:, :-1])
+        thresholds: NDArray[Any] = (self.levels[:, 1:] + self.levels[:, :-1]) / 2
         symbols = np.empty(projected.shape, np.uint8)
         for k in range(DIMENSIONS):
             symbols[:, k] = np.searchsorted(thresholds[k], projected[:, k])
-        packed: NDArray[np.uint8] = symbols[:, 0::2] | (symbols[:, 1::2] << 4)
-        return packed
+        return symbols[:, 0::2] | (symbols[:, 1::2] << np.uint8(4))
 
     def restore(self, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(N, 16) codes -> (N, 32) float32 coordinates."""
@@ -93,8 +93,9 @@ def root_sift(sift: NDArray[Any]) -> NDArray[np.float32]:
     sift = np.asarray(sift, dtype=np.float32)
     if sift.ndim != 2 or sift.shape[1] != SIFT_DIMENSIONS or not np.isfinite(sift).all():
         raise InvalidValue(f"SIFT descriptors must be (N, 128) finite, not {sift.shape}")
-    sift = np.maximum(sift, 0)
-    out: NDArray[np.float32] = np.sqrt(sift / np.maximum(sift.sum(axis=1, keepdims=True), 1e-12))
+    sift = np.maximum(sift, np.float32(0))
+    total = np.maximum(sift.sum(axis=1, keepdims=True), 1e-12)
+    out: NDArray[np.float32] = np.sqrt(sift / total).astype(np.float32, copy=False)
     return out
 
 

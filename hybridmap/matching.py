@@ -80,7 +80,8 @@ def _second(squared: NDArray[np.float32], axis: int) -> NDArray[Any]:
     """Second smallest along an axis; infinite where there is only one."""
     if squared.shape[axis] < 2:
         return np.full(squared.shape[1 - axis], np.inf, np.float32)
-    return np.partition(squared, 1, axis=axis).take(1, axis=axis)
+    second: NDArray[Any] = np.take(np.partition(squared, 1, axis=axis), 1, axis=axis)
+    return second
 
 
 def match(

@@ -1,0 +1,98 @@
+"""Postures of a planar robot from the fewest sightings that determine one, many at once.
+
+With the camera at (tx, ty, heading) of the points' frame, c and s the heading's cosine and sine,
+    X = c px + s py - A,   Y = -s px + c py - B,   A = c tx + s ty,   B = -s tx + c ty.
+- Three bearings: Y = a X for a pixel with slope a is linear in (c, s, A, B). Two differences of three such
+  rows lose B, and their cross product is (c, s, A) up to scale.
+- Two points with depth: height over the camera and the pixel's row give a depth (or the image measures one),
+  so both points are known in both frames.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Array
+from hybridmap.pose_refinement import Block
+from hybridmap.sightings import Sightings
+
+
+def inverse_poses(poses: Array) -> Array:
+    """(H, 3) inverse postures."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = -cos * poses[:, 0] - sin * poses[:, 1]
+    y = sin * poses[:, 0] - cos * poses[:, 1]
+    return np.stack([x, y, -poses[:, 2]], axis=1)
+
+
+def hypotheses(block: Block, count: int, rng: np.random.Generator) -> Array:
+    """(H, 3) postures from minimal sets of one block; degenerate sets are left out."""
+    sightings = block.sightings
+    found = []
+    if len(sightings) >= 3:
+        found.append(_from_three_bearings(sightings, rng.integers(0, len(sightings), (count, 3))))
+    depths, sigmas = _depths(sightings)
+    good = np.flatnonzero(sigmas < 0.3 * depths)
+    if len(good) >= 2:
+        chosen = good[rng.integers(0, len(good), (count, 2))]
+        found.append(_from_two_depths(sightings, chosen, depths))
+    if not found:
+        return np.zeros((0, 3))
+    poses = np.concatenate(found)
+    poses = poses[np.isfinite(poses).all(axis=1)]
+    return inverse_poses(poses) if block.inverted else poses
+
+
+def _from_three_bearings(sightings: Sightings, chosen: NDArray[np.int64]) -> Array:
+    """(H, 3) postures from (H, 3) chosen sightings, by their horizontal bearings alone."""
+    px, py = sightings.points[chosen, 0], sightings.points[chosen, 1]
+    a = sightings.slopes[chosen, 0]
+    rows = np.stack([py - a * px, -px - a * py, a], axis=-1)
+    solution = np.cross(rows[:, 0] - rows[:, 1], rows[:, 0] - rows[:, 2])
+    b = (rows[:, 0] * solution).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / np.hypot(solution[:, 0], solution[:, 1])
+        c, s, big_a, big_b = solution[:, 0] * scale, solution[:, 1] * scale, solution[:, 2] * scale, b * scale
+        # The null vector's sign is open: the points are in front of the camera.
+        sign = np.sign((c[:, None] * px + s[:, None] * py - big_a[:, None]).sum(axis=1))
+    c, s, big_a, big_b = c * sign, s * sign, big_a * sign, big_b * sign
+    mount = sightings.camera.mount_forward
+    return np.stack(
+        [c * (big_a - mount) - s * big_b, s * (big_a - mount) + c * big_b, np.arctan2(s, c)], axis=1
+    )
+
+
+def _depths(sightings: Sightings) -> tuple[Array, Array]:
+    """(N,) depth in the image and its standard deviation, m, from heights and measured depths."""
+    camera = sightings.camera
+    height = sightings.points[:, 2] - camera.mount_height
+    slope = sightings.slopes[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = height / slope
+        relative2 = (sightings.pixel_sigma / (camera.fy * slope)) ** 2
+        relative2 += sightings.covariances[:, 2, 2] / height**2
+        weight = np.where(depth > 0, 1.0 / (relative2 * depth**2), 0.0)
+    weight = np.where(np.isfinite(weight), weight, 0.0)
+    depth = np.where(weight > 0, depth, 0.0)
+    measured = sightings.depth_measured
+    more = np.where(measured, 1.0 / np.where(measured, sightings.depth_sigmas, 1.0) ** 2, 0.0)
+    total = weight + more
+    with np.errstate(divide="ignore", invalid="ignore"):
+        combined = (weight * depth + more * np.where(measured, sightings.depths, 0.0)) / total
+        return np.where(total > 0, combined, np.nan), np.where(total > 0, total**-0.5, np.inf)
+
+
+def _from_two_depths(sightings: Sightings, chosen: NDArray[np.int64], depths: Array) -> Array:
+    """(H, 3) postures that carry two points of the robot's plane onto two points of the frame's."""
+    p = sightings.points[chosen][..., :2]
+    d = depths[chosen]
+    q = np.stack([d + sightings.camera.mount_forward, d * sightings.slopes[chosen, 0]], axis=-1)
+    dp, dq = p[:, 1] - p[:, 0], q[:, 1] - q[:, 0]
+    heading = np.arctan2(dp[:, 1], dp[:, 0]) - np.arctan2(dq[:, 1], dq[:, 0])
+    cos, sin = np.cos(heading), np.sin(heading)
+    p, q = p.mean(axis=1), q.mean(axis=1)
+    x, y = p[:, 0] - cos * q[:, 0] + sin * q[:, 1], p[:, 1] - sin * q[:, 0] - cos * q[:, 1]
+    poses = np.stack([x, y, heading], axis=1)
+    poses[chosen[:, 0] == chosen[:, 1]] = np.nan
+    return poses

@@ -1,0 +1,127 @@
+"""Where a planar robot stood when it saw known points: three degrees of freedom, robust.
+
+Static localization of the paper's section 6 (least squares on n >= 4 known points), made robust: many
+postures are solved at once from two or three sightings each, scored by likelihood, and the best refined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.minimal_poses import hypotheses, inverse_poses
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.pose_refinement import Block, PlanarFix, improve, refine
+from hybridmap.sightings import Sightings
+
+__all__ = ["Block", "PlanarFix", "PlanarPoseSettings", "solve_blocks", "solve_planar_pose"]
+
+
+@dataclass(frozen=True)
+class PlanarPoseSettings:
+    """How a posture is found.
+
+    Attributes:
+        hypotheses: postures tried from three bearings, and as many from two points with depth.
+        finalists: best hypotheses that are refined.
+        rounds: of Gauss-Newton at most.
+        pixel_sigma: standard deviation of a matched pixel, px. A SIFT feature found again at another scale
+            is off by about one pixel.
+        scale_sigma: share by which all points of one frame may be too near or too far together; they come
+            from one drive with one set of wheels, so their errors are not independent.
+        least_inliers: fewer give no posture.
+    """
+
+    hypotheses: int = 100
+    finalists: int = 3
+    rounds: int = 8
+    pixel_sigma: float = 1.0
+    scale_sigma: float = 0.01
+    least_inliers: int = 4
+
+
+def solve_planar_pose(
+    points: NDArray[Any],
+    pixels: NDArray[Any],
+    camera: Camera,
+    *,
+    rng: np.random.Generator,
+    point_covariances: NDArray[Any] | None = None,
+    settings: PlanarPoseSettings | None = None,
+    prior: PoseGaussian | None = None,
+) -> PlanarFix | None:
+    """Find where the robot stood, from matches of which some may be wrong.
+
+    Args:
+        points: (N, 3) m, in the node's robot frame; rows that are not finite are never inliers.
+        pixels: (N, 2) px, where the robot sees them.
+        camera: the robot's.
+        rng: draws the hypotheses.
+        point_covariances: (N, 3, 3) m^2; exact points without.
+        settings: how.
+        prior: what is known of the posture already; counts as a measurement.
+
+    Returns:
+        The posture, or None if the sightings do not determine one.
+    """
+    s = settings or PlanarPoseSettings()
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+    usable = np.isfinite(points).all(axis=1) & np.isfinite(pixels).all(axis=1)
+    if point_covariances is not None:
+        usable &= np.isfinite(np.asarray(point_covariances)).all(axis=(1, 2))
+        point_covariances = np.asarray(point_covariances)[usable]
+    sightings = Sightings.build(
+        points[usable],
+        pixels[usable],
+        camera,
+        covariances=point_covariances,
+        pixel_sigma=s.pixel_sigma,
+    )
+    solved = solve_blocks([Block(sightings)], rng=rng, settings=s, prior=prior)
+    if solved is None:
+        return None
+    inliers = np.zeros(len(points), dtype=bool)
+    inliers[np.flatnonzero(usable)[solved.inliers]] = True
+    return PlanarFix(solved.node_from_robot, inliers, solved.mean_square, solved.rms_px, solved.log_evidence)
+
+
+def solve_blocks(
+    blocks: Sequence[Block],
+    *,
+    rng: np.random.Generator,
+    settings: PlanarPoseSettings,
+    prior: PoseGaussian | None = None,
+) -> PlanarFix | None:
+    """The same for sightings in either direction; `inliers` is over all blocks one after the other."""
+    blocks = [block for block in blocks if len(block.sightings)]
+    if sum(len(block.sightings) for block in blocks) < settings.least_inliers:
+        return None
+    poses = np.concatenate([hypotheses(block, settings.hypotheses, rng) for block in blocks])
+    if prior is not None:
+        poses = np.concatenate([prior.mean.vector[None], poses])
+    if len(poses) == 0:
+        return None
+    finalists = np.argsort(-_scores(blocks, poses), kind="stable")[: settings.finalists]
+    improved = [improve(blocks, Pose2.from_vector(poses[k]), prior, rounds=2) for k in finalists]
+    kept = [one[0] for one in improved if one is not None]
+    if not kept:
+        return None
+    best = kept[int(_scores(blocks, np.stack([pose.vector for pose in kept])).argmax())]
+    fix = refine(blocks, best, settings.scale_sigma, prior, rounds=settings.rounds)
+    if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
+        return None
+    return fix
+
+
+def _scores(blocks: Sequence[Block], poses: Array) -> Array:
+    """(H,) nats: how much better each of the (H, 3) postures explains the sightings than chance does."""
+    scores = np.zeros(len(poses))
+    for block in blocks:
+        scores += block.sightings.log_ratios(inverse_poses(poses) if block.inverted else poses).sum(axis=1)
+    return scores

@@ -1,0 +1,263 @@
+"""Is this image of that place, and where was it taken: matches, then geometry, then an honest verdict.
+
+What the geometry can rule out is chance: a wrong match hits the small gate around a point's projection about
+once in three hundred times, so a handful of inliers more than the posture needs is no accident. What it
+cannot rule out is another place with the same things in it. So a recognition also has to explain a good share
+of the features that matched at all, all over the image, and determine the posture; and its numbers are kept
+as evidence for those who can compare places (merge, mapserver.relocalization).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.matching import MatchSettings, match
+from hybridmap.node import Landmarks, Node
+from hybridmap.planar_pose import Block, PlanarFix, PlanarPoseSettings, solve_blocks
+from hybridmap.pose import PoseGaussian
+from hybridmap.query import View
+from hybridmap.sightings import Sightings
+
+GRID = (6, 4)
+"""Columns and rows of cells in which the spread over an image is counted."""
+
+
+@dataclass(frozen=True)
+class RecognitionSettings:
+    """When an image counts as recognised.
+
+    Attributes:
+        matching: how features are matched.
+        pose: how the posture is found.
+        least_inliers: landmarks that agree.
+        least_share: of the matches that could have been inliers.
+        least_cells: cells of the 6 x 4 grid with an inlier, in either image.
+        least_evidence: how much likelier the inliers are than wrong matches, nats.
+        most_mean_square: largest mean squared normalised residual; 1 is expected.
+        most_position_share: largest standard deviation of the position as a share of the median depth of
+            the inliers.
+        most_heading_sigma: rad.
+    """
+
+    matching: MatchSettings = field(default_factory=MatchSettings)
+    pose: PlanarPoseSettings = field(default_factory=PlanarPoseSettings)
+    least_inliers: int = 10
+    least_share: float = 0.35
+    least_cells: int = 4
+    least_evidence: float = 40.0
+    most_mean_square: float = 3.0
+    most_position_share: float = 0.15
+    most_heading_sigma: float = math.radians(4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Recognition:
+    """A place was recognised.
+
+    Attributes:
+        node_from_robot: posture of the robot that took the view, in the node's robot frame. For two nodes
+            a and b this is `a_from_b`.
+        pairs: (K, 2) int64, inliers: landmark of the node (a), feature of the view (landmark of b).
+        matches: mutual matches, with or without depth.
+        usable: matches with a depth on either side, which could have been inliers.
+        fix: the posture with its residuals.
+        evidence: the numbers that support it, for an edge's `evidence`.
+    """
+
+    node_from_robot: PoseGaussian
+    pairs: NDArray[np.int64]
+    matches: int
+    usable: int
+    fix: PlanarFix
+    evidence: dict[str, float]
+
+    @property
+    def inliers(self) -> int:
+        """How many landmarks agree."""
+        return len(self.pairs)
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A place was not recognised.
+
+    Attributes:
+        reason: in words.
+        matches: mutual matches.
+        inliers: of the best posture, 0 without one.
+    """
+
+    reason: str
+    matches: int
+    inliers: int = 0
+
+
+def recognise(
+    node: Node, view: View, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | None:
+    """Find where a view was taken near a node, or None; `examine_view` says why not."""
+    verdict = examine_view(node, view, settings, rng)
+    return verdict if isinstance(verdict, Recognition) else None
+
+
+def register(
+    a: Node, b: Node, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | None:
+    """Find `a_from_b` from what two nodes both see, or None; `examine_nodes` says why not."""
+    verdict = examine_nodes(a, b, settings, rng)
+    return verdict if isinstance(verdict, Recognition) else None
+
+
+def examine_view(
+    node: Node, view: View, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | Refusal:
+    """Compare a view with a node's landmarks that have a depth.
+
+    Args:
+        node: the place.
+        view: the image's features.
+        settings: when an image counts as recognised; None for the defaults.
+        rng: draws hypotheses.
+
+    Returns:
+        A recognition, or why there is none.
+    """
+    unknown = np.full(len(view), np.nan, np.float32)
+    seen = Landmarks(view.pixels, view.codes, unknown, unknown)
+    return _examine(node.landmarks, node.camera, seen, view.camera, settings or RecognitionSettings(), rng)
+
+
+def examine_nodes(
+    a: Node, b: Node, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | Refusal:
+    """Compare two nodes, with the landmarks' depths on both sides, in one joint estimate.
+
+    Where a's landmark has a depth, its point must project on b's pixel and, if b has a depth too, lie at that
+    depth; where only b's has, its point must project on a's pixel.
+
+    Args:
+        a: one place.
+        b: the other.
+        settings: when two nodes count as the same place; None for the defaults.
+        rng: draws hypotheses.
+
+    Returns:
+        A recognition whose `node_from_robot` is `a_from_b`, or why there is none.
+    """
+    return _examine(a.landmarks, a.camera, b.landmarks, b.camera, settings or RecognitionSettings(), rng)
+
+
+def _examine(
+    a: Landmarks,
+    camera_a: Camera,
+    b: Landmarks,
+    camera_b: Camera,
+    s: RecognitionSettings,
+    rng: np.random.Generator,
+) -> Recognition | Refusal:
+    pairs = match(a.codes, b.codes, s.matching)
+    forward = a.has_depth[pairs[:, 0]]
+    backward = ~forward & b.has_depth[pairs[:, 1]]
+    usable = np.concatenate([pairs[forward], pairs[backward]])
+    if len(usable) < s.least_inliers:
+        words = f"{len(pairs)} features match, {len(usable)} with a depth; {s.least_inliers} are needed"
+        return Refusal(words, len(pairs))
+    blocks = [
+        Block(_sightings(a, camera_a, b, camera_b, pairs[forward], s)),
+        Block(_sightings(b, camera_b, a, camera_a, pairs[backward][:, ::-1], s), inverted=True),
+    ]
+    fix = solve_blocks(blocks, rng=rng, settings=s.pose)
+    if fix is None:
+        return Refusal(f"{len(usable)} matches agree on no posture", len(pairs))
+    inliers = usable[fix.inliers]
+    evidence = _evidence(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
+    reason = _objection(evidence, s)
+    if reason:
+        return Refusal(reason, len(pairs), len(inliers))
+    return Recognition(fix.node_from_robot, inliers, len(pairs), len(usable), fix, evidence)
+
+
+def _sightings(
+    known: Landmarks,
+    known_camera: Camera,
+    seen: Landmarks,
+    seen_camera: Camera,
+    pairs: NDArray[Any],
+    s: RecognitionSettings,
+) -> Sightings:
+    """Points of the known side, pixels and depths of the seen side."""
+    known, seen = known.take(pairs[:, 0]), seen.take(pairs[:, 1])
+    return Sightings.build(
+        known.points_in_robot(known_camera),
+        seen.pixels,
+        seen_camera,
+        covariances=known.covariances_in_robot(known_camera, s.pose.pixel_sigma),
+        pixel_sigma=s.pose.pixel_sigma,
+        depths=seen.depths,
+        depth_sigmas=seen.depth_sigmas,
+    )
+
+
+def _evidence(
+    a: Landmarks,
+    camera_a: Camera,
+    b: Landmarks,
+    camera_b: Camera,
+    inliers: NDArray[np.int64],
+    matches: int,
+    usable: int,
+    fix: PlanarFix,
+) -> dict[str, float]:
+    """The numbers that speak for a posture; all finite."""
+    seen_a, seen_b = a.take(inliers[:, 0]), b.take(inliers[:, 1])
+    depths = np.where(seen_a.has_depth, seen_a.depths, seen_b.depths)
+    sigmas = np.sqrt(np.linalg.eigvalsh(fix.node_from_robot.covariance[:2, :2]))
+    return {
+        "inliers": float(len(inliers)),
+        "inliers_a": float(seen_a.has_depth.sum()),
+        "inliers_b": float(seen_b.has_depth.sum()),
+        "inliers_3d": float((seen_a.has_depth & seen_b.has_depth).sum()),
+        "matches": float(matches),
+        "share": len(inliers) / usable,
+        "cells": float(min(_cells(seen_a.pixels, camera_a), _cells(seen_b.pixels, camera_b))),
+        "log_evidence": fix.log_evidence,
+        "mean_square": fix.mean_square,
+        "rms_px": fix.rms_px,
+        "depth": float(np.median(depths)),
+        "sigma_xy": float(sigmas[-1]),
+        "sigma_heading": math.sqrt(float(fix.node_from_robot.covariance[2, 2])),
+    }
+
+
+def _cells(pixels: NDArray[np.float32], camera: Camera) -> int:
+    """How many cells of the grid over the image are occupied."""
+    column = np.clip(pixels[:, 0] * GRID[0] / camera.width, 0, GRID[0] - 1).astype(int)
+    row = np.clip(pixels[:, 1] * GRID[1] / camera.height, 0, GRID[1] - 1).astype(int)
+    return len(np.unique(column * GRID[1] + row))
+
+
+def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
+    """Why a posture is not good enough, in words; empty if it is."""
+    e = evidence
+    inliers = int(e["inliers"])
+    if inliers < s.least_inliers:
+        return f"{inliers} landmarks agree on a posture; {s.least_inliers} are needed"
+    if e["share"] < s.least_share:
+        return f"only {e['share']:.0%} of the matches agree on one posture"
+    if e["cells"] < s.least_cells:
+        return f"the {inliers} landmarks that agree lie in {int(e['cells'])} of {math.prod(GRID)} image cells"
+    if e["log_evidence"] < s.least_evidence:
+        return f"the {inliers} landmarks that agree are hardly better than chance"
+    if e["mean_square"] > s.most_mean_square:
+        return f"the residuals are {math.sqrt(e['mean_square']):.1f} times what they should be"
+    if e["sigma_xy"] > s.most_position_share * e["depth"]:
+        return f"the position is uncertain by {e['sigma_xy']:.2f} m at landmarks {e['depth']:.1f} m away"
+    if e["sigma_heading"] > s.most_heading_sigma:
+        return f"the heading is uncertain by {math.degrees(e['sigma_heading']):.1f} degrees"
+    return ""

@@ -1,0 +1,130 @@
+"""Ways through a hybrid map: A* with the paper's Euclidean weights and heuristic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import networkx as nx
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from hybridmap.pose import Pose2
+
+
+@dataclass(frozen=True)
+class RouteSettings:
+    """What a way costs, in metres. Everything is added to the Euclidean weight, so the heuristic stays below.
+
+    Attributes:
+        per_edge: each hop means one more recognition and one more approach.
+        per_turn: a radian between the headings of two nodes.
+    """
+
+    per_edge: float = 0.02
+    per_turn: float = 0.3
+
+
+@dataclass(frozen=True)
+class Route:
+    """A way, or why there is none.
+
+    Attributes:
+        nodes: from start to goal; empty if there is no way.
+        edges: one fewer, that lead from each node to the next.
+        cost: of the whole way, m.
+        reason: in words, whatever the outcome.
+    """
+
+    nodes: tuple[NodeId, ...]
+    edges: tuple[EdgeId, ...]
+    cost: float
+    reason: str
+
+
+def find_route(
+    hybrid_map: HybridMap,
+    start: NodeId,
+    goal: NodeId,
+    *,
+    postures: Mapping[NodeId, Pose2] | None = None,
+    penalties: Mapping[EdgeId, float] | None = None,
+    blocked: frozenset[EdgeId] = frozenset(),
+    settings: RouteSettings | None = None,
+) -> Route:
+    """Find the cheapest way from node to node.
+
+    An edge costs the Euclidean distance of its two nodes, as in the paper, by `postures`; the heuristic is
+    the distance to the goal by the same postures, so it is admissible and consistent by the triangle
+    inequality, whatever is added. Where no postures are given, each node's own posture in its map is used;
+    between nodes of two maps, whose frames have nothing in common, the heuristic is then zero and a link
+    costs the distance that it measured.
+
+    Args:
+        hybrid_map: nodes and edges; edges to nodes that are not there lead nowhere.
+        start: where the robot is.
+        goal: where it shall be.
+        postures: all in one frame; nodes without one cannot be on the way.
+        penalties: extra cost of edges, m; not negative, negative ones count as none.
+        blocked: edges that must not be used.
+        settings: what a way costs.
+
+    Returns:
+        The way; one node and no edge if start is goal.
+    """
+    s = settings or RouteSettings()
+    for name, node_id in (("start", start), ("goal", goal)):
+        if node_id not in hybrid_map.nodes:
+            return Route((), (), 0.0, f"{name} {node_id} is not in the map")
+        if postures is not None and node_id not in postures:
+            return Route((), (), 0.0, f"{name} {node_id} has no posture in the merged map")
+    if start == goal:
+        return Route((start,), (), 0.0, "already there")
+    places = postures if postures is not None else _own_postures(hybrid_map)
+    graph: nx.Graph = nx.Graph()
+    for edge in hybrid_map.edges.values():
+        if edge.id in blocked or edge.a not in places or edge.b not in places or edge.a == edge.b:
+            continue
+        cost = edge_cost(edge, places, postures is not None, s) + max(
+            (penalties or {}).get(edge.id, 0.0), 0.0
+        )
+        known = graph.get_edge_data(edge.a, edge.b)
+        # Ties go to the smaller id, so that a route does not depend on the order in which edges came.
+        if known is None or (cost, edge.id) < (known["weight"], known["edge"]):
+            graph.add_edge(edge.a, edge.b, weight=cost, edge=edge.id)
+
+    comparable = postures is not None or len({node_id.map for node_id in graph}) <= 1
+
+    def heuristic(node: NodeId, target: NodeId) -> float:
+        return places[node].distance(places[target]) if comparable else 0.0
+
+    try:
+        nodes = nx.astar_path(graph, start, goal, heuristic=heuristic, weight="weight")
+    except (nx.NetworkXNoPath, nx.NodeNotFound):
+        return Route((), (), 0.0, _why_not(hybrid_map, start, goal, blocked))
+    hops = [graph.edges[pair] for pair in zip(nodes[:-1], nodes[1:], strict=True)]
+    cost = sum(hop["weight"] for hop in hops)
+    return Route(tuple(nodes), tuple(hop["edge"] for hop in hops), cost, f"{len(hops)} edges, {cost:.1f} m")
+
+
+def edge_cost(edge: Edge, places: Mapping[NodeId, Pose2], one_frame: bool, settings: RouteSettings) -> float:
+    """What driving an edge costs, m; never less than the distance of its nodes by `places`."""
+    measured = edge.a_from_b.mean
+    relative = places[edge.a].inverse() @ places[edge.b]
+    if not one_frame and edge.a.map != edge.b.map:
+        relative = measured
+    turn = abs(measured.heading) if edge.kind is EdgeKind.TURNED else abs(relative.heading)
+    return relative.distance(Pose2()) + settings.per_edge + settings.per_turn * turn
+
+
+def _own_postures(hybrid_map: HybridMap) -> dict[NodeId, Pose2]:
+    return {node.id: node.map_from_robot.mean for node in hybrid_map.nodes.values()}
+
+
+def _why_not(hybrid_map: HybridMap, start: NodeId, goal: NodeId, blocked: frozenset[EdgeId]) -> str:
+    present = hybrid_map.graph.subgraph(hybrid_map.nodes)
+    if not nx.has_path(present, start, goal):
+        return f"{start} and {goal} are in parts of the map that nothing joins"
+    if blocked:
+        return f"every way from {start} to {goal} is blocked ({len(blocked)} edges)"
+    return f"a node on every way from {start} to {goal} has no posture in the merged map"

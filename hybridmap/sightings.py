@@ -1,0 +1,183 @@
+"""Known points seen in an image of a planar robot: prediction, uncertainty and likelihood.
+
+Geometry, for a robot at (x, y, heading) of the points' frame whose camera stands `mount_forward` ahead of the
+axle and looks along the robot's x axis: with q the point in the robot frame,
+    X = q_x - mount_forward,  Y = q_y,  u = cx - fx Y / X,  v = cy - fy (q_z - mount_height) / X.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.pose import Array, Pose2
+
+NEAREST = 0.05
+"""Points less than this ahead of the optical centre count as not visible, m."""
+
+NO_DEPTH_SIGMA = 1e3
+"""Stands for "depth not measured", m."""
+
+DEPTH_DECADES = math.log(100.0)
+"""A wrong match's depth may be anything over two decades, evenly in its logarithm."""
+
+GATES = (9.21, 11.34)
+"""Chi-square 99 % points for 2 and 3 degrees of freedom."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """N points that are known in one frame and were seen, rightly or wrongly matched, in one image.
+
+    Attributes:
+        points: (N, 3) m, in the frame where the robot's posture is wanted; finite.
+        covariances: (N, 3, 3) m^2, of the points.
+        pixels: (N, 2) px, where the image shows them.
+        camera: that took the image.
+        pixel_sigma: standard deviation of a pixel, px.
+        depths: (N,) m, measured along the optical axis of the image; NaN where not measured.
+        depth_sigmas: (N,) m, of these.
+    """
+
+    points: Array
+    covariances: Array
+    pixels: Array
+    camera: Camera
+    pixel_sigma: float
+    depths: Array
+    depth_sigmas: Array
+
+    @staticmethod
+    def build(
+        points: NDArray[Any],
+        pixels: NDArray[Any],
+        camera: Camera,
+        *,
+        covariances: NDArray[Any] | None = None,
+        pixel_sigma: float = 1.0,
+        depths: NDArray[Any] | None = None,
+        depth_sigmas: NDArray[Any] | None = None,
+    ) -> Sightings:
+        """Fill in what is not given: exact points, no measured depths."""
+        n = len(points)
+        nothing = np.full(n, np.nan)
+        return Sightings(
+            np.asarray(points, dtype=np.float64).reshape(n, 3),
+            np.zeros((n, 3, 3)) if covariances is None else np.asarray(covariances, dtype=np.float64),
+            np.asarray(pixels, dtype=np.float64).reshape(n, 2),
+            camera,
+            pixel_sigma,
+            nothing if depths is None else np.asarray(depths, dtype=np.float64),
+            nothing if depth_sigmas is None else np.asarray(depth_sigmas, dtype=np.float64),
+        )
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.points)
+
+    @property
+    def slopes(self) -> Array:
+        """(N, 2) Y / X and (Z - mount_height) / X of each pixel's ray."""
+        c = self.camera
+        slopes: Array = (np.array([c.cx, c.cy]) - self.pixels) / np.array([c.fx, c.fy])
+        return slopes
+
+    @property
+    def depth_measured(self) -> NDArray[np.bool_]:
+        """(N,) where the image gives a depth too."""
+        return np.isfinite(self.depths) & np.isfinite(self.depth_sigmas)
+
+    def log_ratios(self, poses: Array) -> Array:
+        """How much likelier each sighting is under each posture than as a wrong match.
+
+        A right match is Gaussian around the point's projection, with the point's covariance carried into
+        the image and the pixel's noise added; a wrong one is anywhere in the image. So a point that is hardly
+        known gives little, and one with an uncertain depth must still lie along its own short line.
+
+        Args:
+            poses: (H, 3) m, m, rad, postures of the robot in the points' frame.
+
+        Returns:
+            (H, N) nats; 0 for sightings outside the 99 % gate or behind the camera.
+        """
+        camera = self.camera
+        cos, sin = np.cos(poses[:, 2:3]), np.sin(poses[:, 2:3])
+        dx, dy = self.points[:, 0] - poses[:, 0:1], self.points[:, 1] - poses[:, 1:2]
+        ahead = cos * dx + sin * dy - camera.mount_forward
+        left = cos * dy - sin * dx
+        visible = ahead > NEAREST
+        inverse = 1.0 / np.where(visible, ahead, 1.0)
+        a, b = left * inverse, (self.points[:, 2] - camera.mount_height) * inverse
+        slopes = self.slopes
+        ru, rv = camera.fx * (a - slopes[:, 0]), camera.fy * (b - slopes[:, 1])
+
+        # The points' covariances in the axes of each hypothetical robot, one matrix product an entry.
+        p = self.covariances
+        plan = np.stack([p[:, 0, 0], p[:, 0, 1], p[:, 1, 1]])
+        tilt = np.stack([p[:, 0, 2], p[:, 1, 2]])
+        cc, ss, cs = cos * cos, sin * sin, cos * sin
+        pxx = np.hstack([cc, 2 * cs, ss]) @ plan
+        pyy = np.hstack([ss, -2 * cs, cc]) @ plan
+        pxy = np.hstack([-cs, cc - ss, cs]) @ plan
+        pxz, pyz = np.hstack([cos, sin]) @ tilt, np.hstack([-sin, cos]) @ tilt
+        noise = self.pixel_sigma**2
+        fu, fv = camera.fx * inverse, camera.fy * inverse
+        suu = fu * fu * (a * (a * pxx - 2 * pxy) + pyy) + noise
+        svv = fv * fv * (b * (b * pxx - 2 * pxz) + p[:, 2, 2]) + noise
+        suv = fu * fv * (b * (a * pxx - pxy) - a * pxz + pyz)
+        determinant = suu * svv - suv * suv
+        distance2 = (svv * ru * ru - 2 * suv * ru * rv + suu * rv * rv) / determinant
+
+        area = float(camera.width * camera.height)
+        ratios = math.log(area / (2 * math.pi)) - 0.5 * np.log(determinant) - 0.5 * distance2
+        kept = visible & (distance2 < GATES[0])
+        measured = self.depth_measured
+        if measured.any():
+            # The depth is treated as independent of the pixel here; the refinement does not.
+            depths, sigmas = self.depths[measured], self.depth_sigmas[measured]
+            variance = pxx[:, measured] + sigmas**2
+            depth2 = (ahead[:, measured] - depths) ** 2 / variance
+            ratios[:, measured] += np.log(DEPTH_DECADES * depths) - 0.5 * np.log(2 * math.pi * variance)
+            ratios[:, measured] -= 0.5 * depth2
+            kept[:, measured] &= depth2 < GATES[0]
+        out: Array = np.where(kept, np.maximum(ratios, 0.0), 0.0)
+        return out
+
+    def linearise(self, pose: Pose2, points: Array) -> tuple[Array, Array, Array]:
+        """Predict each sighting and how it changes.
+
+        Args:
+            pose: of the robot in the points' frame.
+            points: (N, 3) m, where to linearise.
+
+        Returns:
+            predicted (N, 3): u px, v px, depth m. By the posture (N, 3, 3), perturbed on the right as in
+            PoseGaussian. By the point (N, 3, 3). Points behind the camera give NaN.
+        """
+        camera = self.camera
+        cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+        dx, dy = points[:, 0] - pose.x, points[:, 1] - pose.y
+        forward, left = cos * dx + sin * dy, cos * dy - sin * dx
+        ahead = forward - camera.mount_forward
+        inverse = 1.0 / np.where(ahead > NEAREST, ahead, np.nan)
+        a, b = left * inverse, (points[:, 2] - camera.mount_height) * inverse
+        predicted = np.stack([camera.cx - camera.fx * a, camera.cy - camera.fy * b, ahead], axis=-1)
+
+        # By the point in robot axes: rows u, v, depth.
+        by_robot = np.zeros((len(points), 3, 3))
+        by_robot[:, 0, 0], by_robot[:, 0, 1] = camera.fx * inverse * a, -camera.fx * inverse
+        by_robot[:, 1, 0], by_robot[:, 1, 2] = camera.fy * inverse * b, -camera.fy * inverse
+        by_robot[:, 2, 0] = 1.0
+        by_point = by_robot.copy()
+        by_point[:, :, 0] = by_robot[:, :, 0] * cos - by_robot[:, :, 1] * sin
+        by_point[:, :, 1] = by_robot[:, :, 0] * sin + by_robot[:, :, 1] * cos
+        # A posture step (dx, dy, dh) moves the point in robot axes by (-dx + dh left, -dy - dh forward).
+        by_pose = np.empty_like(by_robot)
+        by_pose[:, :, :2] = -by_robot[:, :, :2]
+        by_pose[:, :, 2] = by_robot[:, :, 0] * left[:, None] - by_robot[:, :, 1] * forward[:, None]
+        return predicted, by_pose, by_point
