@@ -1,0 +1,156 @@
+"""The exploration drive of the paper: forth and back, features kept in view, obstacles kept away."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.observation import Command, RobotDescription
+from agent.servo.follow import clip
+
+
+@dataclass(frozen=True, slots=True)
+class ImageDriveSettings:
+    """Settings of the exploration drive.
+
+    Attributes:
+        speed: m/s.
+        acceleration: m/s^2, of the speed profile at both ends.
+        centre_gain: 1/s, turns toward the middle of the features.
+        centre_band: rad, the middle may be this far off before it matters: the way stays almost straight.
+        heading_gain: 1/s, holds the heading of the start.
+        border: rad, features nearer to the border than this are about to be lost.
+        min_visible: the drive turns round before fewer features than this have room to the border.
+        slow: m, distance of an obstacle from the edge at which the drive slows.
+        stop: m, distance at which it turns round.
+        deflect: rad/s, largest deflection from an obstacle that is near on one side.
+        cone: rad, rangers within this of the direction of travel matter.
+    """
+
+    speed: float = 0.2
+    acceleration: float = 0.3
+    centre_gain: float = 0.6
+    centre_band: float = 0.06
+    heading_gain: float = 0.8
+    border: float = 0.06
+    min_visible: int = 6
+    slow: float = 0.35
+    stop: float = 0.12
+    deflect: float = 0.15
+    cone: float = 0.9
+
+
+class ImageDrive:
+    """Drives a way forth and back again, steered by the features' bearings alone."""
+
+    def __init__(self, description: RobotDescription, settings: ImageDriveSettings | None = None) -> None:
+        """Prepare for a robot; `start` must come before each drive."""
+        self.settings = settings or ImageDriveSettings()
+        self._description = description
+        self._rangers = np.asarray(description.ranger_bearings, dtype=np.float64)
+        self.start(0.0)
+
+    def start(self, distance: float) -> None:
+        """Begin: `distance` m forth (backward if negative), then back to where the drive began."""
+        self._distance = distance
+        self._outward = True
+        self._turned_at = distance
+        self._reason = "complete"
+
+    def command(
+        self, travelled: float, heading_error: float, bearings: NDArray[Any], proximity: NDArray[Any]
+    ) -> tuple[Command, bool, str]:
+        """One tick.
+
+        Args:
+            travelled: m since the start, signed, forward positive.
+            heading_error: rad, heading now less the heading at the start.
+            bearings: (N,) rad of the tracked features, positive to the left.
+            proximity: (K,) m from the robot's edge.
+
+        Returns:
+            The command, whether the drive is over, and in words what it does or why it turned round.
+        """
+        settings = self.settings
+        bearings = np.asarray(bearings, dtype=np.float64)
+        sense = math.copysign(1.0, self._distance)
+        if self._outward:
+            obstacle = self._free(sense, proximity) <= settings.stop
+            few = sense > 0 and self._safe(bearings) < settings.min_visible
+            if obstacle or few or sense * (self._distance - travelled) <= 0.005:
+                self._outward = False
+                self._turned_at = travelled
+                if obstacle:
+                    self._reason = "turned round: an obstacle " + ("ahead" if sense > 0 else "behind")
+                elif few:
+                    self._reason = "turned round: features were leaving the view"
+        if not self._outward and sense * travelled <= 0.005:
+            return Command(), True, self._reason
+        direction = sense if self._outward else -sense
+        if not self._outward and self._free(direction, proximity) <= settings.stop:
+            return Command(), True, "ended: an obstacle on the way back"
+        forward = direction * self._speed(travelled, self._free(direction, proximity))
+        turn = self._turn(direction, heading_error, bearings, proximity)
+        return Command(forward, turn), False, "driving forth" if self._outward else "driving back"
+
+    def _speed(self, travelled: float, free: float) -> float:
+        """m/s: ramps at both ends of the way, slower toward obstacles."""
+        settings = self.settings
+        ends = (0.0, self._distance) if self._outward else (self._turned_at, 0.0)
+        way = min(abs(travelled - ends[0]), abs(travelled - ends[1]))
+        ramp = math.sqrt(2.0 * settings.acceleration * max(way, 0.0))
+        share = clip(max(free - settings.stop, 0.0) / (settings.slow - settings.stop), 1.0)
+        top = min(settings.speed, self._description.max_forward)
+        return max(min(ramp, top), min(0.03, top)) * max(share, 0.15)
+
+    def _turn(
+        self, direction: float, heading_error: float, bearings: NDArray[Any], proximity: NDArray[Any]
+    ) -> float:
+        """rad/s: hold the heading; give way to features off the middle, and to obstacles on one side."""
+        settings = self.settings
+        turn = -settings.heading_gain * heading_error
+        if len(bearings):
+            middle = float(np.median(bearings))
+            aside = max(abs(middle) - settings.centre_band, 0.0)
+            turn += settings.centre_gain * math.copysign(aside, middle)
+            room = self._description.camera.semi_aperture - settings.border
+            out_left, out_right = int((bearings > room).sum()), int((bearings < -room).sum())
+            turn += 0.15 * settings.centre_gain * (out_left - out_right) / len(bearings)
+        near = self._near(direction, proximity)
+        if len(near):
+            distances, offsets = near.T
+            weight = np.clip((settings.slow - distances) / settings.slow, 0.0, 1.0)
+            # An obstacle ahead on the left pushes to the right; while backing the sides change roles.
+            turn -= direction * settings.deflect * clip(float((weight * np.sign(offsets)).sum()), 1.0)
+        return clip(turn, 0.5 * self._description.max_turn)
+
+    def _near(self, direction: float, proximity: NDArray[Any]) -> NDArray[np.float64]:
+        """(M, 2) distance m and bearing off the direction of travel rad (left of the robot positive)."""
+        distances = np.asarray(proximity, dtype=np.float64)
+        count = min(len(distances), len(self._rangers))
+        behind = 0.0 if direction > 0 else math.pi
+        offsets = np.mod(self._rangers[:count] - behind + math.pi, 2.0 * math.pi) - math.pi
+        chosen = (np.abs(offsets) <= self.settings.cone) & np.isfinite(distances[:count])
+        left = offsets * (1.0 if direction > 0 else -1.0)
+        return np.column_stack([distances[:count][chosen], left[chosen]])
+
+    def _free(self, direction: float, proximity: NDArray[Any]) -> float:
+        """Free way in the direction of travel, m: to the nearest thing within the width of the robot."""
+        near = self._near(direction, proximity)
+        if not len(near):
+            return math.inf
+        radius = self._description.radius
+        reach = near[:, 0] + radius
+        ahead = reach * np.cos(near[:, 1])
+        aside = np.abs(reach * np.sin(near[:, 1]))
+        in_the_way = aside < radius + 0.05
+        return float((ahead - radius)[in_the_way].min()) if in_the_way.any() else math.inf
+
+    def _safe(self, bearings: NDArray[Any]) -> int:
+        """How many features have room to the border."""
+        room = self._description.camera.semi_aperture - self.settings.border
+        return int((np.abs(bearings) <= room).sum())

@@ -1,0 +1,159 @@
+"""Plans: straight legs along the robot's own axis with turns on the spot between them.
+
+Of the extremals of the shortest path in view of a landmark (turns on the spot, straight lines, logarithmic
+spirals; Bhattacharya, Murrieta-Cid and Hutchinson 2007, Salaris et al. 2010) the first two are kept: a spiral
+is met by a few legs, and a leg can be tracked and resumed from anywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.servo.field import Field
+from hybridmap.pose import Array, Pose2, wrap_angle
+
+TURN_STEP = 0.05
+"""rad between two samples of a turn on the spot."""
+
+LEG_STEP = 0.04
+"""m between two samples of a leg."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A straight drive.
+
+    Attributes:
+        heading: of the robot, rad, in goal, on the same branch as the plan's other headings.
+        direction: 1 forward, -1 backward.
+        x: m, where it ends, in goal.
+        y: m, where it ends, in goal.
+        length: m.
+    """
+
+    heading: float
+    direction: float
+    x: float
+    y: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A way to the goal posture.
+
+    Attributes:
+        start: where it begins, in goal; the heading's branch is that of the legs.
+        legs: driven one after another, each after a turn on the spot to its heading.
+        cost: length, turns and legs, m.
+        margin: rad, slack that it keeps.
+    """
+
+    start: Pose2
+    legs: tuple[Leg, ...]
+    cost: float
+    margin: float
+
+    @property
+    def length(self) -> float:
+        """Driven, m."""
+        return sum(leg.length for leg in self.legs)
+
+    def postures(self) -> Array:
+        """(M, 3) x m, y m, heading rad, in goal: the way, densely, with the last turn to heading 0."""
+        return sample(self.start, self.legs)
+
+
+def sample(start: Pose2, legs: Sequence[Leg]) -> Array:
+    """(M, 3) dense postures from a start along legs to the goal's heading (the turn of it nearest)."""
+    parts = []
+    here = start.vector
+    for leg in legs:
+        turned = np.array([here[0], here[1], leg.heading])
+        there = np.array([leg.x, leg.y, leg.heading])
+        parts += [_between(here, turned), _between(turned, there)]
+        here = there
+    final = here.copy()
+    final[2] = 2.0 * math.pi * round(here[2] / (2.0 * math.pi))
+    parts.append(_between(here, final))
+    return np.concatenate(parts)
+
+
+def _between(a: Array, b: Array) -> Array:
+    way, turn = math.hypot(b[0] - a[0], b[1] - a[1]), abs(b[2] - a[2])
+    count = 2 + int(max(way / LEG_STEP, turn / TURN_STEP))
+    return a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
+
+
+@dataclass(frozen=True, slots=True)
+class Price:
+    """What a plan costs besides its length.
+
+    Attributes:
+        turn: m a radian.
+        leg: m a leg.
+    """
+
+    turn: float = 0.12
+    leg: float = 0.05
+
+    def of(self, start: Pose2, legs: Sequence[Leg]) -> float:
+        """Cost of legs from a start, m."""
+        headings = [start.heading, *(leg.heading for leg in legs)]
+        headings.append(2.0 * math.pi * round(headings[-1] / (2.0 * math.pi)))
+        turned = sum(abs(b - a) for a, b in pairwise(headings))
+        return sum(leg.length for leg in legs) + self.turn * turned + self.leg * len(legs)
+
+
+class Surroundings:
+    """Where the robot may stand: enough landmarks in view, and clear of obstacles."""
+
+    def __init__(self, field: Field, obstacles_in_goal: NDArray[Any], clearance: float) -> None:
+        """Join a field of view and obstacles.
+
+        Args:
+            field: of view.
+            obstacles_in_goal: (K, 2) m, points that must not be touched, in goal.
+            clearance: m, least distance of the robot's origin from an obstacle point.
+        """
+        self.field = field
+        self.obstacles = np.asarray(obstacles_in_goal, dtype=np.float64).reshape(-1, 2)
+        self.clearance = clearance
+
+    def distance(self, postures: NDArray[Any]) -> Array:
+        """(...) m from the nearest obstacle point; infinite without any."""
+        if not len(self.obstacles):
+            return np.full(np.shape(postures)[:-1], np.inf)
+        dx = postures[..., 0, None] - self.obstacles[:, 0]
+        dy = postures[..., 1, None] - self.obstacles[:, 1]
+        distance: Array = np.sqrt((dx * dx + dy * dy).min(axis=-1))
+        return distance
+
+    def allowed(self, postures: NDArray[Any], margin: float) -> NDArray[np.bool_]:
+        """(...) whether postures (..., 3) in goal keep both constraints."""
+        fine: NDArray[np.bool_] = self.field.slack(postures) >= margin
+        if len(self.obstacles):
+            fine &= self.distance(postures) >= self.clearance
+        return fine
+
+    def relaxed_at(self, posture: Pose2) -> Surroundings:
+        """The same with a clearance that a robot already too near an obstacle can keep while it leaves."""
+        here = float(self.distance(posture.vector))
+        if here >= self.clearance:
+            return self
+        return Surroundings(self.field, self.obstacles, here - 0.005)
+
+
+def leg_to(x0: float, y0: float, x: float, y: float, heading: float) -> Leg:
+    """The leg from (x0, y0) to (x, y) whose heading, given on some branch, points along or against it."""
+    dx, dy = x - x0, y - y0
+    direction = 1.0 if math.cos(heading) * dx + math.sin(heading) * dy >= 0.0 else -1.0
+    along = math.atan2(direction * dy, direction * dx) if (dx or dy) else heading
+    return Leg(heading + wrap_angle(along - heading), direction, x, y, math.hypot(dx, dy))

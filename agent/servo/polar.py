@@ -1,0 +1,74 @@
+"""Polar coordinates of the robot about the goal, equation (2) of the paper, and bearings, equation (3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Array, Pose2, wrap_angle
+
+TURN = 2.0 * math.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Polar:
+    """Where the robot stands, seen from the goal.
+
+    Attributes:
+        rho: distance to the goal, m.
+        phi: direction of the robot from the goal, rad, in the goal's frame.
+        beta: pi + phi - heading, rad: 0 when the robot faces the goal, +-pi when its back does.
+    """
+
+    rho: float
+    phi: float
+    beta: float
+
+    def pose(self) -> Pose2:
+        """The posture `goal_from_robot` with these coordinates."""
+        heading = wrap_angle(math.pi + self.phi - self.beta)
+        return Pose2(self.rho * math.cos(self.phi), self.rho * math.sin(self.phi), heading)
+
+
+def polar_of(goal_from_robot: Pose2) -> Polar:
+    """Coordinates with phi in [0, 2 pi) and beta in [-pi, pi).
+
+    The cut of phi lies ahead of the goal: a robot that comes from behind (phi near pi, the usual way) never
+    crosses it, and the four laws that come from ahead have a chart on either side of it.
+    """
+    rho = math.hypot(goal_from_robot.x, goal_from_robot.y)
+    phi = math.atan2(goal_from_robot.y, goal_from_robot.x) % TURN
+    return Polar(rho, phi, wrap_angle(math.pi + phi - goal_from_robot.heading))
+
+
+def continued(goal_from_robot: Pose2, before: Polar) -> Polar:
+    """Coordinates on the branch that continues `before`, so that a law that goes on sees no jump."""
+    here = polar_of(goal_from_robot)
+    return Polar(
+        here.rho,
+        before.phi + wrap_angle(here.phi - before.phi),
+        before.beta + wrap_angle(here.beta - before.beta),
+    )
+
+
+def bearings(rho: Any, phi: Any, beta: Any, points_in_goal: NDArray[Any]) -> Array:
+    """Bearings gamma of landmarks from the robot's origin, equation (3).
+
+    Args:
+        rho: (...) m.
+        phi: (...) rad.
+        beta: (...) rad.
+        points_in_goal: (N, 2) or (N, 3) m, in the goal's robot frame.
+
+    Returns:
+        (..., N) rad in [-pi, pi), positive to the left of the optical axis.
+    """
+    rho, phi, beta = (np.asarray(a, dtype=np.float64)[..., None] for a in (rho, phi, beta))
+    points = np.asarray(points_in_goal, dtype=np.float64)
+    direction = np.arctan2(points[:, 1] - rho * np.sin(phi), points[:, 0] - rho * np.cos(phi))
+    gamma: Array = np.mod(direction - phi + beta, TURN) - math.pi
+    return gamma

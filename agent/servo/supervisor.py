@@ -1,0 +1,327 @@
+"""The servo: which law or which leg drives, tick by tick, so that the landmarks stay in view."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.observation import Command, RobotDescription
+from agent.servo.follow import LegFollower, Limits, clip
+from agent.servo.laws import control, saturate
+from agent.servo.obstacles import ObstacleMemory
+from agent.servo.plan import Plan, Surroundings, sample
+from agent.servo.polar import Polar, continued, polar_of
+from agent.servo.rollout import roll_out
+from agent.servo.settings import ServoSettings
+from agent.servo.sight import Sight
+from agent.servo.step import ServoStep, State
+from agent.servo.way import find_plan
+from hybridmap.pose import Array, Pose2, wrap_angle
+
+
+@dataclass(slots=True)
+class _LawDrive:
+    """A law at work: its index and the chart's branch."""
+
+    law: int
+    polar: Polar
+
+
+class Servo:
+    """Parks the robot at the goal, keeping enough landmarks in view at every instant.
+
+    The order of preference: (1) inside the dead zone turn on the spot to the goal's heading; (2) go on with
+    the law at work while its roll-out keeps the constraints; (3) a law whose roll-out parks and costs little
+    more than a plan; (4) a plan of legs, re-made wherever it turns out to be wrong; (5) turn, then retreat,
+    to where landmarks are in view again; (6) say that it is stuck.
+    """
+
+    def __init__(self, description: RobotDescription, settings: ServoSettings | None = None) -> None:
+        """Prepare for a robot.
+
+        Args:
+            description: camera, footprint and limits.
+            settings: defaults if None.
+        """
+        self.settings = settings or ServoSettings()
+        self._description = description
+        share = self.settings.cruise
+        self._limits = Limits(
+            max(description.max_forward, 1e-3) * share, max(description.max_turn, 1e-3) * share
+        )
+        self.start(Pose2(), np.zeros((0, 3)))
+
+    def start(self, goal_from_robot: Pose2, points_in_goal: NDArray[Any]) -> bool:
+        """Take a new goal: forget the way and the obstacles.
+
+        Args:
+            goal_from_robot: where the robot is, in the goal's robot frame.
+            points_in_goal: (N, 3) m, landmarks in the goal's robot frame; rows with NaN are ignored.
+
+        Returns:
+            Whether a way that keeps the landmarks in view is known already.
+        """
+        self.switches = 0
+        self._sight = Sight(self._description.camera, self.settings)
+        self._memory = ObstacleMemory()
+        self._law: _LawDrive | None = None
+        self._plan: Plan | None = None
+        self._leg = 0
+        self._follower: LegFollower | None = None
+        self._broken_laws = 0
+        self._in_dead_zone = False
+        self._settled = 0
+        self._retreat_from: Pose2 | None = None
+        self._wait = 0
+        self._sight.update(goal_from_robot, points_in_goal, None)
+        self._choose(goal_from_robot, self._surroundings(goal_from_robot))
+        return self._law is not None or self._plan is not None
+
+    @property
+    def plan(self) -> Plan | None:
+        """The plan at work, if legs and no law drive."""
+        return self._plan
+
+    def command(
+        self,
+        goal_from_robot: Pose2,
+        points_in_goal: NDArray[Any],
+        visible: NDArray[np.bool_],
+        obstacles: NDArray[Any],
+    ) -> ServoStep:
+        """One tick.
+
+        Args:
+            goal_from_robot: where the robot is now, in the goal's robot frame.
+            points_in_goal: (N, 3) m, landmarks in the goal's robot frame; rows with NaN are ignored.
+            visible: (N,) which of them are tracked now.
+            obstacles: (K, 2) m, in robot, points that the rangers hit now.
+
+        Raises:
+            InvalidValue: landmarks of another shape.
+        """
+        pose = Pose2(goal_from_robot.x, goal_from_robot.y, wrap_angle(goal_from_robot.heading))
+        self._sight.update(pose, points_in_goal, visible)
+        self._memory.add(pose, obstacles)
+        final = self._final_turn(pose)
+        if final is not None:
+            return final
+        surroundings = self._surroundings(pose)
+        if self._sight.field.slack(pose.vector) < self.settings.least_margin:
+            return self._recover(pose, surroundings)
+        self._retreat_from = None
+        for _ in range(3):
+            self._keep_or_drop(pose, surroundings)
+            if self._law is None and self._plan is None:
+                self._choose(pose, surroundings)
+            if self._law is not None:
+                return self._drive_law(pose, surroundings)
+            if self._plan is None:
+                break
+            step = self._drive_leg(pose, surroundings)
+            if step is not None:
+                return step
+        return self._step(
+            Command(), "stuck", "no way keeps the landmarks in view and the obstacles away", pose
+        )
+
+    # ---- constraints
+
+    def _surroundings(self, pose: Pose2) -> Surroundings:
+        """Constraints now; where goal or robot already stand nearer to an obstacle, as near is allowed."""
+        wanted = self._description.radius + self.settings.clearance
+        around = Surroundings(self._sight.planning_field, self._memory.points, wanted)
+        if len(self._memory.points):
+            nearest = float(around.distance(np.array([pose.vector, [0.0, 0.0, 0.0]])).min())
+            floor = self._description.radius + 0.01
+            around.clearance = min(wanted, max(nearest - 0.005, floor))
+        return around
+
+    def _admissible(self, postures: Array, around: Surroundings, margin: float) -> bool:
+        """Whether a way keeps its margin, or at least what the robot has now."""
+        slack = around.field.slack(postures)
+        if slack.min() < min(margin, float(slack[0]) - 0.005):
+            return False
+        distance = around.distance(postures)
+        return bool(distance.min() >= min(around.clearance, float(distance[0]) - 0.005))
+
+    # ---- choice
+
+    def _keep_or_drop(self, pose: Pose2, around: Surroundings) -> None:
+        """Drop the law or plan at work when its way has become inadmissible; let a law relieve a plan."""
+        hard = 0.5 * self.settings.least_margin
+        if self._law is not None:
+            polar = continued(pose, self._law.polar)
+            rollouts = roll_out(polar, self.settings.lambda_, self.settings.dead_zone)
+            working = self._law.law
+            if rollouts.parked[working] and self._admissible(rollouts.postures[working], around, hard):
+                self._law.polar = polar
+            else:
+                self._law = None
+                self._broken_laws += 1
+        elif self._plan is not None:
+            rest = self._plan.legs[self._leg :]
+            here = Pose2(pose.x, pose.y, _branch(pose.heading, self._plan.start.heading))
+            if not self._admissible(sample(here, rest), around, min(hard, self._plan.margin)):
+                self._drop_plan()
+                return
+            cost = self.settings.price.of(here, rest)
+            law = self._best_law(polar_of(pose), around, cost)
+            if law is not None:
+                self._drop_plan()
+                self._take_law(law, pose)
+
+    def _choose(self, pose: Pose2, around: Surroundings) -> None:
+        """Find a way from here: the cheaper of laws and plan, laws favoured."""
+        if self._wait > 0:
+            self._wait -= 1
+            return
+        if math.hypot(pose.x, pose.y) < 1e-9 or self._sight.field.count < self.settings.min_visible:
+            return
+        plan = find_plan(around, pose, self.settings)
+        law = self._best_law(polar_of(pose), around, plan.cost if plan else math.inf)
+        if law is not None:
+            self._take_law(law, pose)
+        elif plan is not None:
+            self._plan, self._leg, self._follower = plan, 0, None
+            self.switches += 1
+        else:
+            self._wait = 5
+
+    def _best_law(self, polar: Polar, around: Surroundings, cost: float) -> int | None:
+        """The cheapest law that parks within the constraints for little more than a cost (m)."""
+        settings = self.settings
+        rollouts = roll_out(polar, settings.lambda_, settings.dead_zone)
+        costs = rollouts.lengths + settings.price.turn * rollouts.turns + settings.price.leg
+        # Each law that had to be given up raises the bar for the next: no endless switching.
+        margin = settings.field_margin * (1.0 + 0.5 * self._broken_laws)
+        limit = cost * (1.0 + settings.law_bonus) + settings.law_bonus_m
+        for law in np.argsort(costs, kind="stable").tolist():
+            if costs[law] > limit:
+                return None
+            if rollouts.parked[law] and self._admissible(rollouts.postures[law], around, margin):
+                return int(law)
+        return None
+
+    def _take_law(self, law: int, pose: Pose2) -> None:
+        self._law = _LawDrive(law, polar_of(pose))
+        self.switches += 1
+
+    def _drop_plan(self) -> None:
+        self._plan, self._follower = None, None
+
+    # ---- motion
+
+    def _final_turn(self, pose: Pose2) -> ServoStep | None:
+        """Inside the dead zone: mend the heading, then settle."""
+        settings = self.settings
+        rho = math.hypot(pose.x, pose.y)
+        self._in_dead_zone = rho <= (
+            settings.position_tolerance if self._in_dead_zone else settings.dead_zone
+        )
+        if not self._in_dead_zone:
+            self._settled = 0
+            return None
+        self._law = None
+        self._drop_plan()
+        if abs(pose.heading) > settings.heading_tolerance:
+            self._settled = 0
+            turn = Command(0.0, clip(-settings.turn_gain * pose.heading, self._limits.turn))
+            return self._step(turn, "turning", "at the goal: turning to its heading", pose)
+        self._settled += 1
+        if self._settled < settings.settle_ticks:
+            return self._step(Command(), "turning", "at the goal: settling", pose)
+        return self._step(Command(), "arrived", "at the goal", pose)
+
+    def _drive_law(self, pose: Pose2, around: Surroundings) -> ServoStep:
+        """Equation (5) with v = rho u, slowed to the limits without a change of curvature."""
+        assert self._law is not None
+        polar, gain = self._law.polar, self.settings.gain
+        u, omega = control(polar.phi, polar.beta, self.settings.lambda_)
+        speeds = saturate(
+            gain * polar.rho * float(u),
+            gain * float(omega[self._law.law]),
+            self._limits.forward,
+            self._limits.turn,
+        )
+        return self._checked(Command(*speeds), "driving", f"law {self._law.law + 1}", pose, around)
+
+    def _drive_leg(self, pose: Pose2, around: Surroundings) -> ServoStep | None:
+        """Follow the plan; None when it has ended or its next leg must be thought over."""
+        plan = self._plan
+        assert plan is not None
+        while self._leg < len(plan.legs):
+            leg = plan.legs[self._leg]
+            if self._follower is None:
+                last = self._leg == len(plan.legs) - 1
+                self._follower = LegFollower(leg, last, self.settings, self._limits)
+            command = self._follower.command(pose)
+            if command is not None:
+                name = f"leg {self._leg + 1} of {len(plan.legs)}"
+                if self._follower.turning:
+                    return self._checked(command, "turning", f"turning to {name}", pose, around)
+                away = leg.direction < 0 and math.hypot(leg.x, leg.y) > math.hypot(pose.x, pose.y)
+                return self._checked(command, "retreating" if away else "driving", name, pose, around)
+            self._leg += 1
+            self._follower = None
+        self._drop_plan()
+        return None
+
+    def _recover(self, pose: Pose2, around: Surroundings) -> ServoStep:
+        """Too few landmarks in view: turn to where more are, else back off along the optical axis."""
+        self._law = None
+        self._drop_plan()
+        offsets = np.linspace(-0.8, 0.8, 33)
+        postures = np.column_stack([np.full(33, pose.x), np.full(33, pose.y), pose.heading + offsets])
+        slack = self._sight.field.slack(postures)
+        fine = np.flatnonzero(slack >= 2.0 * self.settings.least_margin)
+        if len(fine):
+            offset = float(offsets[fine[np.abs(offsets[fine]).argmin()]])
+            turn = clip(self.settings.turn_gain * offset, self._limits.turn)
+            return self._step(Command(0.0, turn), "turning", "turning back to the landmarks", pose)
+        if self._retreat_from is None:
+            self._retreat_from = pose
+        behind = (pose @ Pose2(-0.1)).vector
+        room = self.settings.retreat - pose.distance(self._retreat_from)
+        clear = around.distance(behind) >= min(around.clearance, float(around.distance(pose.vector)))
+        if room > 0 and clear and self._sight.field.count >= self.settings.min_visible:
+            speed = -0.5 * self._limits.forward
+            return self._step(Command(speed, 0.0), "retreating", "backing off to see more landmarks", pose)
+        return self._step(Command(), "stuck", "too few landmarks in view", pose)
+
+    # ---- output
+
+    def _ahead(self, pose: Pose2, command: Command) -> Array:
+        """(T, 3) postures over the look-ahead under a constant command."""
+        times = np.linspace(0.0, self.settings.horizon, 4)
+        turn = command.turn * times
+        chord = command.forward * times * np.sinc(0.5 * turn / math.pi)
+        middle = pose.heading + 0.5 * turn
+        return np.column_stack(
+            [pose.x + chord * np.cos(middle), pose.y + chord * np.sin(middle), pose.heading + turn]
+        )
+
+    def _checked(
+        self, command: Command, state: State, reason: str, pose: Pose2, around: Surroundings
+    ) -> ServoStep:
+        """The last check: a command that would break a constraint within the look-ahead does not leave."""
+        if self._admissible(self._ahead(pose, command), around, 0.0):
+            return self._step(command, state, reason, pose)
+        self._law = None
+        self._drop_plan()
+        return self._step(Command(), state, f"stopped: {reason} would leave what is allowed", pose)
+
+    def _step(self, command: Command, state: State, reason: str, pose: Pose2) -> ServoStep:
+        rooms = self._sight.field.rooms(self._ahead(pose, command))
+        seen = int((rooms >= 0.0).sum(axis=-1).min())
+        law = self._law.law if self._law is not None and state == "driving" else None
+        return ServoStep(command, state, law, reason, seen)
+
+
+def _branch(angle: float, near: float) -> float:
+    """The angle plus the multiple of 2 pi that brings it nearest to another."""
+    return near + wrap_angle(angle - near)
