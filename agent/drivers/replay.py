@@ -1,0 +1,179 @@
+"""A robot that is a recording: the same pipeline runs on camera images and odometry from a folder.
+
+Layout of a recording (README, "Recordings"): `images/`, `camera.toml`, `times.txt`, `odometry.csv`, and
+optionally `splits.toml`, which cuts it into robots. `truth.csv` is for scoring and is never read here.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from agent.observation import Command, Observation, Odometry, RobotDescription
+from hybridmap.camera import Camera
+from hybridmap.errors import DeviceError, InvalidValue
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
+AXLE_PER_HEIGHT = 0.9
+"""A recording does not say how wide its robot is; taller ones are wider."""
+
+
+def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, float]]:
+    """Read a `camera.toml`: px, and metres above the floor.
+
+    Returns:
+        The camera and the five coefficients of its lens.
+
+    Raises:
+        DeviceError: the file is missing or wrong.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        camera = Camera(
+            width=int(values["width"]), height=int(values["height"]), fx=float(values["fx"]),
+            fy=float(values["fy"]), cx=float(values["cx"]), cy=float(values["cy"]),
+            mount_height=float(values["height_m"]), mount_forward=float(values.get("forward_m", 0.0)),
+        )  # fmt: skip
+        k1, k2, p1, p2, k3 = (float(k) for k in values.get("distortion", (0.0,) * 5))
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file; it must give the camera's intrinsics") from None
+    except KeyError as missing:
+        raise DeviceError(f"{path}: {missing.args[0]!r} is missing") from None
+    except (OSError, ValueError, TypeError, InvalidValue) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    return camera, (k1, k2, p1, p2, k3)
+
+
+class Replay:
+    """The Robot protocol over a recording. It takes no commands."""
+
+    def __init__(self, folder: Path, robot: str | None = None) -> None:
+        """Open a recording.
+
+        Args:
+            folder: the recording.
+            robot: which robot of its `splits.toml`; None plays all frames.
+
+        Raises:
+            DeviceError: something is missing or wrong, in one line.
+        """
+        if not folder.is_dir():
+            raise DeviceError(
+                f"{folder}: no such folder; a recording is a folder with images/ and camera.toml"
+            )
+        self._camera, self._distortion = read_camera(folder / "camera.toml")
+        images = [p for p in (folder / "images").glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+        if not images:
+            raise DeviceError(f"{folder}: no images in images/ (png, jpg, pgm or bmp)")
+        self._images = sorted(images, key=_natural_order)
+        self._times = _read_times(folder / "times.txt", len(self._images))
+        self._odometry = _read_odometry(folder / "odometry.csv", len(self._images))
+        self._frames = _read_split(folder / "splits.toml", robot, len(self._images))
+        self._position = 0
+
+    def __len__(self) -> int:
+        """How many observations there are."""
+        return len(self._frames)
+
+    def describe(self) -> RobotDescription:
+        """The camera; no rangers and no wheels to command."""
+        tick = float(np.median(np.diff(self._times))) * self._frames.step if len(self._times) > 1 else 0.1
+        return RobotDescription(
+            camera=self._camera,
+            distortion=self._distortion,
+            axle=AXLE_PER_HEIGHT * max(self._camera.mount_height, 0.1),
+            max_forward=0.0,
+            max_turn=0.0,
+            tick=tick,
+        )
+
+    def sense(self) -> Observation | None:
+        """The next frame with the odometry since the one before; None at the end.
+
+        Raises:
+            DeviceError: an image cannot be read.
+        """
+        if self._position >= len(self._frames):
+            return None
+        frame = self._frames[self._position]
+        before = self._frames[self._position - 1] if self._position else frame
+        self._position += 1
+        path = self._images[frame]
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise DeviceError(f"{path}: not an image that can be read")
+        if image.shape != (self._camera.height, self._camera.width):
+            raise DeviceError(
+                f"{path}: {image.shape[1]}x{image.shape[0]} px, but camera.toml says "
+                f"{self._camera.width}x{self._camera.height}"
+            )
+        forward, turn = self._odometry[before + 1 : frame + 1].sum(axis=0)
+        stamp_ns = round(self._times[frame] * 1e9)
+        return Observation(stamp_ns, Odometry(float(forward), float(turn)), np.asarray(image, np.uint8))
+
+    def act(self, command: Command) -> Command:
+        """Nothing moves: what is applied is always standing still."""
+        return Command()
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+def _natural_order(path: Path) -> tuple[list[int], str]:
+    return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.name
+
+
+def _read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    if not path.exists():
+        return np.arange(count) * 0.1
+    try:
+        times = np.array([float(line) for line in path.read_text().split()])
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    if len(times) != count or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise DeviceError(f"{path}: {len(times)} times for {count} images; they must be one each and ascend")
+    return times
+
+
+def _read_odometry(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """(count, 2) forward m and turn rad since the image before."""
+    try:
+        with path.open(newline="") as file:
+            rows = [(float(r["forward_m"]), float(r["turn_rad"])) for r in csv.DictReader(file)]
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file; without odometry nothing tells the map's scale") from None
+    except KeyError as missing:
+        raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
+    except (OSError, ValueError, TypeError) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    if len(rows) != count or not all(math.isfinite(v) for row in rows for v in row):
+        raise DeviceError(f"{path}: {len(rows)} rows for {count} images; there must be one finite row each")
+    return np.array(rows)
+
+
+def _read_split(path: Path, robot: str | None, count: int) -> range:
+    if robot is None:
+        return range(count)
+    try:
+        robots = {str(r["name"]): r for r in tomllib.loads(path.read_text(encoding="utf-8")).get("robot", [])}
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file; without it there is no robot {robot!r}") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    if robot not in robots:
+        raise DeviceError(f"{path}: no robot {robot!r}; there are {', '.join(sorted(robots)) or 'none'}")
+    split = robots[robot]
+    try:
+        frames = range(int(split["first"]), int(split["last"]) + 1, int(split.get("step", 1)))
+    except (KeyError, ValueError, TypeError) as error:
+        raise DeviceError(f"{path}: robot {robot!r}: {error}") from None
+    if not len(frames) or frames[0] < 0 or frames[-1] >= count:
+        raise DeviceError(f"{path}: robot {robot!r}: frames {frames} are not within the {count} images")
+    return frames

@@ -1,0 +1,158 @@
+"""A robot's link to its fleet: changes and status out, missions in, questions asked without waiting."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from typing import Any
+
+import msgpack
+
+from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question, WhereAmI
+from agent.pipeline import Status
+from hybridmap.errors import InvalidMessage, MapweaveError
+from hybridmap.node import MapId, NodeId
+from wire.bus import Bus, Request
+from wire.keys import Keys
+from wire.messages import (
+    RouteRequest,
+    decode_relocalize_answer,
+    decode_route_answer,
+    encode_route_request,
+    encode_view,
+)
+
+NO_ANSWER = "no map server answered"
+
+
+def encode_mission(mission: Mission) -> bytes:
+    """An operator's command as a message."""
+    name = type(mission).__name__.lower()
+    node = str(mission.node) if isinstance(mission, GoTo) else ""
+    return bytes(msgpack.packb({"version": 1, "mission": name, "node": node}))
+
+
+def decode_mission(payload: bytes) -> Mission:
+    """Read an operator's command.
+
+    Raises:
+        InvalidMessage: it is none.
+    """
+    try:
+        message = msgpack.unpackb(payload)
+        name, node = str(message["mission"]), str(message.get("node", ""))
+    except (ValueError, KeyError, TypeError, AttributeError, msgpack.UnpackException) as error:
+        raise InvalidMessage(f"not a mission: {error}") from None
+    plain: dict[str, Mission] = {"idle": Idle(), "explore": Explore(), "carried": Carried()}
+    if name in plain:
+        return plain[name]
+    if name == "goto":
+        return GoTo(NodeId.parse(node))
+    raise InvalidMessage(f"no mission {name!r}; known are idle, explore, carried and goto")
+
+
+def encode_status(status: Status, stamp_ns: int) -> bytes:
+    """What the robot is doing, for people and for tests."""
+    pose = status.map_from_robot
+    message: dict[str, Any] = {
+        "version": 1, "stamp_ns": stamp_ns, "doing": status.doing, "detail": status.detail,
+        "nodes": status.nodes, "tracked": status.tracked, "finished": status.finished,
+        "map_from_robot": [pose.x, pose.y, pose.heading],
+        "fix_node": "" if status.fix_node is None else str(status.fix_node),
+        "node_from_robot": status.node_from_robot.vector.tolist(),
+        "legs": status.legs, "mission": status.mission,
+    }  # fmt: skip
+    return bytes(msgpack.packb(message))
+
+
+class FleetLink:
+    """Runs beside the robot's loop; nothing here makes the loop wait, unless it asks to."""
+
+    def __init__(self, bus: Bus, keys: Keys, map_id: MapId, answer_timeout: float = 3.0) -> None:
+        """Announce the agent and listen for missions.
+
+        Args:
+            bus: the connection.
+            keys: of the fleet.
+            map_id: the map that the agent makes.
+            answer_timeout: how long a question may take, s.
+        """
+        self._bus = bus
+        self._keys = keys
+        self._agent = map_id.agent
+        self._timeout = answer_timeout
+        self._missions: queue.SimpleQueue[Mission] = queue.SimpleQueue()
+        self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
+        self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._open_questions = 0
+        self._closing = [
+            bus.serve(keys.mission(map_id.agent), self._take_mission),
+            bus.announce(keys.agent_alive(map_id)),
+        ]
+        self._asker = threading.Thread(target=self._ask_all, name="questions", daemon=True)
+        self._asker.start()
+
+    def missions(self) -> list[Mission]:
+        """Commands that came since the last call."""
+        out: list[Mission] = []
+        while not self._missions.empty():
+            out.append(self._missions.get())
+        return out
+
+    def report(self, status: Status, stamp_ns: int) -> None:
+        """Tell people what the robot is doing. Best effort."""
+        self._bus.publish(self._keys.agent_status(self._agent), encode_status(status, stamp_ns))
+
+    def ask(self, question: Question) -> None:
+        """Send a question; its answer comes with a later `answers`."""
+        self._open_questions += 1
+        self._asked.put(question)
+
+    def answers(self, wait: bool = False) -> tuple[Answer, ...]:
+        """Answers that have come.
+
+        Args:
+            wait: until every question has its answer or its time is over. A simulation in lock-step waits,
+                so that its result does not depend on the machine's speed; a robot never does.
+        """
+        out: list[Answer] = []
+        while self._open_questions and (wait or not self._answered.empty()):
+            out.append(self._answered.get())
+            self._open_questions -= 1
+        return tuple(out)
+
+    def close(self) -> None:
+        """Withdraw from the fleet."""
+        self._asked.put(None)
+        for closing in self._closing:
+            closing.close()
+        self._asker.join(self._timeout + 1.0)
+
+    def _take_mission(self, request: Request) -> None:
+        mission = decode_mission(request.payload)
+        self._missions.put(mission)
+        request.reply(b"ok")
+
+    def _ask_all(self) -> None:
+        while (question := self._asked.get()) is not None:
+            self._answered.put(self._answer(question))
+
+    def _answer(self, question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            key, payload = self._keys.any_relocalize(), encode_view(question.view)
+        else:
+            request = RouteRequest(question.start, question.goal, question.blocked)
+            key, payload = self._keys.any_route(), encode_route_request(request)
+        replies = self._bus.ask(key, payload, self._timeout)
+        error = NO_ANSWER if not replies else ""
+        for reply in replies:
+            if reply.error:
+                error = reply.error
+                continue
+            try:
+                if isinstance(question, WhereAmI):
+                    return Answer(question.number, decode_relocalize_answer(reply.payload))
+                return Answer(question.number, decode_route_answer(reply.payload))
+            except MapweaveError as refused:
+                error = str(refused)
+        return Answer(question.number, None, error)

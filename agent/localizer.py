@@ -1,0 +1,121 @@
+"""Where the robot is with respect to one node: recognised by SIFT, then tracked and filtered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from hybridmap.recognition import Recognition
+from numpy.typing import NDArray
+
+from agent.ekf.localization import LocalizationFilter, LocalizationSettings
+from agent.observation import Observation, RobotDescription
+from agent.vision.lens import Lens
+from agent.vision.sift import Features
+from agent.vision.tracker import Tracker, TrackerSettings
+from hybridmap.node import Node
+from hybridmap.pose import Array, PoseGaussian
+
+
+@dataclass(frozen=True)
+class LocalizerSettings:
+    """When a node's landmarks count as in sight.
+
+    Attributes:
+        tracker: tracks of the node's landmarks.
+        filter: the localization EKF.
+        least: landmarks that must be tracked (paper, section 6: n >= 4).
+        strikes: a track that the filter refuses this often in a row is given up.
+    """
+
+    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    filter: LocalizationSettings = field(default_factory=LocalizationSettings)
+    least: int = 4
+    strikes: int = 3
+
+
+class Localizer:
+    """Follows one node's landmarks. Track ids are the landmarks' indices in the node.
+
+    Attributes:
+        node: the node that the posture refers to.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        node: Node,
+        image: NDArray[np.uint8],
+        features: Features,
+        recognition: Recognition,
+        settings: LocalizerSettings | None = None,
+    ) -> None:
+        """Start from a recognition of the node in an image's features."""
+        self.node = node
+        self._settings = settings or LocalizerSettings()
+        self._description = description
+        self._tracker = Tracker(lens, self._settings.tracker)
+        self._tracker.track(image)
+        landmarks, seen = recognition.pairs[:, 0], recognition.pairs[:, 1]
+        self._tracker.add(landmarks.astype(np.int64), features.raw[seen])
+        self._strikes = np.zeros(len(node.landmarks), np.int64)
+        self._filter = LocalizationFilter(
+            description.camera,
+            description.axle,
+            description.wheel_noise,
+            recognition.node_from_robot,
+            landmarks.astype(np.int64),
+            node.points_in_robot[landmarks],
+            node.landmarks.covariances_in_robot(node.camera)[landmarks],
+            settings=self._settings.filter,
+        )
+
+    @property
+    def pose(self) -> PoseGaussian:
+        """`node_from_robot` now."""
+        return self._filter.pose
+
+    @property
+    def visible(self) -> NDArray[np.int64]:
+        """Indices of the node's landmarks that are tracked now."""
+        return self._tracker.ids
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) px, where they are seen."""
+        return self._tracker.pixels
+
+    @property
+    def in_sight(self) -> bool:
+        """Whether enough landmarks are tracked and the filter trusts itself."""
+        return len(self._tracker.ids) >= self._settings.least and self._filter.healthy
+
+    def step(self, observation: Observation) -> None:
+        """One tick: predict by the wheels, follow the landmarks, correct."""
+        self._filter.predict(observation.odometry)
+        if observation.image is None:
+            return
+        self._tracker.track(observation.image, self._expected())
+        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
+        ids = self._tracker.ids
+        if len(ids):
+            report = self._filter.update(ids, self._tracker.pixels)
+            self._strikes[ids] = np.where(report.accepted, 0, self._strikes[ids] + 1)
+            bad = self._strikes[ids] >= self._settings.strikes
+            if bad.any():
+                self._filter.remove(ids[bad])
+                self._tracker.keep(~bad)
+
+    def _expected(self) -> Array:
+        """(N, 2) px where the tracks should be now, in the tracks' order."""
+        predicted = self._filter.predict_pixels()
+        order = np.argsort(self._filter.ids)
+        ids = self._filter.ids[order]
+        expected = np.full((len(self._tracker.ids), 2), np.nan)
+        if len(ids):
+            place = np.clip(np.searchsorted(ids, self._tracker.ids), 0, len(ids) - 1)
+            hit = ids[place] == self._tracker.ids
+            expected[hit] = predicted[order[place[hit]]]
+            expected[~self._description.camera.contains(expected)] = np.nan
+        return expected

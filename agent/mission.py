@@ -1,0 +1,70 @@
+"""What an operator wants of a robot, and what the pipeline asks of the fleet: plain values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hybridmap.node import NodeId
+from hybridmap.query import RelocalizeAnswer, RouteAnswer, View
+
+
+@dataclass(frozen=True)
+class Idle:
+    """Stand still."""
+
+
+@dataclass(frozen=True)
+class Explore:
+    """Map whatever can be reached."""
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Map while somebody else moves the robot."""
+
+
+@dataclass(frozen=True)
+class GoTo:
+    """Park where a node's image was taken; the node may be another robot's."""
+
+    node: NodeId
+
+
+Mission = Idle | Explore | Carried | GoTo
+
+
+@dataclass(frozen=True, eq=False)
+class WhereAmI:
+    """Question to the fleet's map: where was this view taken?"""
+
+    number: int
+    view: View
+
+
+@dataclass(frozen=True)
+class WhichWay:
+    """Question to the fleet's map: how to get from one node to another?
+
+    Attributes:
+        number: of the question; the answer repeats it.
+        start: node where the robot is.
+        goal: node where it wants to be.
+        blocked: pairs of nodes between which it could not drive.
+    """
+
+    number: int
+    start: NodeId
+    goal: NodeId
+    blocked: tuple[tuple[NodeId, NodeId], ...] = ()
+
+
+Question = WhereAmI | WhichWay
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What came back. `content` is None when nobody answered; `error` says what is known of the reason."""
+
+    number: int
+    content: RelocalizeAnswer | RouteAnswer | None
+    error: str = ""

@@ -1,0 +1,61 @@
+"""Recognising places of the robot's own map, without any server."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from hybridmap.recognition import Recognition, recognise
+
+from hybridmap.descriptor import decode
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Node
+from hybridmap.query import View
+
+
+@dataclass(frozen=True)
+class RecallSettings:
+    """How places are looked up.
+
+    Attributes:
+        tries: nodes that are verified, by descending votes.
+        votes: a node with fewer votes is not tried.
+    """
+
+    tries: int = 5
+    votes: int = 6
+
+
+def recall(
+    hybrid_map: HybridMap, view: View, rng: np.random.Generator, settings: RecallSettings | None = None
+) -> tuple[Node, Recognition] | None:
+    """Find the node of a robot's own map that a view shows best (paper, section 5: the kidnapped robot).
+
+    Every feature votes for the node that holds its nearest descriptor; the nodes with most votes are
+    verified by geometry. One robot's map is small, so all descriptors are compared.
+
+    Args:
+        hybrid_map: the robot's own map.
+        view: what it sees now.
+        rng: for the verification's random samples.
+        settings: how many to try.
+
+    Returns:
+        The node with the most inliers and how it was recognised, or None.
+    """
+    settings = settings or RecallSettings()
+    nodes = [n for n in hybrid_map.nodes.values() if len(n.landmarks)]
+    if not nodes or not len(view):
+        return None
+    known = np.concatenate([decode(n.landmarks.codes) for n in nodes])
+    owner = np.repeat(np.arange(len(nodes)), [len(n.landmarks) for n in nodes])
+    nearest = (decode(view.codes) @ known.T - 0.5 * (known**2).sum(axis=1)).argmax(axis=1)
+    votes = np.bincount(owner[nearest], minlength=len(nodes))
+    best: tuple[Node, Recognition] | None = None
+    for index in np.argsort(-votes, kind="stable")[: settings.tries]:
+        if votes[index] < settings.votes:
+            break
+        found = recognise(nodes[index], view, None, rng)
+        if found is not None and (best is None or found.inliers > best[1].inliers):
+            best = (nodes[index], found)
+    return best

@@ -1,0 +1,63 @@
+"""`mapweave agent`: one robot."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hybridmap.node import check_name
+from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "agent",
+        help="run one robot's agent",
+        description="Run one robot: its whole pipeline, its own map on its own disk, its link to the fleet. "
+        "Without a network it goes on mapping; what it mapped is sent when a server can be reached.",
+    )
+    parser.add_argument("name", help="the robot's name in the fleet, for example r0")
+    parser.add_argument(
+        "--driver", choices=["remote"], default="remote", help="remote: a body behind Zenoh keys (simulator)"
+    )
+    parser.add_argument(
+        "--mission", choices=["idle", "explore"], default="explore", help="what to do at the start"
+    )
+    parser.add_argument("--data", type=Path, default=Path("out/agent"), help="folder for the robot's map")
+    parser.add_argument("--epoch", type=int, help="number of the new map (default: from the clock)")
+    parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
+    parser.add_argument(
+        "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
+    )
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the robot until its body ends or the process is told to stop."""
+    from mapweave.agent_process import AgentOptions, run_agent
+    from agent.drivers.remote import RemoteRobot
+    from agent.mission import Explore, Idle
+
+    name = check_name(arguments.name)
+    settings = settings_of(arguments)
+    network = network_of(arguments, settings)
+    stop = stop_on_signals()
+    bus, keys = connect(network)
+    try:
+        robot = RemoteRobot(bus, network.fleet, name)
+        options = AgentOptions(
+            name=name,
+            data=arguments.data,
+            epoch=arguments.epoch,
+            mission=Explore() if arguments.mission == "explore" else Idle(),
+            seed=arguments.seed,
+            lockstep=arguments.lockstep,
+            server=network.server,
+        )
+        run_agent(robot, bus, keys, settings.pipeline, options, stop)
+    finally:
+        bus.close()
+    return 0

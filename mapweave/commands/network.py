@@ -1,0 +1,55 @@
+"""Arguments and connections that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+from pathlib import Path
+
+from mapweave.settings import NetworkSettings, Settings, load_settings
+from wire.bus_settings import BusSettings
+from wire.keys import Keys
+from wire.zenoh_bus import ZenohBus
+
+
+def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
+    """Arguments with which a process finds its fleet."""
+    group = parser.add_argument_group("network")
+    group.add_argument("--fleet", metavar="NAME", help="name that robots and server share (default: demo)")
+    word = "listen at" if listens else "connect to"
+    group.add_argument(
+        f"--{'listen' if listens else 'connect'}",
+        metavar="ENDPOINT",
+        dest="endpoint",
+        help=f"Zenoh endpoint to {word} (default: tcp/127.0.0.1:7447)",
+    )
+    parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; the command line overrides it")
+
+
+def settings_of(arguments: argparse.Namespace) -> Settings:
+    """The settings file with the command line over it."""
+    return load_settings(arguments.settings)
+
+
+def network_of(arguments: argparse.Namespace, settings: Settings) -> NetworkSettings:
+    """Where the fleet is: the command line over the settings."""
+    given = settings.network
+    return NetworkSettings(
+        fleet=arguments.fleet or given.fleet,
+        endpoints=(arguments.endpoint,) if arguments.endpoint else given.endpoints,
+        server=given.server,
+    )
+
+
+def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
+    """A client connection; it opens in the background and survives a router that comes and goes."""
+    return ZenohBus(BusSettings(mode="client", endpoints=network.endpoints)), Keys(network.fleet)
+
+
+def stop_on_signals() -> threading.Event:
+    """An event that SIGTERM and Ctrl-C set, so that a process can end in order."""
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    return stop

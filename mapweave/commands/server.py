@@ -1,0 +1,50 @@
+"""`mapweave server`: the map server, with the Zenoh router inside."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "server",
+        help="run the map server and the router",
+        description="Keep every robot's map, merge them, tell lost robots where they are and give routes. "
+        "The Zenoh router that robots connect to runs inside.",
+    )
+    parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
+    parser.add_argument("--data", type=Path, default=Path("out/server"), help="folder for the store")
+    add_network(parser, listens=True)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until told to stop."""
+    from mapserver.server import MapServer
+    from wire.bus_settings import BusSettings
+    from wire.keys import Keys
+    from wire.zenoh_bus import ZenohBus
+
+    settings = settings_of(arguments)
+    network = network_of(arguments, settings)
+    stop = stop_on_signals()
+    bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
+    try:
+        name = arguments.name or network.server
+        with MapServer(bus, Keys(network.fleet), arguments.data / f"{name}.sqlite", name) as server:
+            where = ", ".join(network.endpoints)
+            print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
+            said = ""
+            while not stop.wait(1.0):
+                now = server.summary()
+                if now != said:
+                    print(now, flush=True)
+                    said = now
+    finally:
+        bus.close()
+    return 0

@@ -1,0 +1,70 @@
+"""A world that needs no simulator: a photograph hung on two walls, rendered by an exact homography."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+
+from agent.observation import Observation, Odometry, RobotDescription
+from hybridmap.camera import Camera
+from hybridmap.pose import Pose2
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
+DESCRIPTION = RobotDescription(camera=CAMERA)
+
+
+class PhotoWalls:
+    """A near wall on the left and a far wall on the right, facing the robot, each with a photograph."""
+
+    def __init__(self) -> None:
+        """Hang the pictures: each is 2.4 m wide, and px of the picture are metres of the wall."""
+        left = cv2.cvtColor(skimage.data.astronaut(), cv2.COLOR_RGB2GRAY)
+        right = cv2.cvtColor(skimage.data.coffee(), cv2.COLOR_RGB2GRAY)
+        # (picture, x of the wall, y of its left edge, z of its top edge), m in world
+        self.walls = [(right, 3.2, 0.2, 1.5, 2.6), (left, 2.2, 1.9, 1.3, 1.8)]
+
+    def depth_at(self, world_from_robot: Pose2, pixels: np.ndarray) -> np.ndarray:
+        """True depth along the optical axis at pixels of a robot that looks along x exactly."""
+        assert world_from_robot.heading == 0.0
+        near = self.walls[1]
+        depth = near[1] - world_from_robot.x
+        y = world_from_robot.y - (pixels[:, 0] - CAMERA.cx) / CAMERA.fx * depth
+        on_near = (y <= near[2]) & (y >= near[2] - near[4])
+        return np.where(on_near, depth, self.walls[0][1] - world_from_robot.x)
+
+    def render(self, world_from_robot: Pose2) -> np.ndarray:
+        """(240, 320) grey."""
+        image = np.full((CAMERA.height, CAMERA.width), 128, np.uint8)
+        for picture, x, y, z, width in self.walls:
+            scale = width / picture.shape[1]
+            height = scale * picture.shape[0]
+            corners = np.array([[x, y, z], [x, y - width, z], [x, y - width, z - height], [x, y, z - height]])
+            seen = CAMERA.project(world_from_robot.inverse().apply(corners))
+            size = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (picture.shape[1], picture.shape[0]) - 0.5
+            to_image = cv2.getPerspectiveTransform(size.astype(np.float32), seen.astype(np.float32))
+            soft = cv2.GaussianBlur(picture, (0, 0), 1.0)
+            size_out = (CAMERA.width, CAMERA.height)
+            drawn = cv2.warpPerspective(soft, to_image, size_out, flags=cv2.INTER_AREA)
+            mask = cv2.warpPerspective(np.full_like(soft, 255), to_image, size_out)
+            image = np.where(mask > 127, drawn, image).astype(np.uint8)
+        return image
+
+    def observe(self, before: Pose2, now: Pose2, tick: int) -> Observation:
+        """What a robot with perfect wheels senses after moving from one posture to another."""
+        moved = before.inverse() @ now
+        forward = float(np.hypot(moved.x, moved.y)) * (1.0 if moved.x >= 0 else -1.0)
+        return Observation(tick * 100_000_000, Odometry(forward, moved.heading), self.render(now))
+
+
+@pytest.fixture(scope="session")
+def walls() -> PhotoWalls:
+    """The world."""
+    return PhotoWalls()
+
+
+@pytest.fixture
+def description() -> RobotDescription:
+    """The robot in it."""
+    return DESCRIPTION
