@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.servo.field import Field
-from hybridmap.pose import Array, Pose2, wrap_angle
+from hybridmap.pose import Array, Pose2
 
 TURN_STEP = 0.05
 """rad between two samples of a turn on the spot."""
@@ -143,17 +143,24 @@ class Surroundings:
             fine &= self.distance(postures) >= self.clearance
         return fine
 
-    def relaxed_at(self, posture: Pose2) -> Surroundings:
-        """The same with a clearance that a robot already too near an obstacle can keep while it leaves."""
-        here = float(self.distance(posture.vector))
-        if here >= self.clearance:
-            return self
-        return Surroundings(self.field, self.obstacles, here - 0.005)
+    def admits(self, way: NDArray[Any], margin: float) -> bool:
+        """Whether a way (M, 3) that the robot is about to drive keeps both constraints.
+
+        Where the robot already has less room than it should, it must keep what it has.
+        """
+        slack = self.field.slack(way)
+        if slack.min() < min(margin, float(slack[0]) - 0.005):
+            return False
+        distance = self.distance(way)
+        return bool(distance.min() >= min(self.clearance, float(distance[0]) - 0.005))
 
 
-def leg_to(x0: float, y0: float, x: float, y: float, heading: float) -> Leg:
-    """The leg from (x0, y0) to (x, y) whose heading, given on some branch, points along or against it."""
-    dx, dy = x - x0, y - y0
-    direction = 1.0 if math.cos(heading) * dx + math.sin(heading) * dy >= 0.0 else -1.0
-    along = math.atan2(direction * dy, direction * dx) if (dx or dy) else heading
-    return Leg(heading + wrap_angle(along - heading), direction, x, y, math.hypot(dx, dy))
+def arc(pose: Pose2, forward: float, turn: float, seconds: float, count: int = 4) -> Array:
+    """(count, 3) postures from a pose on, under constant speeds (m/s, rad/s)."""
+    times = np.linspace(0.0, seconds, count)
+    turned = turn * times
+    chord = forward * times * np.sinc(0.5 * turned / math.pi)
+    middle = pose.heading + 0.5 * turned
+    return np.column_stack(
+        [pose.x + chord * np.cos(middle), pose.y + chord * np.sin(middle), pose.heading + turned]
+    )

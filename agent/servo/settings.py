@@ -25,6 +25,8 @@ class ServoSettings:
         clearance: m, room between the footprint and obstacles.
         most_landmarks: how many landmarks ways are checked against.
         missed_ticks: a landmark that should be in view and is not tracked this long is not counted on.
+        law_reach: m, nearer than this no law is taken up (one at work goes on): the direction to the goal
+            is noise there, and short legs are surer.
         law_bonus: a law is preferred to a plan up to this share of extra cost.
         law_bonus_m: and up to this extra cost, m.
         horizon: s, look-ahead of the last check before a command leaves.
@@ -48,9 +50,10 @@ class ServoSettings:
     clearance: float = 0.04
     most_landmarks: int = 24
     missed_ticks: int = 10
+    law_reach: float = 0.04
     law_bonus: float = 0.15
     law_bonus_m: float = 0.05
-    horizon: float = 0.3
+    horizon: float = 0.15
     forward_gain: float = 1.5
     turn_gain: float = 2.5
     cruise: float = 1.0

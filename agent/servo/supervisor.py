@@ -13,14 +13,14 @@ from agent.observation import Command, RobotDescription
 from agent.servo.follow import LegFollower, Limits, clip
 from agent.servo.laws import control, saturate
 from agent.servo.obstacles import ObstacleMemory
-from agent.servo.plan import Plan, Surroundings, sample
+from agent.servo.plan import Plan, Surroundings, arc, sample
 from agent.servo.polar import Polar, continued, polar_of
 from agent.servo.rollout import roll_out
 from agent.servo.settings import ServoSettings
 from agent.servo.sight import Sight
 from agent.servo.step import ServoStep, State
 from agent.servo.way import find_plan
-from hybridmap.pose import Array, Pose2, wrap_angle
+from hybridmap.pose import Pose2, wrap_angle
 
 
 @dataclass(slots=True)
@@ -76,7 +76,7 @@ class Servo:
         self._in_dead_zone = False
         self._settled = 0
         self._retreat_from: Pose2 | None = None
-        self._wait = 0
+        self._wait, self._patience = 0, 2
         self._sight.update(goal_from_robot, points_in_goal, None)
         self._choose(goal_from_robot, self._surroundings(goal_from_robot))
         return self._law is not None or self._plan is not None
@@ -141,14 +141,6 @@ class Servo:
             around.clearance = min(wanted, max(nearest - 0.005, floor))
         return around
 
-    def _admissible(self, postures: Array, around: Surroundings, margin: float) -> bool:
-        """Whether a way keeps its margin, or at least what the robot has now."""
-        slack = around.field.slack(postures)
-        if slack.min() < min(margin, float(slack[0]) - 0.005):
-            return False
-        distance = around.distance(postures)
-        return bool(distance.min() >= min(around.clearance, float(distance[0]) - 0.005))
-
     # ---- choice
 
     def _keep_or_drop(self, pose: Pose2, around: Surroundings) -> None:
@@ -158,7 +150,7 @@ class Servo:
             polar = continued(pose, self._law.polar)
             rollouts = roll_out(polar, self.settings.lambda_, self.settings.dead_zone)
             working = self._law.law
-            if rollouts.parked[working] and self._admissible(rollouts.postures[working], around, hard):
+            if rollouts.parked[working] and around.admits(rollouts.postures[working], hard):
                 self._law.polar = polar
             else:
                 self._law = None
@@ -166,7 +158,7 @@ class Servo:
         elif self._plan is not None:
             rest = self._plan.legs[self._leg :]
             here = Pose2(pose.x, pose.y, _branch(pose.heading, self._plan.start.heading))
-            if not self._admissible(sample(here, rest), around, min(hard, self._plan.margin)):
+            if not around.admits(sample(here, rest), min(hard, self._plan.margin)):
                 self._drop_plan()
                 return
             cost = self.settings.price.of(here, rest)
@@ -190,11 +182,15 @@ class Servo:
             self._plan, self._leg, self._follower = plan, 0, None
             self.switches += 1
         else:
-            self._wait = 5
+            # A search that found nothing is dear: wait ever longer before the next, the scene may change.
+            self._patience = min(2 * self._patience, 80)
+            self._wait = self._patience
 
     def _best_law(self, polar: Polar, around: Surroundings, cost: float) -> int | None:
         """The cheapest law that parks within the constraints for little more than a cost (m)."""
         settings = self.settings
+        if polar.rho < settings.law_reach:
+            return None
         rollouts = roll_out(polar, settings.lambda_, settings.dead_zone)
         costs = rollouts.lengths + settings.price.turn * rollouts.turns + settings.price.leg
         # Each law that had to be given up raises the bar for the next: no endless switching.
@@ -203,7 +199,7 @@ class Servo:
         for law in np.argsort(costs, kind="stable").tolist():
             if costs[law] > limit:
                 return None
-            if rollouts.parked[law] and self._admissible(rollouts.postures[law], around, margin):
+            if rollouts.parked[law] and around.admits(rollouts.postures[law], margin):
                 return int(law)
         return None
 
@@ -251,7 +247,7 @@ class Servo:
         return self._checked(Command(*speeds), "driving", f"law {self._law.law + 1}", pose, around)
 
     def _drive_leg(self, pose: Pose2, around: Surroundings) -> ServoStep | None:
-        """Follow the plan; None when it has ended or its next leg must be thought over."""
+        """Follow the plan; None when it has ended short of the goal."""
         plan = self._plan
         assert plan is not None
         while self._leg < len(plan.legs):
@@ -269,7 +265,9 @@ class Servo:
             self._leg += 1
             self._follower = None
         self._drop_plan()
-        return None
+        # A way that has ended within the tolerance is as good as it gets: no further leg for a millimetre.
+        self._in_dead_zone = math.hypot(pose.x, pose.y) <= 0.8 * self.settings.position_tolerance
+        return self._final_turn(pose)
 
     def _recover(self, pose: Pose2, around: Surroundings) -> ServoStep:
         """Too few landmarks in view: turn to where more are, else back off along the optical axis."""
@@ -295,28 +293,18 @@ class Servo:
 
     # ---- output
 
-    def _ahead(self, pose: Pose2, command: Command) -> Array:
-        """(T, 3) postures over the look-ahead under a constant command."""
-        times = np.linspace(0.0, self.settings.horizon, 4)
-        turn = command.turn * times
-        chord = command.forward * times * np.sinc(0.5 * turn / math.pi)
-        middle = pose.heading + 0.5 * turn
-        return np.column_stack(
-            [pose.x + chord * np.cos(middle), pose.y + chord * np.sin(middle), pose.heading + turn]
-        )
-
     def _checked(
         self, command: Command, state: State, reason: str, pose: Pose2, around: Surroundings
     ) -> ServoStep:
         """The last check: a command that would break a constraint within the look-ahead does not leave."""
-        if self._admissible(self._ahead(pose, command), around, 0.0):
+        if around.admits(arc(pose, command.forward, command.turn, self.settings.horizon), 0.0):
             return self._step(command, state, reason, pose)
         self._law = None
         self._drop_plan()
         return self._step(Command(), state, f"stopped: {reason} would leave what is allowed", pose)
 
     def _step(self, command: Command, state: State, reason: str, pose: Pose2) -> ServoStep:
-        rooms = self._sight.field.rooms(self._ahead(pose, command))
+        rooms = self._sight.field.rooms(arc(pose, command.forward, command.turn, self.settings.horizon))
         seen = int((rooms >= 0.0).sum(axis=-1).min())
         law = self._law.law if self._law is not None and state == "driving" else None
         return ServoStep(command, state, law, reason, seen)
