@@ -127,7 +127,7 @@ class _Solver:
         flat = jacobian.reshape(n, 2 * t, 3)
         transposed = np.swapaxes(flat, 1, 2)
         # The small prior only keeps tracks without parallax solvable: sigma 1e3 in slope and 1/m.
-        self.covariances = np.linalg.inv(transposed @ flat + 1e-6 * np.eye(3))
+        self.covariances = np.asarray(np.linalg.inv(transposed @ flat + 1e-6 * np.eye(3)), np.float64)
         weighted = (goal * self.precision[:, None]).reshape(n, 2 * t, 1)
         return (self.covariances @ (transposed @ weighted))[:, :, 0]
 

@@ -1,0 +1,115 @@
+"""The iterated update: linearise again where the first linearisation did not hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.ekf.anchored import see
+from agent.ekf.gating import believe, inverse
+from agent.ekf.node_state import NEAREST_SCALE, NodeState
+from hybridmap.pose import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What an image says of some landmarks.
+
+    Attributes:
+        slots: (N,) their places in the state.
+        slopes: (N, 2) where they are seen, (pixel - principal point) / focal length.
+        variances: (2,) of a slope.
+        gate: chi-square threshold.
+        most: linearisations at most.
+        linear: a slope whose second-order part stays below this needs no further linearisation.
+    """
+
+    slots: NDArray[np.intp]
+    slopes: Array
+    variances: Array
+    gate: float
+    most: int
+    linear: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A corrected state.
+
+    Attributes:
+        state: after the update.
+        accepted: (N,) measurements that were believed.
+        innovations: (N, 2) slopes, measured minus expected, at the first linearisation.
+        mean_nis: normalised innovation squared over its degrees of freedom; NaN if nothing was believed.
+    """
+
+    state: NodeState
+    accepted: NDArray[np.bool_]
+    innovations: Array
+    mean_nis: float
+
+
+def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_forward: float) -> Fit | None:
+    """Correct the state by an image (iterated extended Kalman filter: Gauss-Newton on the MAP cost).
+
+    Args:
+        state: before the update: prior mean and covariance.
+        start: (3,) posture at which to linearise first, the prior's or a better one.
+        seen: the image.
+        mount_forward: of the optical centre ahead of the axle, m.
+
+    Returns:
+        The correction, or None if an iterate had a landmark behind the camera: the prior is too uncertain.
+    """
+    n, slots = len(seen.slots), seen.slots
+    index = (3 + 2 * slots[:, None] + np.arange(2)).ravel()
+    posture, rays = start, state.rays
+    first: Array | None = None
+    accepted: NDArray[np.bool_] = np.ones(n, np.bool_)
+    for _ in range(seen.most):
+        sight = see(posture, rays[slots], mount_forward)
+        if (sight.scale <= NEAREST_SCALE).any():
+            return None
+        by_posture = sight.by_posture[:, :2].reshape(2 * n, 3)
+        by_pair = state.by_pair(sight, slots)[:, :2]
+        columns = by_posture @ state.covariance[:3]
+        columns += (by_pair @ state.covariance[index].reshape(n, 2, -1)).reshape(2 * n, -1)
+        columns = columns.T
+        spread = by_posture @ columns[:3] + (by_pair @ columns[index].reshape(n, 2, -1)).reshape(2 * n, 2 * n)
+        noise = np.tile(seen.variances, (n, 1))
+        noise[:, 1] += state.slope_variance[slots] * sight.by_ray[:, 1, 1] ** 2
+        spread[np.arange(2 * n), np.arange(2 * n)] += noise.ravel()
+        # The prior mean as seen from this linearisation point.
+        pairs = (state.rays - rays)[slots][:, [0, 2]]
+        expected = sight.rays[:, :2] + _linear(by_posture, by_pair, state.posture - posture, pairs)
+        innovations = seen.slopes - expected
+        if first is None:
+            first = innovations
+            accepted, information = believe(innovations, spread, seen.gate)
+            if not accepted.any():
+                return Fit(state, accepted, first, float("nan"))
+        else:
+            both = np.flatnonzero(np.repeat(accepted, 2))
+            information = inverse(spread[np.ix_(both, both)])
+        columns = columns[:, np.repeat(accepted, 2)]
+        residual = innovations[accepted].ravel()
+        new_posture, new_rays = state.stepped(columns @ (information @ residual))
+        pairs = (new_rays - rays)[slots][:, [0, 2]]
+        promised = sight.rays[:, :2] + _linear(by_posture, by_pair, new_posture - posture, pairs)
+        posture, rays = new_posture, new_rays
+        kept = see(posture, rays[slots], mount_forward).rays[:, :2]
+        if np.abs(kept - promised)[accepted].max() < seen.linear:
+            break
+    root = columns @ np.linalg.cholesky(information)
+    covariance = state.covariance - root @ root.T
+    corrected = NodeState(posture, rays, state.slope, state.slope_variance, covariance)
+    nis = float(residual @ information @ residual) / len(residual)
+    assert first is not None
+    return Fit(corrected, accepted, first, nis)
+
+
+def _linear(by_posture: Array, by_pair: Array, posture: Array, pairs: Array) -> Array:
+    """(N, 2) change of the slopes to first order, for changes of posture (3,) and (a, w) (N, 2)."""
+    return (by_posture @ posture).reshape(-1, 2) + (by_pair @ pairs[:, :, None])[:, :, 0]

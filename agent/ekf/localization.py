@@ -1,0 +1,302 @@
+"""The localization filter: posture in a node's frame and the node's landmarks, 3 + 2n (paper section 6)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.ekf.anchored import rays_of_points, see
+from agent.ekf.gating import pixel_gate
+from agent.ekf.iterated import Measurement, iterated_update
+from agent.ekf.motion import WheelNoise, move_posture
+from agent.ekf.node_state import NEAREST_SCALE, NodeState, turning
+from agent.ekf.report import UpdateReport
+from agent.ekf.static_fix import LEAST, static_fix
+from agent.observation import Odometry
+from hybridmap.camera import Camera
+from hybridmap.errors import InvalidValue
+from hybridmap.pose import Array, Pose2, PoseGaussian
+
+Ids = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationSettings:
+    """How the localization filter believes, gates and judges itself.
+
+    Attributes:
+        pixel_sigma: standard deviation of a tracked pixel, px.
+        wheel_floor: standard deviation of a wheel's way in a step without any, m.
+        gate_probability: share of true measurements that each gate lets pass.
+        iterations: linearisations of one update at most; a second is made only if the first did not hold.
+        linear_px: a pixel whose second-order part stays below this is linear, px.
+        loose_heading: a heading less certain than this is first fixed by static least squares, rad.
+        lost_position: uncertainty of a position that was refuted, m (the paper's 1 m).
+        lost_heading: uncertainty of a heading that was refuted, rad (the paper's 1 rad).
+        fix_chi2: a static fix with more than this per degree of freedom is not used.
+        least_agreeing: fewer accepted landmarks than this are no good update.
+        least_agreeing_share: nor is a smaller share of those seen.
+        patience: so many bad updates in a row make the filter unhealthy.
+        widest_sigma: so does a position less certain than this, m.
+        widest_slope: landmarks further aside of the node than this |a| cannot be anchored at it.
+        nearest: nor can those nearer to the node's optical centre, m.
+    """
+
+    pixel_sigma: float = 0.7
+    wheel_floor: float = 1e-5
+    gate_probability: float = 0.999
+    iterations: int = 4
+    linear_px: float = 0.1
+    loose_heading: float = 0.15
+    lost_position: float = 1.0
+    lost_heading: float = 1.0
+    fix_chi2: float = 4.0
+    least_agreeing: int = 3
+    least_agreeing_share: float = 0.35
+    patience: int = 3
+    widest_sigma: float = 0.5
+    widest_slope: float = 4.0
+    nearest: float = 0.05
+
+
+class NodeLandmarks(NamedTuple):
+    """Landmarks in a node's robot frame, in columns.
+
+    Attributes:
+        ids: (n,).
+        points: (n, 3) m, in the node's robot frame; NaN where w <= 0, that may as well be at infinity.
+        covariances: (n, 3, 3) m^2, in the node's robot frame, to first order.
+    """
+
+    ids: Ids
+    points: Array
+    covariances: Array
+
+
+class LocalizationFilter:
+    """Iterated extended Kalman filter over [node_from_robot (3), landmarks (a, w) x n].
+
+    Each landmark keeps its vertical slope b at the node as a linear function of (a, w), with a residual
+    variance that counts as noise of the vertical pixel (agent.ekf.anchored).
+
+    Attributes:
+        ids: (n,) landmark ids in the state's order.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        axle: float,
+        wheel_noise: float,
+        prior: PoseGaussian,
+        ids: Ids,
+        points_in_node: Array,
+        covariances: Array,
+        settings: LocalizationSettings | None = None,
+    ) -> None:
+        """Start from a posture, however uncertain, and a node's landmarks.
+
+        Args:
+            camera: of the robot that drives; the node's may be another.
+            axle: distance between the wheels, m.
+            wheel_noise: standard deviation of a wheel's way as a share of the way.
+            prior: node_from_robot.
+            ids: (n,) landmark ids as they will come in update.
+            points_in_node: (n, 3) m, in the node's robot frame; those that cannot be anchored are left out.
+            covariances: (n, 3, 3) m^2, in the node's robot frame.
+            settings: see there.
+
+        Raises:
+            InvalidValue: shapes that do not belong together, or an id twice.
+        """
+        self.settings = settings or LocalizationSettings()
+        self.ids: Ids = np.zeros(0, np.int64)
+        self._camera = camera
+        self._wheels = WheelNoise(axle, wheel_noise, self.settings.wheel_floor)
+        self._focal = np.array([camera.fx, camera.fy])
+        self._centre = np.array([camera.cx, camera.cy])
+        self._state = NodeState.of_prior(prior)
+        self._bad = 0
+        self._bad_reason = ""
+        self._insert(ids, points_in_node, covariances, np.zeros((len(ids), 3, 3)))
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move by one step of the wheels. The landmarks stand still in the node's frame."""
+        posture, by_posture, by_input = move_posture(self._state.posture, odometry)
+        noise = by_input @ self._wheels.root(odometry)
+        p = self._state.covariance.copy()
+        p[:3, 3:] = by_posture @ p[:3, 3:]
+        p[3:, :3] = p[:3, 3:].T
+        own = by_posture @ p[:3, :3] @ by_posture.T + noise @ noise.T
+        p[:3, :3] = 0.5 * (own + own.T)
+        self._state = replace(self._state, posture=posture, covariance=p)
+
+    def update(self, ids: Ids, pixels: Array) -> UpdateReport:
+        """Correct posture and landmarks by the pixels of one image.
+
+        Args:
+            ids: (N,) what is seen; ids that the filter does not hold are ignored.
+            pixels: (N, 2) px, undistorted; rows with NaN are ignored.
+        """
+        s, mount = self.settings, self._camera.mount_forward
+        slots, rows = self._slots(ids)
+        seen = np.isfinite(pixels[rows]).all(axis=1)
+        slots, rows = slots[seen], rows[seen]
+        start = self._start(slots, pixels[rows])
+        ahead = see(start, self._state.rays[slots], mount).scale > NEAREST_SCALE
+        slots, rows = slots[ahead], rows[ahead]
+        if not len(slots):
+            return self._judge(UpdateReport.blind(ids, "no landmark of the node is in view"))
+        slopes = (pixels[rows] - self._centre) / self._focal
+        measurement = Measurement(
+            slots,
+            slopes,
+            (s.pixel_sigma / self._focal) ** 2,
+            pixel_gate(s.gate_probability),
+            s.iterations,
+            s.linear_px / self._camera.fx,
+        )
+        fit = iterated_update(self._state, start, measurement, mount)
+        if fit is None:
+            return self._judge(UpdateReport.blind(ids, "the posture is too uncertain to be corrected"))
+        self._state = fit.state
+        accepted = np.zeros(len(ids), np.bool_)
+        accepted[rows[fit.accepted]] = True
+        innovations_px = np.full((len(ids), 2), np.nan)
+        innovations_px[rows] = fit.innovations * self._focal
+        kept = int(fit.accepted.sum())
+        needed = max(min(s.least_agreeing, len(self.ids)), s.least_agreeing_share * len(slots))
+        reason = "" if kept >= needed else f"{kept} of {len(slots)} landmarks agree"
+        return self._judge(UpdateReport(ids, accepted, innovations_px, fit.mean_nis, not reason, reason))
+
+    def add(self, ids: Ids, points_in_robot: Array, covariances_in_robot: Array) -> NDArray[np.bool_]:
+        """Add landmarks that are new to the map, as they are known from where the robot stands now.
+
+        Args:
+            ids: (N,) new ids.
+            points_in_robot: (N, 3) m, in the robot's present frame.
+            covariances_in_robot: (N, 3, 3) m^2, in the robot's present frame.
+
+        Returns:
+            (N,) which were added: those that lie ahead of the node, where they can be anchored.
+
+        Raises:
+            InvalidValue: shapes that do not belong together, or an id twice.
+        """
+        pose = Pose2.from_vector(self._state.posture)
+        points, turn = pose.apply(points_in_robot), turning(pose)
+        by_posture = np.zeros((len(points), 3, 3))
+        by_posture[:, 0, 0] = by_posture[:, 1, 1] = 1.0
+        by_posture[:, 0, 2] = pose.y - points[:, 1]
+        by_posture[:, 1, 2] = points[:, 0] - pose.x
+        return self._insert(ids, points, turn @ covariances_in_robot @ turn.T, by_posture)
+
+    def remove(self, ids: Ids) -> None:
+        """Forget landmarks; ids that are not there are ignored."""
+        self._keep(~np.isin(self.ids, ids))
+
+    def rebase(self, new_node_from_node: PoseGaussian) -> None:
+        """Hand over to another node's frame; landmarks that cannot be anchored there are let go.
+
+        Args:
+            new_node_from_node: where the old node stands in the new, independent of what the filter knows.
+        """
+        self._state, ahead = self._state.rebased(new_node_from_node, self._camera.mount_forward)
+        self._keep(ahead & self._anchorable(self._state.rays))
+
+    @property
+    def pose(self) -> PoseGaussian:
+        """`node_from_robot`."""
+        return self._state.pose
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the posture may be driven by."""
+        return not self.reason
+
+    @property
+    def reason(self) -> str:
+        """Why it may not, in words; empty if healthy."""
+        if self._bad >= self.settings.patience:
+            return self._bad_reason
+        sigma = math.sqrt(float(np.linalg.eigvalsh(self._state.covariance[:2, :2])[-1]))
+        return f"position known to {sigma:.1f} m only" if sigma > self.settings.widest_sigma else ""
+
+    def predict_pixels(self, ids: Ids | None = None) -> Array:
+        """(N, 2) px where landmarks are expected now; NaN if behind the camera or not held."""
+        sight = see(self._state.posture, self._state.rays, self._camera.mount_forward)
+        ahead = (sight.scale > NEAREST_SCALE)[:, None]
+        pixels = np.where(ahead, self._centre + self._focal * sight.rays[:, :2], np.nan)
+        if ids is None:
+            return pixels
+        slots, rows = self._slots(ids)
+        out = np.full((len(ids), 2), np.nan)
+        out[rows] = pixels[slots]
+        return out
+
+    def landmarks_in_node(self) -> NodeLandmarks:
+        """All landmarks as they are known now."""
+        return NodeLandmarks(self.ids.copy(), *self._state.points(self._camera))
+
+    def _slots(self, ids: Ids) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Places in the state of those ids that are held, and their rows among the ids given."""
+        _, slots, rows = np.intersect1d(self.ids, ids, return_indices=True)
+        return slots, rows
+
+    def _start(self, slots: NDArray[np.intp], pixels: Array) -> Array:
+        """Posture at which to linearise first: the static fix where the own is too loose or was refuted.
+
+        The fix is a point of linearisation only, so that no pixel is used twice. A refuted posture loses
+        its certainty; the landmarks keep theirs.
+        """
+        s, state = self.settings, self._state
+        refuted = self._bad >= s.patience
+        if len(slots) < LEAST or not (refuted or state.covariance[2, 2] > s.loose_heading**2):
+            return state.posture
+        points, covariances = state.points(self._camera)
+        finite = np.isfinite(points[slots]).all(axis=1)
+        chosen = slots[finite]
+        fix = static_fix(self._camera, points[chosen], covariances[chosen], pixels[finite], s.pixel_sigma)
+        if fix is None or fix.chi2 > s.fix_chi2:
+            return state.posture
+        start = fix.node_from_robot.mean.vector
+        if refuted:
+            p = state.covariance.copy()
+            p[:3, :] = p[:, :3] = 0.0
+            p[[0, 1, 2], [0, 1, 2]] = s.lost_position**2, s.lost_position**2, s.lost_heading**2
+            self._state = replace(state, posture=start, covariance=p)
+        # The same turn of the circle as the prior's heading.
+        start[2] += 2 * math.pi * round((self._state.posture[2] - start[2]) / (2 * math.pi))
+        return start
+
+    def _judge(self, report: UpdateReport) -> UpdateReport:
+        self._bad = 0 if report.healthy else self._bad + 1
+        self._bad_reason = report.reason
+        return report
+
+    def _insert(self, ids: Ids, points: Array, covariances: Array, by_posture: Array) -> NDArray[np.bool_]:
+        n = len(ids)
+        if points.shape != (n, 3) or covariances.shape != (n, 3, 3):
+            raise InvalidValue("localization: ids, points and covariances do not belong together")
+        if np.isin(ids, self.ids).any() or len(np.unique(ids)) != n:
+            raise InvalidValue("localization: a landmark can be added only once")
+        rays, by_point = rays_of_points(points, self._camera.mount_forward, self._camera.mount_height)
+        fit = self._anchorable(rays) & np.isfinite(covariances).all(axis=(1, 2))
+        by_point = by_point[fit]
+        own = by_point @ covariances[fit] @ np.swapaxes(by_point, 1, 2)
+        self._state = self._state.grown(rays[fit], own, by_point @ by_posture[fit])
+        self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)[fit]])
+        return fit
+
+    def _anchorable(self, rays: Array) -> NDArray[np.bool_]:
+        near = rays[:, 2] * self.settings.nearest > 1.0
+        aside = ~(np.abs(rays[:, 0]) <= self.settings.widest_slope)
+        return np.asarray((rays[:, 2] > 0) & ~near & ~aside, np.bool_)
+
+    def _keep(self, mask: NDArray[np.bool_]) -> None:
+        self._state = self._state.kept(mask)
+        self.ids = self.ids[mask]
