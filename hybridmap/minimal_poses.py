@@ -14,16 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array
+from hybridmap.pose_arrays import inverse_poses
 from hybridmap.pose_refinement import Block
 from hybridmap.sightings import Sightings
-
-
-def inverse_poses(poses: Array) -> Array:
-    """(H, 3) inverse postures."""
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x = -cos * poses[:, 0] - sin * poses[:, 1]
-    y = sin * poses[:, 0] - cos * poses[:, 1]
-    return np.stack([x, y, -poses[:, 2]], axis=1)
 
 
 def hypotheses(block: Block, count: int, rng: np.random.Generator) -> Array:

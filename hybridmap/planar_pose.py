@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
-from hybridmap.minimal_poses import hypotheses, inverse_poses
+from hybridmap.minimal_poses import hypotheses
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.pose_arrays import inverse_poses
 from hybridmap.pose_refinement import Block, PlanarFix, improve, refine
 from hybridmap.sightings import Sightings
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import networkx as nx
 
@@ -49,7 +50,7 @@ def find_route(
     *,
     postures: Mapping[NodeId, Pose2] | None = None,
     penalties: Mapping[EdgeId, float] | None = None,
-    blocked: frozenset[EdgeId] = frozenset(),
+    blocked: Collection[tuple[NodeId, NodeId]] = (),
     settings: RouteSettings | None = None,
 ) -> Route:
     """Find the cheapest way from node to node.
@@ -66,7 +67,7 @@ def find_route(
         goal: where it shall be.
         postures: all in one frame; nodes without one cannot be on the way.
         penalties: extra cost of edges, m; not negative, negative ones count as none.
-        blocked: edges that must not be used.
+        blocked: pairs of nodes, in either order, between which the robot cannot drive.
         settings: what a way costs.
 
     Returns:
@@ -82,15 +83,18 @@ def find_route(
         return Route((start,), (), 0.0, "already there")
     places = postures if postures is not None else _own_postures(hybrid_map)
     graph: nx.Graph = nx.Graph()
-    for edge in hybrid_map.edges.values():
-        if edge.id in blocked or edge.a not in places or edge.b not in places or edge.a == edge.b:
+    barred = {frozenset(pair) for pair in blocked}
+    # In the order of ids, so that among ways of equal cost the same one is found whatever came first.
+    for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
+        if edge.a == edge.b or frozenset((edge.a, edge.b)) in barred:
+            continue
+        if edge.a not in places or edge.b not in places:
             continue
         cost = edge_cost(edge, places, postures is not None, s) + max(
             (penalties or {}).get(edge.id, 0.0), 0.0
         )
         known = graph.get_edge_data(edge.a, edge.b)
-        # Ties go to the smaller id, so that a route does not depend on the order in which edges came.
-        if known is None or (cost, edge.id) < (known["weight"], known["edge"]):
+        if known is None or cost < known["weight"]:
             graph.add_edge(edge.a, edge.b, weight=cost, edge=edge.id)
 
     comparable = postures is not None or len({node_id.map for node_id in graph}) <= 1
@@ -101,8 +105,8 @@ def find_route(
     try:
         nodes = nx.astar_path(graph, start, goal, heuristic=heuristic, weight="weight")
     except (nx.NetworkXNoPath, nx.NodeNotFound):
-        return Route((), (), 0.0, _why_not(hybrid_map, start, goal, blocked))
-    hops = [graph.edges[pair] for pair in zip(nodes[:-1], nodes[1:], strict=True)]
+        return Route((), (), 0.0, _why_not(hybrid_map, start, goal, len(barred)))
+    hops = [graph.edges[pair] for pair in pairwise(nodes)]
     cost = sum(hop["weight"] for hop in hops)
     return Route(tuple(nodes), tuple(hop["edge"] for hop in hops), cost, f"{len(hops)} edges, {cost:.1f} m")
 
@@ -121,10 +125,10 @@ def _own_postures(hybrid_map: HybridMap) -> dict[NodeId, Pose2]:
     return {node.id: node.map_from_robot.mean for node in hybrid_map.nodes.values()}
 
 
-def _why_not(hybrid_map: HybridMap, start: NodeId, goal: NodeId, blocked: frozenset[EdgeId]) -> str:
+def _why_not(hybrid_map: HybridMap, start: NodeId, goal: NodeId, barred: int) -> str:
     present = hybrid_map.graph.subgraph(hybrid_map.nodes)
     if not nx.has_path(present, start, goal):
         return f"{start} and {goal} are in parts of the map that nothing joins"
-    if blocked:
-        return f"every way from {start} to {goal} is blocked ({len(blocked)} edges)"
+    if barred:
+        return f"every way from {start} to {goal} is blocked ({barred} pairs)"
     return f"a node on every way from {start} to {goal} has no posture in the merged map"

@@ -1,0 +1,78 @@
+"""Many planar postures at once: the operations of hybridmap.pose on arrays.
+
+A posture is a row (x m, y m, heading rad). A Gaussian posture is a row and a (3, 3) covariance of its
+perturbation on the right, as in PoseGaussian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Array
+
+
+def compose_poses(a: Array, b: Array) -> Array:
+    """(N, 3) postures `x_from_y` and (N, 3) `y_from_z` -> (N, 3) `x_from_z`, headings wrapped."""
+    cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
+    heading = (a[:, 2] + b[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return np.stack(
+        [a[:, 0] + cos * b[:, 0] - sin * b[:, 1], a[:, 1] + sin * b[:, 0] + cos * b[:, 1], heading], axis=1
+    )
+
+
+def inverse_poses(poses: Array) -> Array:
+    """(N, 3) inverse postures."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = -cos * poses[:, 0] - sin * poses[:, 1]
+    y = sin * poses[:, 0] - cos * poses[:, 1]
+    return np.stack([x, y, -poses[:, 2]], axis=1)
+
+
+def adjoints(poses: Array) -> Array:
+    """(N, 3, 3) matrices Ad with `pose @ delta == (Ad delta) @ pose` to first order."""
+    out = np.zeros((len(poses), 3, 3))
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = cos, -sin, poses[:, 1]
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = sin, cos, -poses[:, 0]
+    out[:, 2, 2] = 1.0
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGaussians:
+    """N Gaussian postures.
+
+    Attributes:
+        means: (N, 3) m, m, rad.
+        covariances: (N, 3, 3), in the moving frame.
+    """
+
+    means: Array
+    covariances: Array
+
+    def __matmul__(self, other: PoseGaussians) -> PoseGaussians:
+        """Compose independent Gaussian postures to first order, row by row."""
+        ad = adjoints(inverse_poses(other.means))
+        carried = ad @ self.covariances @ ad.transpose(0, 2, 1)
+        return PoseGaussians(compose_poses(self.means, other.means), carried + other.covariances)
+
+    def inverse(self) -> PoseGaussians:
+        """The Gaussians of the inverse postures to first order."""
+        ad = adjoints(self.means)
+        return PoseGaussians(inverse_poses(self.means), ad @ self.covariances @ ad.transpose(0, 2, 1))
+
+    def distances2(self) -> Array:
+        """(N,) squared Mahalanobis distances of the identity from the means, 3 degrees of freedom."""
+        means = self.means.copy()
+        means[:, 2] = (means[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        solved = np.linalg.solve(self.covariances, means[:, :, None])[:, :, 0]
+        out: Array = (means * solved).sum(axis=1)
+        return out
+
+    def take(self, index: NDArray[Any]) -> PoseGaussians:
+        """The rows that an index or a mask selects."""
+        return PoseGaussians(self.means[index], self.covariances[index])

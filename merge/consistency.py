@@ -1,0 +1,235 @@
+"""Which links tell the same story: pairwise consistency, and the best supported set of it.
+
+Two links between the same two pieces of map close a loop: along one link, through the one piece, back along
+the other link, through the other piece. If both are right the loop comes back to where it began, within its
+uncertainty (pairwise consistent measurement set maximisation, Mangelson et al., ICRA 2018). A false link, or
+a set of links into a room that merely looks alike, closes no loop with the true ones. The set that is kept is
+the clique with the most landmarks behind it, and it has to be clearly better than any that contradicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.node import NodeId
+from hybridmap.pose import Array
+from hybridmap.pose_arrays import PoseGaussians
+from merge.fragments import Fragment
+from merge.links import Link, RefusedLink, refuse
+
+
+@dataclass(frozen=True)
+class ConsistencySettings:
+    """When links are believed.
+
+    Attributes:
+        gate: chi-square with 3 degrees of freedom that a loop may miss by; 11.34 is 99 %.
+        floor_xy: error of any loop that no covariance tells of, m.
+        floor_heading: the same, rad.
+        least_links: independent links (no node in common) that join two pieces.
+        overwhelming_inliers: a single link with as many landmarks ...
+        overwhelming_share: ... and this share of its matches joins them alone.
+        dominance: how many times the landmarks of a contradicting set the kept set must have.
+        exact: up to as many links the best clique is searched exhaustively, beyond greedily.
+    """
+
+    gate: float = 11.34
+    floor_xy: float = 0.02
+    floor_heading: float = 0.01
+    least_links: int = 2
+    overwhelming_inliers: int = 45
+    overwhelming_share: float = 0.7
+    dominance: float = 1.5
+    exact: int = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Sorted:
+    """Links between two pieces of map, sorted into believed and not.
+
+    Attributes:
+        kept: mutually consistent and enough, or nothing.
+        refused: the others, with reasons.
+    """
+
+    kept: tuple[Link, ...]
+    refused: tuple[RefusedLink, ...]
+
+    @property
+    def weight(self) -> int:
+        """Landmarks behind the kept links."""
+        return sum(link.weight for link in self.kept)
+
+
+def loop_distances2(
+    links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings
+) -> Array:
+    """(N, N) squared normalised misclosures of the loops through each two links, 3 degrees of freedom.
+
+    Args:
+        links: each from a node of `first` (its a) to a node of `second` (its b).
+        first: piece of map.
+        second: piece of map; may be the same, then the links are loops within it.
+        s: the floor of uncertainty.
+    """
+    n = len(links)
+    i, j = np.triu_indices(n, 1)
+    out = np.zeros((n, n))
+    if len(i) == 0:
+        return out
+    across = PoseGaussians(
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance for link in links]),
+    )
+    a, b = [link.a for link in links], [link.b for link in links]
+    through_second = second.graph.relative([b[k] for k in i], [b[k] for k in j])
+    through_first = first.graph.relative([a[k] for k in j], [a[k] for k in i])
+    loop = across.take(i) @ through_second @ across.take(j).inverse() @ through_first
+    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+    out[i, j] = out[j, i] = PoseGaussians(loop.means, loop.covariances + floor).distances2()
+    return out
+
+
+def sort_links(
+    links: Sequence[Link], first: Fragment, second: Fragment, settings: ConsistencySettings | None = None
+) -> Sorted:
+    """Keep the best supported consistent set of the links between two pieces of map.
+
+    Args:
+        links: from nodes of `first` to nodes of `second`.
+        first: piece of map.
+        second: piece of map; may be the same.
+        settings: when links are believed.
+
+    Returns:
+        Kept and refused links, in the order of their nodes.
+    """
+    s = settings or ConsistencySettings()
+    links = sorted(links, key=lambda link: link.pair)
+    refused: list[RefusedLink] = []
+    if first is second:
+        links, refused = _against_odometry(links, first, s)
+    agree = loop_distances2(links, first, second, s) < s.gate
+    weights = np.array([link.weight for link in links], dtype=np.int64)
+    best = best_clique(agree, weights, s.exact)
+    kept = [links[k] for k in best]
+    reason = _too_little(kept, s)
+    rival = _rival(agree, weights, best, s)
+    support = int(weights[best].sum())
+    if not reason and rival * s.dominance > support:
+        reason = f"ambiguous: {support} landmarks support one way of joining, {rival} another"
+    for k, link in enumerate(links):
+        if k not in best:
+            against = f"contradicts {len(best)} links with {support} landmarks between the same maps"
+            refused.append(refuse(link, reason or against))
+        elif reason:
+            refused.append(refuse(link, reason))
+    return Sorted(
+        () if reason else tuple(kept),
+        tuple(sorted(refused, key=lambda refusal: refusal.pair)),
+    )
+
+
+def _against_odometry(
+    links: Sequence[Link], fragment: Fragment, s: ConsistencySettings
+) -> tuple[list[Link], list[RefusedLink]]:
+    """A loop within a map must also agree with the map's own way from the one node to the other."""
+    if not links:
+        return [], []
+    own = fragment.graph.relative([link.b for link in links], [link.a for link in links])
+    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+    measured = PoseGaussians(
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance + floor for link in links]),
+    )
+    fits = (measured @ own).distances2() < s.gate
+    refusals = [
+        refuse(link, "contradicts the map's own way between its nodes")
+        for link, good in zip(links, fits, strict=True)
+        if not good
+    ]
+    return [link for link, good in zip(links, fits, strict=True) if good], refusals
+
+
+def best_clique(agree: NDArray[np.bool_], weights: NDArray[np.int64], exact: int = 40) -> list[int]:
+    """Indices, ascending, of the set in which all agree that has the greatest weight.
+
+    Args:
+        agree: (N, N) symmetric.
+        weights: (N,) positive.
+        exact: up to this N the answer is the best; beyond, grown greedily from each link.
+    """
+    n = len(weights)
+    if n <= exact:
+        graph: nx.Graph = nx.Graph()
+        for k in range(n):
+            graph.add_node(k, weight=int(weights[k]))
+        graph.add_edges_from((i, j) for i in range(n) for j in range(i) if agree[i, j])
+        clique, _ = nx.max_weight_clique(graph, weight="weight")
+        return sorted(clique)
+    best: list[int] = []
+    support = (agree * weights).sum(axis=1) + weights
+    order = np.argsort(-support, kind="stable")
+    for seed in order:
+        grown, open_ = [int(seed)], agree[seed].copy()
+        open_[seed] = False
+        for k in order:
+            if open_[k]:
+                grown.append(int(k))
+                open_ &= agree[k]
+                open_[k] = False
+        if weights[grown].sum() > (weights[best].sum() if best else 0):
+            best = sorted(grown)
+    return best
+
+
+def _rival(
+    agree: NDArray[np.bool_], weights: NDArray[np.int64], best: list[int], s: ConsistencySettings
+) -> int:
+    """Weight of the best set among the links that agree with less than half of the kept ones."""
+    others = np.setdiff1d(np.arange(len(weights)), best)
+    others = others[agree[others][:, best].mean(axis=1) < 0.5] if best else others
+    if len(others) == 0:
+        return 0
+    clique = best_clique(agree[np.ix_(others, others)], weights[others], s.exact)
+    return int(weights[others[clique]].sum())
+
+
+def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
+    """Why a consistent set does not suffice; empty if it does."""
+    if not kept:
+        return "no links"
+    independent = independent_links(kept)
+    if independent >= s.least_links:
+        return ""
+    for link in kept:
+        share = link.evidence.get("share", 0.0)
+        if link.weight >= s.overwhelming_inliers and share >= s.overwhelming_share:
+            return ""
+    return f"only {independent} independent link of {len(kept)}, {s.least_links} must agree"
+
+
+def independent_links(links: Sequence[Link]) -> int:
+    """How many links can be chosen of which no two have a node in common."""
+    graph: nx.Graph = nx.Graph()
+    graph.add_edges_from(link.pair for link in links)
+    return len(nx.max_weight_matching(graph, maxcardinality=True))
+
+
+def group_links(
+    links: Sequence[Link], by_node: dict[NodeId, Fragment]
+) -> dict[tuple[NodeId, NodeId], list[Link]]:
+    """Links by the names of the two pieces of map, smaller first; each link turned to that direction."""
+    groups: dict[tuple[NodeId, NodeId], list[Link]] = {}
+    for link in sorted(links, key=lambda link: link.pair):
+        first, second = by_node[link.a].name, by_node[link.b].name
+        if second < first:
+            link = link.turned()
+            first, second = second, first
+        groups.setdefault((first, second), []).append(link)
+    return groups

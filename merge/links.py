@@ -1,0 +1,92 @@
+"""Links: two nodes that show the same place, found by looking, and what became of them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from hybridmap.pose import PoseGaussian
+
+MERGE_AUTHOR = "merge"
+"""Stands for the agent in the ids of edges that the merge makes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Two nodes, of two maps or of one, that were recognised to see the same landmarks.
+
+    Attributes:
+        a: the smaller id.
+        b: the greater id.
+        a_from_b: posture of b's robot frame in a's.
+        shared: (K, 2) int64, landmark indices in a and in b.
+        evidence: of hybridmap.recognition.
+    """
+
+    a: NodeId
+    b: NodeId
+    a_from_b: PoseGaussian
+    shared: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    evidence: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def pair(self) -> tuple[NodeId, NodeId]:
+        """(a, b): there is at most one link between two nodes."""
+        return self.a, self.b
+
+    @property
+    def within(self) -> bool:
+        """Whether both nodes belong to one map: a loop."""
+        return self.a.map == self.b.map
+
+    @property
+    def weight(self) -> int:
+        """How much counts for it: landmarks that agree, at least 1."""
+        return max(int(self.evidence.get("inliers", 1.0)), 1)
+
+    def turned(self) -> Link:
+        """The same link seen from its other end."""
+        return Link(self.b, self.a, self.a_from_b.inverse(), self.shared[:, ::-1], self.evidence)
+
+    def canonical(self) -> Link:
+        """The same link with the smaller id first."""
+        return self if self.a <= self.b else self.turned()
+
+    def edge(self) -> Edge:
+        """The same as an edge of the merged map; its id depends on the two nodes alone."""
+        digest = hashlib.blake2b(f"{self.a} {self.b}".encode(), digest_size=6).digest()
+        edge_id = EdgeId(MERGE_AUTHOR, 0, int.from_bytes(digest, "big"))
+        kind = EdgeKind.LOOP if self.within else EdgeKind.MERGED
+        return Edge(edge_id, self.a, self.b, self.a_from_b, kind, self.shared, dict(self.evidence))
+
+
+@dataclass(frozen=True, eq=False)
+class RefusedLink:
+    """Two nodes that looked alike and were not joined.
+
+    Attributes:
+        a: the smaller id.
+        b: the greater id.
+        reason: in words.
+        link: the geometry that was found, or None if not even that.
+    """
+
+    a: NodeId
+    b: NodeId
+    reason: str
+    link: Link | None = None
+
+    @property
+    def pair(self) -> tuple[NodeId, NodeId]:
+        """(a, b)."""
+        return self.a, self.b
+
+
+def refuse(link: Link, reason: str) -> RefusedLink:
+    """Refuse a link whose geometry was found."""
+    link = link.canonical()
+    return RefusedLink(link.a, link.b, reason, link)

@@ -1,0 +1,108 @@
+"""The merged map: the union of the maps, the links that join them, and one posture a node."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from merge.links import Link, RefusedLink
+from merge.posegraph import PoseGraph
+
+
+class Placement(NamedTuple):
+    """Where a node is in the merged map.
+
+    Attributes:
+        component: number of the component, 0 is the largest.
+        merged_from_robot: posture in the component's frame, which is the map frame of the component's
+            smallest node id.
+    """
+
+    component: int
+    merged_from_robot: PoseGaussian
+
+
+@dataclass(frozen=True, eq=False)
+class MergedMap:
+    """A merge of maps. It keeps the maps as they are, so it can be explained, and made anew without a link.
+
+    Attributes:
+        maps: the maps, by id.
+        links: that join nodes, in the order of their ids.
+        refused: pairs that looked alike and were not joined, with reasons.
+        components: nodes that belong together, largest first.
+        postures: of all nodes.
+        graphs: the solved graph of each component, for covariances between nodes.
+    """
+
+    maps: Mapping[MapId, HybridMap]
+    links: tuple[Link, ...]
+    refused: tuple[RefusedLink, ...]
+    components: tuple[frozenset[NodeId], ...]
+    postures: Mapping[NodeId, Placement]
+    graphs: tuple[PoseGraph, ...] = ()
+
+    @staticmethod
+    def empty() -> MergedMap:
+        """No maps."""
+        return MergedMap({}, (), (), (), {})
+
+    def component_of(self, node: NodeId) -> int | None:
+        """Number of the node's component."""
+        placement = self.postures.get(node)
+        return None if placement is None else placement.component
+
+    def relative(self, a: NodeId, b: NodeId) -> PoseGaussian | None:
+        """Posture `a_from_b` through the whole merged map; None if nothing joins them."""
+        component = self.component_of(a)
+        if component is None or component != self.component_of(b):
+            return None
+        found = self.graphs[component].relative([a], [b])
+        return PoseGaussian(Pose2.from_vector(found.means[0]), found.covariances[0])
+
+    def joined(self, first: MapId, second: MapId) -> bool:
+        """Whether any node of one map is in one component with any of the other."""
+        return any(
+            any(node.map == first for node in component) and any(node.map == second for node in component)
+            for component in self.components
+        )
+
+    def union(self) -> HybridMap:
+        """All nodes and edges of all maps in one graph, with the links as edges."""
+        whole = HybridMap()
+        for map_id in sorted(self.maps):
+            for body in self.maps[map_id].contents():
+                whole.apply(body)
+        for link in self.links:
+            edge = link.edge()
+            whole.edges[edge.id] = edge
+            whole.graph.add_edge(edge.a, edge.b, key=edge.id)
+        return whole
+
+    def explain(self, a: NodeId, b: NodeId) -> str:
+        """Why two nodes are linked, or are not, in one sentence."""
+        pair = (a, b) if a <= b else (b, a)
+        for link in self.links:
+            if link.pair == pair:
+                numbers = ", ".join(f"{key} {value:.3g}" for key, value in sorted(link.evidence.items()))
+                return f"{link.a} and {link.b} are linked: {numbers}"
+        for refusal in self.refused:
+            if refusal.pair == pair:
+                return f"{refusal.a} and {refusal.b} are not linked: {refusal.reason}"
+        return f"{a} and {b} were not compared: they share too few alike features"
+
+    def summary(self) -> str:
+        """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
+        refused = sum(refusal.link is not None for refusal in self.refused)
+        counts = (
+            (len(self.postures), "node"),
+            (len(self.maps), "map"),
+            (len(self.components), "component"),
+            (len(self.links), "link"),
+        )
+        words = [f"{count} {word}{'' if count == 1 else 's'}" for count, word in counts]
+        return ", ".join([*words, f"{refused} refused"])
