@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 
 from hybridmap.pose import Array
 from hybridmap.pose_arrays import inverse_poses
-from hybridmap.pose_refinement import Block
 from hybridmap.sightings import Sightings
 
 
-def hypotheses(block: Block, count: int, rng: np.random.Generator) -> Array:
-    """(H, 3) postures from minimal sets of one block; degenerate sets are left out."""
-    sightings = block.sightings
+def hypotheses(sightings: Sightings, count: int, rng: np.random.Generator) -> Array:
+    """(H, 3) wanted postures from minimal sets of sightings; degenerate sets are left out."""
     found = []
     if len(sightings) >= 3:
         found.append(_from_three_bearings(sightings, rng.integers(0, len(sightings), (count, 3))))
@@ -34,7 +32,7 @@ def hypotheses(block: Block, count: int, rng: np.random.Generator) -> Array:
         return np.zeros((0, 3))
     poses = np.concatenate(found)
     poses = poses[np.isfinite(poses).all(axis=1)]
-    return inverse_poses(poses) if block.inverted else poses
+    return inverse_poses(poses) if sightings.inverted else poses
 
 
 def _from_three_bearings(sightings: Sightings, chosen: NDArray[np.int64]) -> Array:

@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from hybridmap.camera import Camera
 from hybridmap.minimal_poses import hypotheses
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.pose_arrays import inverse_poses
-from hybridmap.pose_refinement import Block, PlanarFix, improve, refine
+from hybridmap.pose_refinement import PlanarFix, Stack, improve, refine
 from hybridmap.sightings import Sightings
 
-__all__ = ["Block", "PlanarFix", "PlanarPoseSettings", "solve_blocks", "solve_planar_pose"]
+__all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
+
+PREVIEW = 20
+"""Sightings, about, on which all hypotheses are scored before the best fifth is scored on all."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class PlanarPoseSettings:
     """
 
     hypotheses: int = 100
-    finalists: int = 3
+    finalists: int = 2
     rounds: int = 8
     pixel_sigma: float = 1.0
     scale_sigma: float = 0.01
@@ -84,7 +86,7 @@ def solve_planar_pose(
         covariances=point_covariances,
         pixel_sigma=s.pixel_sigma,
     )
-    solved = solve_blocks([Block(sightings)], rng=rng, settings=s, prior=prior)
+    solved = solve_sightings([sightings], rng=rng, settings=s, prior=prior)
     if solved is None:
         return None
     inliers = np.zeros(len(points), dtype=bool)
@@ -92,37 +94,44 @@ def solve_planar_pose(
     return PlanarFix(solved.node_from_robot, inliers, solved.mean_square, solved.rms_px, solved.log_evidence)
 
 
-def solve_blocks(
-    blocks: Sequence[Block],
+def solve_sightings(
+    parts: Sequence[Sightings],
     *,
     rng: np.random.Generator,
     settings: PlanarPoseSettings,
     prior: PoseGaussian | None = None,
 ) -> PlanarFix | None:
-    """The same for sightings in either direction; `inliers` is over all blocks one after the other."""
-    blocks = [block for block in blocks if len(block.sightings)]
-    if sum(len(block.sightings) for block in blocks) < settings.least_inliers:
+    """The same for sightings in either direction; `inliers` is over all parts one after the other."""
+    parts = [part for part in parts if len(part)]
+    total = sum(len(part) for part in parts)
+    if total < settings.least_inliers:
         return None
-    poses = np.concatenate([hypotheses(block, settings.hypotheses, rng) for block in blocks])
+    counts = [-(-settings.hypotheses * len(part) // total) for part in parts]
+    poses = np.concatenate([hypotheses(part, n, rng) for part, n in zip(parts, counts, strict=True)])
     if prior is not None:
         poses = np.concatenate([prior.mean.vector[None], poses])
     if len(poses) == 0:
         return None
-    finalists = np.argsort(-_scores(blocks, poses), kind="stable")[: settings.finalists]
-    improved = [improve(blocks, Pose2.from_vector(poses[k]), prior, rounds=2) for k in finalists]
+    stack = Stack.build(parts)
+    if total > 2 * PREVIEW:
+        # Most hypotheses are wrong, which a part of the sightings shows as well as all of them.
+        few = [part.take(slice(None, None, total // PREVIEW)) for part in parts]
+        poses = poses[np.argsort(-_scores(few, poses), kind="stable")[: max(len(poses) // 5, 10)]]
+    finalists = np.argsort(-_scores(parts, poses), kind="stable")[: settings.finalists]
+    improved = [improve(stack, Pose2.from_vector(poses[k]), prior, rounds=2) for k in finalists]
     kept = [one[0] for one in improved if one is not None]
     if not kept:
         return None
-    best = kept[int(_scores(blocks, np.stack([pose.vector for pose in kept])).argmax())]
-    fix = refine(blocks, best, settings.scale_sigma, prior, rounds=settings.rounds)
+    best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
+    fix = refine(stack, best, settings.scale_sigma, prior, rounds=settings.rounds)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return fix
 
 
-def _scores(blocks: Sequence[Block], poses: Array) -> Array:
+def _scores(parts: Sequence[Sightings], poses: Array) -> Array:
     """(H,) nats: how much better each of the (H, 3) postures explains the sightings than chance does."""
     scores = np.zeros(len(poses))
-    for block in blocks:
-        scores += block.sightings.log_ratios(inverse_poses(poses) if block.inverted else poses).sum(axis=1)
+    for part in parts:
+        scores += part.log_ratios(poses).sum(axis=1)
     return scores

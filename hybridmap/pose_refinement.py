@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.sightings import DEPTH_DECADES, GATES, NO_DEPTH_SIGMA, Sightings
+from hybridmap.sightings import DEPTH_DECADES, GATES, NEAREST, NO_DEPTH_SIGMA, Sightings
 
-SMALL_STEP = 1e-5
+SMALL_STEP = 1e-4
 """Gauss-Newton ends when no component moves more, m and rad: far below any posture's uncertainty."""
 
 
@@ -41,194 +41,249 @@ class PlanarFix:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Sightings of one image, in the direction asked for or the other way round.
+class Stack:
+    """All sightings of one problem, in columns; each row has its own camera and direction.
 
     Attributes:
-        sightings: of points.
-        inverted: the points are in the robot's frame and the image was taken at the origin of the wanted
-            posture's frame.
+        points: (N, 3) m.
+        covariances: (N, 3, 3) m^2.
+        observed: (N, 3) u px, v px, depth m; the depth is NaN where not measured.
+        noise: (N, 3) variances of these.
+        measured: (N,) where the depth is.
+        gates: (N,) largest squared normalised residual of an inlier.
+        log_wrong: (N,) what -log of a right match's density is compared with, nats.
+        inverted: (N,) see Sightings.
+        optics: (6, N) fx, fy, cx, cy px, mount_height, mount_forward m.
     """
 
-    sightings: Sightings
-    inverted: bool = False
+    points: Array
+    covariances: Array
+    observed: Array
+    noise: Array
+    measured: NDArray[np.bool_]
+    gates: Array
+    log_wrong: Array
+    inverted: NDArray[np.bool_]
+    optics: Array
+
+    @staticmethod
+    def build(parts: Sequence[Sightings]) -> Stack:
+        """Put sightings one after the other."""
+        measured = np.concatenate([part.depth_measured for part in parts])
+        depths = np.concatenate([part.depths for part in parts])
+        sigmas = np.concatenate([part.depth_sigmas for part in parts])
+        counts = [len(part) for part in parts]
+        pixel = np.repeat([part.pixel_sigma**2 for part in parts], counts)
+        cameras = [part.camera for part in parts]
+        optics = [(c.fx, c.fy, c.cx, c.cy, c.mount_height, c.mount_forward) for c in cameras]
+        log_area = np.repeat([math.log(c.width * c.height / (2 * math.pi)) for c in cameras], counts)
+        log_depth = np.log(DEPTH_DECADES * np.where(measured, depths, 1.0)) - 0.5 * math.log(2 * math.pi)
+        return Stack(
+            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.covariances for part in parts]),
+            np.column_stack(
+                [np.concatenate([part.pixels for part in parts]), np.where(measured, depths, np.nan)]
+            ),
+            np.column_stack([pixel, pixel, np.where(measured, sigmas, NO_DEPTH_SIGMA) ** 2]),
+            measured,
+            np.where(measured, GATES[1], GATES[0]),
+            log_area + np.where(measured, log_depth, math.log(NO_DEPTH_SIGMA)),
+            np.repeat([part.inverted for part in parts], counts),
+            np.repeat(np.array(optics).T, counts, axis=1),
+        )
+
+    def predict(self, wanted: Pose2, points: Array) -> tuple[Array, Array, Array]:
+        """Predict each sighting and how it changes.
+
+        Args:
+            wanted: posture.
+            points: (N, 3) m, where to linearise.
+
+        Returns:
+            predicted (N, 3): u px, v px, depth m. By the posture (N, 3, 3), perturbed on the right as in
+            PoseGaussian. By the point (N, 3, 3). Points behind the camera give NaN.
+        """
+        fx, fy, cx, cy, mount_height, mount_forward = self.optics
+        back = wanted.inverse()
+        x, y = np.where(self.inverted, back.x, wanted.x), np.where(self.inverted, back.y, wanted.y)
+        cos = math.cos(wanted.heading)
+        sin = np.where(self.inverted, -math.sin(wanted.heading), math.sin(wanted.heading))
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        forward, left = cos * dx + sin * dy, cos * dy - sin * dx
+        ahead = forward - mount_forward
+        inverse = 1.0 / np.where(ahead > NEAREST, ahead, np.nan)
+        a, b = left * inverse, (points[:, 2] - mount_height) * inverse
+        predicted = np.stack([cx - fx * a, cy - fy * b, ahead], axis=-1)
+
+        # By the point in robot axes, columns forward and left (up is the same in both frames).
+        u_forward, u_left, v_forward, v_up = fx * inverse * a, -fx * inverse, fy * inverse * b, -fy * inverse
+        by_point = np.zeros((len(points), 3, 3))
+        by_point[:, 0, 0], by_point[:, 0, 1] = u_forward * cos - u_left * sin, u_forward * sin + u_left * cos
+        by_point[:, 1, 0], by_point[:, 1, 1], by_point[:, 1, 2] = v_forward * cos, v_forward * sin, v_up
+        by_point[:, 2, 0], by_point[:, 2, 1] = cos, sin
+        # A posture step (dx, dy, dh) moves the point in robot axes by (-dx + dh left, -dy - dh forward).
+        by_pose = np.zeros((len(points), 3, 3))
+        by_pose[:, 0, 0], by_pose[:, 0, 1] = -u_forward, -u_left
+        by_pose[:, 0, 2] = u_forward * left - u_left * forward
+        by_pose[:, 1, 0], by_pose[:, 1, 2] = -v_forward, v_forward * left
+        by_pose[:, 2, 0], by_pose[:, 2, 2] = -1.0, left
+        if self.inverted.any():
+            # inverse(wanted @ d) = inverse(wanted) @ (-Ad(wanted) d) to first order.
+            by_pose[self.inverted] = by_pose[self.inverted] @ -wanted.adjoint
+        return predicted, by_pose, by_point
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """One block linearised: what Gauss-Newton needs.
+class _Linear:
+    """The problem linearised at a posture and at points.
 
     Attributes:
         residuals: (N, 3) px, px, m, against the points where they were given.
         reprojection_px: (N, 2) against the points where they are now.
         by_pose: (N, 3, 3), of the prediction by the wanted posture.
-        by_scale: (N, 3, 2), of the residual by the common scale of the points and of the measured depths.
+        by_point: (N, 3, 3), of the prediction by the point.
         information: (N, 3, 3), inverse covariance of the residuals.
-        gain: (N, 3, 3), from residual to point.
         distance2: (N,) squared normalised residuals.
         log_ratios: (N,) nats against a wrong match, not cut.
         inliers: (N,).
+        weighted: (3, 3N) derivative times information times the probability that a sighting is right.
     """
 
     residuals: Array
     reprojection_px: Array
     by_pose: Array
-    by_scale: Array
+    by_point: Array
     information: Array
-    gain: Array
     distance2: Array
     log_ratios: Array
     inliers: NDArray[np.bool_]
+    weighted: Array
 
 
-def _linearise(block: Block, wanted: Pose2, points: Array) -> Linear:
-    sightings = block.sightings
-    pose = wanted.inverse() if block.inverted else wanted
-    predicted, by_pose, by_point = sightings.linearise(pose, points)
-    measured = sightings.depth_measured
-    observed = np.column_stack([sightings.pixels, np.where(measured, sightings.depths, predicted[:, 2])])
-    reprojection_px = (observed - predicted)[:, :2]
-    residuals = observed - predicted - np.einsum("nij,nj->ni", by_point, sightings.points - points)
-    visible = np.isfinite(predicted).all(axis=1) & np.isfinite(residuals).all(axis=1)
-    by_point = np.where(visible[:, None, None], by_point, 0.0)
-    by_pose = np.where(visible[:, None, None], by_pose, 0.0)
-    residuals = np.where(visible[:, None], residuals, 0.0)
-    residuals[~measured, 2] = 0.0
-
-    to_point = sightings.covariances @ by_point.transpose(0, 2, 1)
-    spread = by_point @ to_point
-    spread[:, 0, 0] += sightings.pixel_sigma**2
-    spread[:, 1, 1] += sightings.pixel_sigma**2
-    spread[:, 2, 2] += np.where(measured, sightings.depth_sigmas, NO_DEPTH_SIGMA) ** 2
+def _linearise(stack: Stack, wanted: Pose2, points: Array) -> _Linear:
+    predicted, by_pose, by_point = stack.predict(wanted, points)
+    off = stack.observed - predicted
+    off[~stack.measured, 2] = 0.0
+    back = (by_point @ (stack.points - points)[:, :, None])[:, :, 0]
+    back[~stack.measured, 2] = 0.0
+    residuals = off - back
+    visible = np.isfinite(residuals).all(axis=1)
+    if not visible.all():
+        for part in (residuals, by_pose, by_point):
+            part[~visible] = 0.0
+    spread = by_point @ stack.covariances @ by_point.transpose(0, 2, 1)
+    spread[:, [0, 1, 2], [0, 1, 2]] += stack.noise
     information = np.linalg.inv(spread).astype(np.float64, copy=False)
-    distance2 = np.einsum("ni,nij,nj->n", residuals, information, residuals)
-    area = float(sightings.camera.width * sightings.camera.height)
-    depth_terms = np.where(
-        measured,
-        np.log(DEPTH_DECADES * np.where(measured, sightings.depths, 1.0)) - 0.5 * math.log(2 * math.pi),
-        math.log(NO_DEPTH_SIGMA),
-    )
-    log_ratios = math.log(area / (2 * math.pi)) + depth_terms - 0.5 * np.log(np.linalg.det(spread))
-    log_ratios -= 0.5 * distance2
-    gates = np.where(measured, GATES[1], GATES[0])
-    by_scale = np.zeros((len(points), 3, 2))
-    by_scale[:, :, 0] = -np.einsum("nij,nj->ni", by_point, points)
-    by_scale[:, 2, 1] = np.where(measured, sightings.depths, 0.0)
-    if block.inverted:
-        # inverse(wanted @ d) = inverse(wanted) @ (-Ad(wanted) d) to first order.
-        by_pose = by_pose @ -wanted.adjoint
-    return Linear(
-        residuals,
-        reprojection_px,
-        by_pose,
-        by_scale,
-        information,
-        to_point @ information,
-        distance2,
-        log_ratios,
-        visible & (distance2 < gates) & (log_ratios > 0),
+    distance2 = (residuals * (information @ residuals[:, :, None])[:, :, 0]).sum(axis=1)
+    log_ratios = stack.log_wrong - 0.5 * (np.log(np.linalg.det(spread)) + distance2)
+    inliers = visible & (distance2 < stack.gates) & (log_ratios > 0)
+    weights = np.where(inliers, 1.0 / (1.0 + np.exp(-np.clip(log_ratios, -30, 30))), 0.0)
+    weighted = (information @ by_pose * weights[:, None, None]).reshape(-1, 3).T
+    return _Linear(
+        residuals, off[:, :2], by_pose, by_point, information, distance2, log_ratios, inliers, weighted
     )
 
 
-def improve(
-    blocks: Sequence[Block], pose: Pose2, prior: PoseGaussian | None, rounds: int
-) -> tuple[Pose2, list[Array]] | None:
+def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) -> tuple[Pose2, Array] | None:
     """Bring a posture to its best.
 
     Args:
-        blocks: the sightings.
+        stack: the sightings.
         pose: where to start.
         prior: what else is known of the posture.
         rounds: of Gauss-Newton at most.
 
     Returns:
-        The posture and each block's points (N, 3) m at their best for it; None if the inliers do not
-        determine a posture.
+        The posture and the points (N, 3) m at their best for it; None if the inliers do not determine a
+        posture.
     """
-    moved = [block.sightings.points for block in blocks]
+    moved = stack.points
     for _ in range(rounds):
-        linear = [_linearise(block, pose, points) for block, points in zip(blocks, moved, strict=True)]
-        information, gradient, _ = _normal_equations(linear, pose, prior)
+        linear = _linearise(stack, pose, moved)
+        information, gradient = _normal_equations(linear, pose, prior)
         step = _solve(information, gradient)
         if step is None:
             return None
         pose = pose @ Pose2.from_vector(step)
-        moved = [_move(block, part, step) for block, part in zip(blocks, linear, strict=True)]
+        moved = _move(stack, linear, step)
         if np.abs(step).max() < SMALL_STEP:
             break
     return pose, moved
 
 
 def refine(
-    blocks: Sequence[Block],
-    pose: Pose2,
-    scale_sigma: float,
-    prior: PoseGaussian | None,
-    rounds: int,
+    stack: Stack, pose: Pose2, scale_sigma: float, prior: PoseGaussian | None, rounds: int
 ) -> PlanarFix | None:
     """Bring a posture to its best and say how certain it is.
 
+    The covariance is the inverse information, larger where the residuals are larger than they should be,
+    and larger by what a common scale error of the points, or of the measured depths, would do: these come
+    from one drive with one set of wheels and do not average out.
+
     Args:
-        blocks: the sightings.
+        stack: the sightings.
         pose: where to start.
-        scale_sigma: share by which all points, or all measured depths, of a block may be wrong together.
+        scale_sigma: share by which all points, or all measured depths, may be wrong together.
         prior: what else is known of the posture.
         rounds: of Gauss-Newton at most.
 
     Returns:
         The posture, or None if the inliers do not determine one.
     """
-    improved = improve(blocks, pose, prior, rounds)
+    improved = improve(stack, pose, prior, rounds)
     if improved is None:
         return None
     pose, moved = improved
-    linear = [_linearise(block, pose, points) for block, points in zip(blocks, moved, strict=True)]
-    information, _, common = _normal_equations(linear, pose, prior)
-    inliers = np.concatenate([part.inliers for part in linear])
+    linear = _linearise(stack, pose, moved)
+    information, _ = _normal_equations(linear, pose, prior)
     covariance = _solve(information, np.eye(3))
+    inliers = linear.inliers
     if covariance is None or not inliers.any():
         return None
-    measured = np.concatenate([block.sightings.depth_measured for block in blocks])
-    distance2 = np.concatenate([part.distance2 for part in linear])
-    freedom = max(int(np.where(measured, 3, 2)[inliers].sum()) - 3, 1)
-    mean_square = float(distance2[inliers].sum()) / freedom
+    freedom = max(int(np.where(stack.measured, 3, 2)[inliers].sum()) - 3, 1)
+    mean_square = float(linear.distance2[inliers].sum()) / freedom
     covariance = covariance * max(1.0, mean_square)
-    drifts = scale_sigma * np.concatenate(common) @ covariance
-    covariance = covariance + drifts.T @ drifts
-    pixels = np.concatenate([part.reprojection_px for part in linear])[inliers]
+    for share in _common_scales(stack, linear, moved):
+        drift = scale_sigma * (covariance @ (linear.weighted @ share.ravel()))
+        covariance = covariance + np.outer(drift, drift)
     return PlanarFix(
         PoseGaussian(pose, 0.5 * (covariance + covariance.T)),
         inliers,
         mean_square,
-        float(np.sqrt((pixels**2).sum(axis=1).mean())),
-        float(np.concatenate([part.log_ratios for part in linear])[inliers].sum()),
+        float(np.sqrt((linear.reprojection_px[inliers] ** 2).sum(axis=1).mean())),
+        float(linear.log_ratios[inliers].sum()),
     )
 
 
-def _normal_equations(
-    linear: Sequence[Linear], pose: Pose2, prior: PoseGaussian | None
-) -> tuple[Array, Array, list[Array]]:
-    """Information (3, 3), gradient (3,), and the gradients (2 per block, 3) that common scales cause."""
-    information, gradient, common = np.zeros((3, 3)), np.zeros(3), []
-    for part in linear:
-        # Each sighting counts by the probability that it is right.
-        weights = np.where(part.inliers, 1.0 / (1.0 + np.exp(-np.clip(part.log_ratios, -30, 30))), 0.0)
-        weighted = np.einsum("n,nji,njk->nik", weights, part.by_pose, part.information)
-        information += np.einsum("nij,njk->ik", weighted, part.by_pose)
-        gradient += np.einsum("nij,nj->i", weighted, part.residuals)
-        common += [np.einsum("nij,njk->ki", weighted, part.by_scale)]
+def _common_scales(stack: Stack, linear: _Linear, points: Array) -> list[Array]:
+    """How the residuals (N, 3) change when all points, or all depths, of one side grow together.
+
+    One side's points are the forward rows' points and the inverted rows' depths; the other's the reverse.
+    """
+    by_points = -(linear.by_point @ points[:, :, None])[:, :, 0]
+    by_points[~stack.measured, 2] = 0.0
+    by_depths = np.zeros_like(by_points)
+    by_depths[:, 2] = np.where(stack.measured, stack.observed[:, 2], 0.0)
+    inverted = stack.inverted[:, None]
+    return [np.where(inverted, by_depths, by_points), np.where(inverted, by_points, by_depths)]
+
+
+def _normal_equations(linear: _Linear, pose: Pose2, prior: PoseGaussian | None) -> tuple[Array, Array]:
+    """Information (3, 3) and gradient (3,)."""
+    information = linear.weighted @ linear.by_pose.reshape(-1, 3)
+    gradient = linear.weighted @ linear.residuals.ravel()
     if prior is not None:
         weight = np.linalg.inv(prior.covariance + 1e-12 * np.eye(3))
-        information += weight
-        gradient += weight @ (pose.inverse() @ prior.mean).vector
-    return information, gradient, common
+        information = information + weight
+        gradient = gradient + weight @ (pose.inverse() @ prior.mean).vector
+    return information, gradient
 
 
-def _move(block: Block, part: Linear, step: Array) -> Array:
+def _move(stack: Stack, linear: _Linear, step: Array) -> Array:
     """(N, 3) m, the inliers' points at their best for this round; the others where they were given."""
-    left = part.residuals - part.by_pose @ step
-    moved = block.sightings.points + np.einsum("nij,nj->ni", part.gain, left)
-    return np.where(part.inliers[:, None], moved, block.sightings.points)
+    left = (linear.residuals - linear.by_pose @ step)[:, :, None]
+    gain = stack.covariances @ linear.by_point.transpose(0, 2, 1) @ linear.information
+    return np.where(linear.inliers[:, None], stack.points + (gain @ left)[:, :, 0], stack.points)
 
 
 def _solve(information: Array, right: Array) -> Array | None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hybridmap.camera import Camera
 from hybridmap.matching import MatchSettings, match
 from hybridmap.node import Landmarks, Node
-from hybridmap.planar_pose import Block, PlanarFix, PlanarPoseSettings, solve_blocks
+from hybridmap.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
 from hybridmap.pose import PoseGaussian
 from hybridmap.query import View
 from hybridmap.sightings import Sightings
@@ -52,7 +52,7 @@ class RecognitionSettings:
     least_cells: int = 4
     least_evidence: float = 40.0
     most_mean_square: float = 3.0
-    most_position_share: float = 0.15
+    most_position_share: float = 0.06
     most_heading_sigma: float = math.radians(4.0)
 
 
@@ -168,11 +168,11 @@ def _examine(
     if len(usable) < s.least_inliers:
         words = f"{len(pairs)} features match, {len(usable)} with a depth; {s.least_inliers} are needed"
         return Refusal(words, len(pairs))
-    blocks = [
-        Block(_sightings(a, camera_a, b, camera_b, pairs[forward], s)),
-        Block(_sightings(b, camera_b, a, camera_a, pairs[backward][:, ::-1], s), inverted=True),
+    sightings = [
+        _sightings(a, camera_a, b, camera_b, pairs[forward], s, inverted=False),
+        _sightings(b, camera_b, a, camera_a, pairs[backward][:, ::-1], s, inverted=True),
     ]
-    fix = solve_blocks(blocks, rng=rng, settings=s.pose)
+    fix = solve_sightings(sightings, rng=rng, settings=s.pose)
     if fix is None:
         return Refusal(f"{len(usable)} matches agree on no posture", len(pairs))
     inliers = usable[fix.inliers]
@@ -190,6 +190,7 @@ def _sightings(
     seen_camera: Camera,
     pairs: NDArray[Any],
     s: RecognitionSettings,
+    inverted: bool,
 ) -> Sightings:
     """Points of the known side, pixels and depths of the seen side."""
     known, seen = known.take(pairs[:, 0]), seen.take(pairs[:, 1])
@@ -201,6 +202,7 @@ def _sightings(
         pixel_sigma=s.pose.pixel_sigma,
         depths=seen.depths,
         depth_sigmas=seen.depth_sigmas,
+        inverted=inverted,
     )
 
 

@@ -8,14 +8,15 @@ axle and looks along the robot's x axis: with q the point in the robot frame,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
+from hybridmap.pose import Array
+from hybridmap.pose_arrays import inverse_poses
 
 NEAREST = 0.05
 """Points less than this ahead of the optical centre count as not visible, m."""
@@ -42,6 +43,8 @@ class Sightings:
         pixel_sigma: standard deviation of a pixel, px.
         depths: (N,) m, measured along the optical axis of the image; NaN where not measured.
         depth_sigmas: (N,) m, of these.
+        inverted: the points are in the robot's frame, and the image was taken where the wanted posture's
+            frame has its origin.
     """
 
     points: Array
@@ -51,6 +54,7 @@ class Sightings:
     pixel_sigma: float
     depths: Array
     depth_sigmas: Array
+    inverted: bool = False
 
     @staticmethod
     def build(
@@ -62,6 +66,7 @@ class Sightings:
         pixel_sigma: float = 1.0,
         depths: NDArray[Any] | None = None,
         depth_sigmas: NDArray[Any] | None = None,
+        inverted: bool = False,
     ) -> Sightings:
         """Fill in what is not given: exact points, no measured depths."""
         n = len(points)
@@ -74,11 +79,23 @@ class Sightings:
             pixel_sigma,
             nothing if depths is None else np.asarray(depths, dtype=np.float64),
             nothing if depth_sigmas is None else np.asarray(depth_sigmas, dtype=np.float64),
+            inverted,
         )
 
     def __len__(self) -> int:
         """How many."""
         return len(self.points)
+
+    def take(self, index: slice) -> Sightings:
+        """Some of them."""
+        return replace(
+            self,
+            points=self.points[index],
+            covariances=self.covariances[index],
+            pixels=self.pixels[index],
+            depths=self.depths[index],
+            depth_sigmas=self.depth_sigmas[index],
+        )
 
     @property
     def slopes(self) -> Array:
@@ -100,12 +117,14 @@ class Sightings:
         known gives little, and one with an uncertain depth must still lie along its own short line.
 
         Args:
-            poses: (H, 3) m, m, rad, postures of the robot in the points' frame.
+            poses: (H, 3) m, m, rad, wanted postures.
 
         Returns:
             (H, N) nats; 0 for sightings outside the 99 % gate or behind the camera.
         """
         camera = self.camera
+        if self.inverted:
+            poses = inverse_poses(poses)
         cos, sin = np.cos(poses[:, 2:3]), np.sin(poses[:, 2:3])
         dx, dy = self.points[:, 0] - poses[:, 0:1], self.points[:, 1] - poses[:, 1:2]
         ahead = cos * dx + sin * dy - camera.mount_forward
@@ -147,37 +166,3 @@ class Sightings:
             kept[:, measured] &= depth2 < GATES[0]
         out: Array = np.where(kept, np.maximum(ratios, 0.0), 0.0)
         return out
-
-    def linearise(self, pose: Pose2, points: Array) -> tuple[Array, Array, Array]:
-        """Predict each sighting and how it changes.
-
-        Args:
-            pose: of the robot in the points' frame.
-            points: (N, 3) m, where to linearise.
-
-        Returns:
-            predicted (N, 3): u px, v px, depth m. By the posture (N, 3, 3), perturbed on the right as in
-            PoseGaussian. By the point (N, 3, 3). Points behind the camera give NaN.
-        """
-        camera = self.camera
-        cos, sin = math.cos(pose.heading), math.sin(pose.heading)
-        dx, dy = points[:, 0] - pose.x, points[:, 1] - pose.y
-        forward, left = cos * dx + sin * dy, cos * dy - sin * dx
-        ahead = forward - camera.mount_forward
-        inverse = 1.0 / np.where(ahead > NEAREST, ahead, np.nan)
-        a, b = left * inverse, (points[:, 2] - camera.mount_height) * inverse
-        predicted = np.stack([camera.cx - camera.fx * a, camera.cy - camera.fy * b, ahead], axis=-1)
-
-        # By the point in robot axes: rows u, v, depth.
-        by_robot = np.zeros((len(points), 3, 3))
-        by_robot[:, 0, 0], by_robot[:, 0, 1] = camera.fx * inverse * a, -camera.fx * inverse
-        by_robot[:, 1, 0], by_robot[:, 1, 2] = camera.fy * inverse * b, -camera.fy * inverse
-        by_robot[:, 2, 0] = 1.0
-        by_point = by_robot.copy()
-        by_point[:, :, 0] = by_robot[:, :, 0] * cos - by_robot[:, :, 1] * sin
-        by_point[:, :, 1] = by_robot[:, :, 0] * sin + by_robot[:, :, 1] * cos
-        # A posture step (dx, dy, dh) moves the point in robot axes by (-dx + dh left, -dy - dh forward).
-        by_pose = np.empty_like(by_robot)
-        by_pose[:, :, :2] = -by_robot[:, :, :2]
-        by_pose[:, :, 2] = by_robot[:, :, 0] * left[:, None] - by_robot[:, :, 1] * forward[:, None]
-        return predicted, by_pose, by_point
