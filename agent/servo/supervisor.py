@@ -15,6 +15,7 @@ from agent.servo.laws import control, saturate
 from agent.servo.obstacles import ObstacleMemory
 from agent.servo.plan import Plan, Surroundings, arc, sample
 from agent.servo.polar import Polar, continued, polar_of
+from agent.servo.recovery import Recovery
 from agent.servo.rollout import roll_out
 from agent.servo.settings import ServoSettings
 from agent.servo.sight import Sight
@@ -75,7 +76,7 @@ class Servo:
         self._broken_laws = 0
         self._in_dead_zone = False
         self._settled = 0
-        self._retreat_from: Pose2 | None = None
+        self._recovery = Recovery(self.settings, self._limits)
         self._wait, self._patience = 0, 2
         self._sight.update(goal_from_robot, points_in_goal, None)
         self._choose(goal_from_robot, self._surroundings(goal_from_robot))
@@ -112,8 +113,10 @@ class Servo:
             return final
         surroundings = self._surroundings(pose)
         if self._sight.field.slack(pose.vector) < self.settings.least_margin:
-            return self._recover(pose, surroundings)
-        self._retreat_from = None
+            self._law = None
+            self._drop_plan()
+            return self._step(*self._recovery.command(pose, self._sight.field, surroundings), pose)
+        self._recovery.over()
         for _ in range(3):
             self._keep_or_drop(pose, surroundings)
             if self._law is None and self._plan is None:
@@ -185,6 +188,8 @@ class Servo:
             # A search that found nothing is dear: wait ever longer before the next, the scene may change.
             self._patience = min(2 * self._patience, 80)
             self._wait = self._patience
+            return
+        self._patience = 2
 
     def _best_law(self, polar: Polar, around: Surroundings, cost: float) -> int | None:
         """The cheapest law that parks within the constraints for little more than a cost (m)."""
@@ -268,28 +273,6 @@ class Servo:
         # A way that has ended within the tolerance is as good as it gets: no further leg for a millimetre.
         self._in_dead_zone = math.hypot(pose.x, pose.y) <= 0.8 * self.settings.position_tolerance
         return self._final_turn(pose)
-
-    def _recover(self, pose: Pose2, around: Surroundings) -> ServoStep:
-        """Too few landmarks in view: turn to where more are, else back off along the optical axis."""
-        self._law = None
-        self._drop_plan()
-        offsets = np.linspace(-0.8, 0.8, 33)
-        postures = np.column_stack([np.full(33, pose.x), np.full(33, pose.y), pose.heading + offsets])
-        slack = self._sight.field.slack(postures)
-        fine = np.flatnonzero(slack >= 2.0 * self.settings.least_margin)
-        if len(fine):
-            offset = float(offsets[fine[np.abs(offsets[fine]).argmin()]])
-            turn = clip(self.settings.turn_gain * offset, self._limits.turn)
-            return self._step(Command(0.0, turn), "turning", "turning back to the landmarks", pose)
-        if self._retreat_from is None:
-            self._retreat_from = pose
-        behind = (pose @ Pose2(-0.1)).vector
-        room = self.settings.retreat - pose.distance(self._retreat_from)
-        clear = around.distance(behind) >= min(around.clearance, float(around.distance(pose.vector)))
-        if room > 0 and clear and self._sight.field.count >= self.settings.min_visible:
-            speed = -0.5 * self._limits.forward
-            return self._step(Command(speed, 0.0), "retreating", "backing off to see more landmarks", pose)
-        return self._step(Command(), "stuck", "too few landmarks in view", pose)
 
     # ---- output
 

@@ -1,0 +1,50 @@
+"""Too few landmarks in view: turn to where more are, else back off along the optical axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agent.observation import Command
+from agent.servo.field import Field
+from agent.servo.follow import Limits, clip
+from agent.servo.plan import Surroundings
+from agent.servo.settings import ServoSettings
+from agent.servo.step import State
+from hybridmap.pose import Pose2
+
+_OFFSETS = np.linspace(-0.8, 0.8, 33)
+"""rad, turns on the spot that are looked at."""
+
+
+class Recovery:
+    """Brings landmarks back into view. Backing off narrows all bearings: tried when no turn helps."""
+
+    def __init__(self, settings: ServoSettings, limits: Limits) -> None:
+        """Prepare."""
+        self._settings, self._limits = settings, limits
+        self._retreat_from: Pose2 | None = None
+
+    def over(self) -> None:
+        """Enough is in view again: the next retreat may be as long as this one could have been."""
+        self._retreat_from = None
+
+    def command(self, pose: Pose2, field: Field, around: Surroundings) -> tuple[Command, State, str]:
+        """What to do at `goal_from_robot` with too few landmarks in view."""
+        settings = self._settings
+        count = len(_OFFSETS)
+        postures = np.column_stack([np.full(count, pose.x), np.full(count, pose.y), pose.heading + _OFFSETS])
+        fine = np.flatnonzero(field.slack(postures) >= 2.0 * settings.least_margin)
+        if len(fine):
+            offset = float(_OFFSETS[fine[np.abs(_OFFSETS[fine]).argmin()]])
+            turn = clip(settings.turn_gain * offset, self._limits.turn)
+            return Command(0.0, turn), "turning", "turning back to the landmarks"
+        if self._retreat_from is None:
+            self._retreat_from = pose
+        room = settings.retreat - pose.distance(self._retreat_from)
+        behind, here = (
+            float(around.distance((pose @ Pose2(-0.1)).vector)),
+            float(around.distance(pose.vector)),
+        )
+        if room > 0.0 and behind >= min(around.clearance, here) and field.count >= settings.min_visible:
+            return Command(-0.5 * self._limits.forward), "retreating", "backing off to see more landmarks"
+        return Command(), "stuck", "too few landmarks in view"
