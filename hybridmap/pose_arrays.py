@@ -67,10 +67,10 @@ class PoseGaussians:
 
     def distances2(self) -> Array:
         """(N,) squared Mahalanobis distances of the identity from the means, 3 degrees of freedom."""
-        means = self.means.copy()
-        means[:, 2] = (means[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        solved = np.linalg.solve(self.covariances, means[:, :, None])[:, :, 0]
-        out: Array = (means * solved).sum(axis=1)
+        off = inverse_poses(self.means)
+        off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        solved = np.linalg.solve(self.covariances, off[:, :, None])[:, :, 0]
+        out: Array = (off * solved).sum(axis=1)
         return out
 
     def take(self, index: NDArray[Any]) -> PoseGaussians:

@@ -1,0 +1,59 @@
+"""Matching against a plain double loop."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap.descriptor import decode
+from hybridmap.matching import MatchSettings, match, match_vectors
+
+
+def brute_force(a: np.ndarray, b: np.ndarray, s: MatchSettings) -> set[tuple[int, int]]:
+    distances = np.array([[np.linalg.norm(x - y) for y in b] for x in a])
+    found = set()
+    for i in range(len(a)):
+        j = int(distances[i].argmin())
+        if int(distances[:, j].argmin()) != i or distances[i, j] > s.most_distance:
+            continue
+        others = [*np.delete(distances[i], j), *np.delete(distances[:, j], i)]
+        if all(distances[i, j] < s.ratio * other for other in others):
+            found.add((i, j))
+    return found
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 10**6))
+def test_against_brute_force(n: int, m: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a = rng.normal(0, 0.12, (n, 32)).astype(np.float32)
+    b = np.concatenate([a[: n // 2] + rng.normal(0, 0.03, (n // 2, 32)), rng.normal(0, 0.12, (m, 32))])
+    s = MatchSettings()
+    pairs = match_vectors(a, b.astype(np.float32), s).pairs
+    assert {(int(i), int(j)) for i, j in pairs} == brute_force(a, b, s)
+
+
+def test_no_feature_is_used_twice_and_the_best_come_first() -> None:
+    """The trap of a one-way test: everything in a low-texture image matches the same few features."""
+    rng = np.random.default_rng(3)
+    one = rng.integers(0, 256, (1, 16), dtype=np.uint8)
+    crowd = np.repeat(one, 40, axis=0)
+    crowd[:, 0] = rng.integers(0, 256, 40)
+    other = np.concatenate([one, rng.integers(0, 256, (30, 16), dtype=np.uint8)])
+    assert len(match(crowd, other)) <= 1
+    codes = rng.integers(0, 256, (60, 16), dtype=np.uint8)
+    found = match_vectors(decode(codes), decode(codes[::-1].copy()))
+    assert len(found) == 60
+    assert len(np.unique(found.pairs[:, 0])) == len(np.unique(found.pairs[:, 1])) == 60
+    assert (np.diff(found.distances) >= 0).all()
+
+
+def test_nothing_matches_nothing() -> None:
+    none, some = np.zeros((0, 16), np.uint8), np.zeros((4, 16), np.uint8)
+    for a, b in ((none, some), (some, none), (none, none)):
+        assert match(a, b).shape == (0, 2)
+        assert match(a, b).dtype == np.int64
+
+
+def test_a_single_candidate_is_judged_by_distance_alone() -> None:
+    codes = np.arange(32, dtype=np.uint8).reshape(2, 16)
+    assert match(codes[:1], codes[:1]).tolist() == [[0, 0]]
