@@ -33,8 +33,13 @@ class MapperSettings:
         tracker: tracks between views.
         filter: the mapping EKF.
         filtered: landmarks in the EKF; further tracks are triangulated against its trajectory.
+        least_filtered: with fewer landmarks in view the wheels are trusted alone.
+        least_spread: likewise if they cover less than this share of the image's width.
         most_landmarks: landmarks that a node keeps.
         least_landmarks: a view with fewer becomes no node.
+        edge_floor: what an edge's posture is never better than, m and rad: tracks err alike for a while,
+            which the filter, for which pixels err independently, does not know.
+        edge_share: likewise as a share of the way and of the turn: wheels are never quite round.
         depth_share: a landmark is kept if its depth's sigma is below this share of the depth.
         depths_per_height: assumed depth of an unknown feature as a multiple of the camera's height (the
             paper's "assumed common height").
@@ -49,8 +54,12 @@ class MapperSettings:
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
     filtered: int = 36
+    least_filtered: int = 5
+    least_spread: float = 0.2
     most_landmarks: int = 150
     least_landmarks: int = 6
+    edge_floor: tuple[float, float] = (0.002, 0.004)
+    edge_share: tuple[float, float] = (0.005, 0.01)
     depth_share: float = 0.25
     depths_per_height: float = 8.0
     associate_px: float = 1.5
@@ -176,11 +185,20 @@ class Mapper:
         in_filter = np.isin(self._tracker.ids, self._filter.ids)
         # A landmark whose track is lost stays out: what it taught is in the posture already.
         self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
-        if in_filter.any():
+        if self._trusted(pixels[in_filter]):
             ids = self._tracker.ids[in_filter]
             report = self._filter.update(ids, pixels[in_filter])
             self._judge(ids, report.accepted)
         self._history.record(self._filter.pose.mean, self._tracker.ids, self._tracker.pixels)
+
+    def _trusted(self, pixels: Array) -> bool:
+        """Whether landmarks are enough, and far enough apart, to correct the wheels.
+
+        A few points in one corner may all lie on the same edge, slide along it together and agree.
+        """
+        s = self._settings
+        spread = float(np.ptp(pixels[:, 0])) if len(pixels) else 0.0
+        return len(pixels) >= s.least_filtered and spread >= s.least_spread * self._description.camera.width
 
     def _expected(self, observation: Observation) -> Array:
         """(N, 2) px where the tracks should be now: by the filter, else by the turn alone."""
@@ -243,7 +261,7 @@ class Mapper:
         for change in changes:
             self.map.apply(change)
         new_anchor = self._take(observation, PoseGaussian(Pose2(), np.zeros((3, 3))))
-        moved = self._filter.reanchor()
+        moved = self._sober(self._filter.reanchor())
         self._map_from_anchor = self._map_from_anchor @ moved
         if self._last is not None:
             self._last.node_from_anchor = self._last.node_from_anchor @ moved
@@ -303,7 +321,7 @@ class Mapper:
         for leaf in leaves:
             beside = self._emit(leaf, changes)
             if beside is not None:
-                changes.append(EdgePut(self._edge(emitted, beside, leaf.anchor_from_view)))
+                changes.append(EdgePut(self._edge(emitted, beside, self._sober(leaf.anchor_from_view))))
         depths = emitted.node.landmarks.depths
         self._prior_depth = float(np.median(depths))
         return changes
@@ -357,6 +375,15 @@ class Mapper:
         return Edge(
             self._number(), a.node.id, b.node.id, a_from_b, kind, shared, {"shared": float(len(shared))}
         )
+
+    def _sober(self, moved: PoseGaussian) -> PoseGaussian:
+        """A posture of the filter with the uncertainty that the filter cannot know."""
+        s = self._settings
+        way, turn = float(np.hypot(moved.mean.x, moved.mean.y)), abs(moved.mean.heading)
+        position = s.edge_floor[0] + s.edge_share[0] * way
+        heading = s.edge_floor[1] + s.edge_share[1] * turn
+        more = np.diag([position**2, position**2, heading**2])
+        return PoseGaussian(moved.mean, moved.covariance + more)
 
     def _close_loops(self, emitted: _Emitted) -> list[ChangeBody]:
         """Recognise places of the own map (paper, section 5): each gives a new edge."""

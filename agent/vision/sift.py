@@ -15,6 +15,9 @@ from hybridmap.node import CODE_BYTES
 from hybridmap.pose import Array
 from hybridmap.query import View
 
+TEXTURE_BLOCK_PX = 11
+"""Side of the square in which texture is measured, about that of a tracked patch."""
+
 
 @dataclass(frozen=True)
 class SiftSettings:
@@ -26,6 +29,10 @@ class SiftSettings:
         cells: the image is cut into cells x cells; each may give at most `crowding` times its even share.
         crowding: see cells.
         border_px: features nearer to the image's border are left out, they cannot be tracked.
+        least_texture: the image's mean squared gradient around a feature, in its weakest direction, (grey/px)^2.
+            On an edge it is that of noise alone: such a feature slides along the edge when it is tracked
+            (aperture problem), unnoticed by a forward-backward check.
+        least_roundness: the same in the weakest direction as a share of that in the strongest.
     """
 
     most: int = 150
@@ -33,6 +40,8 @@ class SiftSettings:
     cells: int = 4
     crowding: float = 2.5
     border_px: float = 6.0
+    least_texture: float = 1.5
+    least_roundness: float = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +84,7 @@ class Sift:
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Find the features of a grey image (H, W)."""
         keypoints = self._detector.detect(image, None)
-        keypoints = self._spread(list(keypoints), image.shape[1], image.shape[0])
+        keypoints = self._spread(self._trackable(list(keypoints), image), image.shape[1], image.shape[0])
         if not keypoints:
             return Features(
                 np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, CODE_BYTES), np.uint8), np.zeros(0)
@@ -84,6 +93,18 @@ class Sift:
         raw = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
         responses = np.array([k.response for k in keypoints], dtype=np.float64)
         return Features(raw, self._lens.undistort(raw), encode(descriptors), responses)
+
+    def _trackable(self, keypoints: list[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[cv2.KeyPoint]:
+        """Those that are held in both directions by the image around them (Shi and Tomasi 1994)."""
+        if not keypoints:
+            return []
+        smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
+        # OpenCV sums (2 * gradient / block)^2 over the block: four times the mean.
+        strengths = cv2.cornerEigenValsAndVecs(smooth, TEXTURE_BLOCK_PX, ksize=3)[..., :2] / 4.0
+        at = np.array([k.pt for k in keypoints]).round().astype(int)
+        strong, weak = strengths[at[:, 1], at[:, 0]].T
+        enough = (weak >= self._settings.least_texture) & (weak >= self._settings.least_roundness * strong)
+        return [k for k, good in zip(keypoints, enough.tolist(), strict=True) if good]
 
     def _spread(self, keypoints: list[cv2.KeyPoint], width: int, height: int) -> list[cv2.KeyPoint]:
         """Strongest first, one a place (SIFT repeats a place for each orientation), no cell crowded."""

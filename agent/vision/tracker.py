@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from agent.vision.lens import Lens
 from hybridmap.pose import Array
 
+EIGENVALUE_UNIT = 1024.0
+"""OpenCV's Lucas-Kanade measures gradients in units of 1/32 grey/px."""
+
 
 @dataclass(frozen=True)
 class TrackerSettings:
@@ -21,12 +24,15 @@ class TrackerSettings:
         levels: pyramid levels above the image.
         backward_px: a point that does not come back to where it was within this is lost.
         border_px: points nearer to the border are lost.
+        least_texture: mean squared gradient of a patch in its weakest direction, (grey/px)^2; with less (that
+            of noise included, about 1 for a webcam) a point would slide along an edge, and is lost.
     """
 
     window_px: int = 15
     levels: int = 2
     backward_px: float = 0.8
     border_px: float = 4.0
+    least_texture: float = 2.5
 
 
 class Tracker:
@@ -76,13 +82,13 @@ class Tracker:
         window = (s.window_px, s.window_px)
         there, found, _ = cv2.calcOpticalFlowPyrLK(
             before, image, start, guess, winSize=window, maxLevel=s.levels, criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=s.least_texture / EIGENVALUE_UNIT,
         )  # fmt: skip
         # The way back starts from the expected displacement, not from the answer, which would hide errors.
         way_back = there - (guess_given - start)
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(
             image, before, there, way_back, winSize=window, maxLevel=s.levels, criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=s.least_texture / EIGENVALUE_UNIT,
         )  # fmt: skip
         height, width = image.shape
         there, back = there[:, 0], back[:, 0]
