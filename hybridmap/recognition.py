@@ -10,7 +10,7 @@ as evidence for those who can compare places (merge, mapserver.relocalization).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from hybridmap.camera import Camera
 from hybridmap.matching import MatchSettings, match
 from hybridmap.node import Landmarks, Node
 from hybridmap.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
-from hybridmap.pose import PoseGaussian
+from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import View
 from hybridmap.sightings import Sightings
 
@@ -38,6 +38,10 @@ class RecognitionSettings:
         least_inliers: landmarks that agree.
         least_share: of the matches that could have been inliers.
         least_cells: cells of the 6 x 4 grid with an inlier, in either image.
+        least_seen: of the landmarks that should be in the image by the posture found, on the side where it
+            is more. A poster that hangs in two rooms explains few of what else should be there.
+        least_depths: of the landmarks that fit by their pixels and have a depth on both sides, how many
+            agree in depth too.
         least_evidence: how much likelier the inliers are than wrong matches, nats.
         most_mean_square: largest mean squared normalised residual; 1 is expected.
         most_position_share: largest standard deviation of the position as a share of the median depth of
@@ -49,7 +53,9 @@ class RecognitionSettings:
     pose: PlanarPoseSettings = field(default_factory=PlanarPoseSettings)
     least_inliers: int = 10
     least_share: float = 0.35
-    least_cells: int = 4
+    least_cells: int = 5
+    least_seen: float = 0.12
+    least_depths: float = 0.5
     least_evidence: float = 40.0
     most_mean_square: float = 3.0
     most_position_share: float = 0.06
@@ -177,6 +183,7 @@ def _examine(
         return Refusal(f"{len(usable)} matches agree on no posture", len(pairs))
     inliers = usable[fix.inliers]
     evidence = _evidence(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
+    evidence["depths"] = _depth_agreement(sightings[0], fix)
     reason = _objection(evidence, s)
     if reason:
         return Refusal(reason, len(pairs), len(inliers))
@@ -228,6 +235,10 @@ def _evidence(
         "matches": float(matches),
         "share": len(inliers) / usable,
         "cells": float(min(_cells(seen_a.pixels, camera_a), _cells(seen_b.pixels, camera_b))),
+        "seen": max(
+            _seen(a, camera_a, camera_b, fix.node_from_robot.mean, inliers[:, 0]),
+            _seen(b, camera_b, camera_a, fix.node_from_robot.mean.inverse(), inliers[:, 1]),
+        ),
         "log_evidence": fix.log_evidence,
         "mean_square": fix.mean_square,
         "rms_px": fix.rms_px,
@@ -235,6 +246,27 @@ def _evidence(
         "sigma_xy": float(sigmas[-1]),
         "sigma_heading": math.sqrt(float(fix.node_from_robot.covariance[2, 2])),
     }
+
+
+def _seen(
+    known: Landmarks, camera: Camera, other: Camera, known_from_other: Pose2, inliers: NDArray[np.int64]
+) -> float:
+    """Share of the landmarks that should be in the other image, by their depth, that are inliers."""
+    points = known_from_other.inverse().apply(known.points_in_robot(camera))
+    expected = int(other.contains(other.project(points)).sum())
+    return min(float(known.has_depth[inliers].sum()) / max(expected, 1), 1.0)
+
+
+def _depth_agreement(forward: Sightings, fix: PlanarFix) -> float:
+    """Share of the landmarks whose pixels fit the posture that fit in depth too; 1 if few have two depths."""
+    both = forward.depth_measured
+    nothing = np.full(len(forward), np.nan)
+    pixels_only = replace(forward, depths=nothing, depth_sigmas=nothing)
+    pose = fix.node_from_robot.mean.vector[None]
+    fits = (pixels_only.log_ratios(pose)[0] > 0) & both
+    if fits.sum() < 5:
+        return 1.0
+    return float((fits & fix.inliers[: len(forward)]).sum() / fits.sum())
 
 
 def _cells(pixels: NDArray[np.float32], camera: Camera) -> int:
@@ -254,6 +286,10 @@ def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
         return f"only {e['share']:.0%} of the matches agree on one posture"
     if e["cells"] < s.least_cells:
         return f"the {inliers} landmarks that agree lie in {int(e['cells'])} of {math.prod(GRID)} image cells"
+    if e["seen"] < s.least_seen:
+        return f"only {e['seen']:.0%} of the landmarks that should be in the image are"
+    if e["depths"] < s.least_depths:
+        return f"only {e['depths']:.0%} of the landmarks that fit lie at the same depth"
     if e["log_evidence"] < s.least_evidence:
         return f"the {inliers} landmarks that agree are hardly better than chance"
     if e["mean_square"] > s.most_mean_square:

@@ -1,0 +1,108 @@
+"""Routes against Dijkstra on random maps."""
+
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap.change import EdgePut, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.route import RouteSettings, edge_cost, find_route
+from hybridmap.synthetic import CAMERA
+
+
+def node(number: int, pose: Pose2, agent: str = "r0") -> Node:
+    posture = PoseGaussian.from_sigmas(pose, 0.01, 0.01)
+    return Node(NodeId(agent, 1, number), 0, posture, CAMERA, Landmarks.empty())
+
+
+def edge(number: int, a: Node, b: Node, kind: EdgeKind = EdgeKind.MAPPED) -> Edge:
+    relative = a.map_from_robot.mean.inverse() @ b.map_from_robot.mean
+    return Edge(NodeId("e", 1, number), a.id, b.id, PoseGaussian.from_sigmas(relative, 0.01, 0.01), kind)
+
+
+def random_map(seed: int, n: int = 14, m: int = 22) -> HybridMap:
+    rng = np.random.default_rng(seed)
+    nodes = [node(k, Pose2(*rng.uniform([0, 0, -3], [9, 9, 3]))) for k in range(n)]
+    edges = []
+    for k in range(m):
+        a, b = rng.choice(n, 2, replace=False)
+        edges.append(edge(k, nodes[a], nodes[b], EdgeKind.TURNED if k % 5 == 0 else EdgeKind.MAPPED))
+    return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.booleans())
+def test_costs_no_more_than_dijkstra(seed: int, optimised: bool) -> None:
+    one = random_map(seed)
+    rng = np.random.default_rng(seed)
+    postures = {i: n.map_from_robot.mean for i, n in one.nodes.items()}
+    if optimised:
+        postures = {i: p @ Pose2(*rng.normal(0, 1.0, 3)) for i, p in postures.items()}
+    penalties = {edge_id: float(rng.uniform(0, 3)) for edge_id in one.edges}
+    graph: nx.MultiGraph = nx.MultiGraph()
+    for e in one.edges.values():
+        cost = edge_cost(e, postures, True, RouteSettings()) + penalties[e.id]
+        assert cost >= postures[e.a].distance(postures[e.b])
+        graph.add_edge(e.a, e.b, weight=cost)
+    start, goal = NodeId("r0", 1, 0), NodeId("r0", 1, 13)
+    found = find_route(one, start, goal, postures=postures if optimised else None, penalties=penalties)
+    if start in graph and goal in graph and nx.has_path(graph, start, goal):
+        assert found.cost == pytest.approx(nx.dijkstra_path_length(graph, start, goal))
+        assert found.nodes[0] == start and found.nodes[-1] == goal
+        for a, edge_id, b in zip(found.nodes[:-1], found.edges, found.nodes[1:], strict=True):
+            assert {one.edges[edge_id].a, one.edges[edge_id].b} == {a, b}
+    else:
+        assert found.nodes == () and found.reason
+
+
+def chain(*poses: Pose2) -> tuple[list[Node], HybridMap]:
+    nodes = [node(k, pose) for k, pose in enumerate(poses)]
+    edges = [edge(100 + k, nodes[k], nodes[k + 1]) for k in range(len(nodes) - 1)]
+    return nodes, HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+
+
+def test_blocked_pairs_are_gone_around_in_either_order() -> None:
+    nodes, one = chain(Pose2(0, 0), Pose2(1, 0), Pose2(2, 0), Pose2(2, 3))
+    one.apply(EdgePut(edge(200, nodes[0], nodes[3])))
+    one.apply(EdgePut(edge(201, nodes[3], nodes[2])))
+    assert len(find_route(one, nodes[0].id, nodes[2].id).edges) == 2
+    around = find_route(one, nodes[0].id, nodes[2].id, blocked=[(nodes[2].id, nodes[1].id)])
+    assert around.nodes == (nodes[0].id, nodes[3].id, nodes[2].id)
+    barred = [(nodes[1].id, nodes[2].id), (nodes[3].id, nodes[2].id)]
+    nowhere = find_route(one, nodes[0].id, nodes[2].id, blocked=barred)
+    assert nowhere.nodes == () and "blocked" in nowhere.reason
+
+
+def test_turning_costs() -> None:
+    nodes, one = chain(Pose2(0, 0, 0), Pose2(0, 0, 3.0))
+    assert find_route(one, nodes[0].id, nodes[1].id).cost > 0.5
+
+
+def test_of_two_edges_the_cheaper_is_driven() -> None:
+    nodes, one = chain(Pose2(0, 0), Pose2(1, 0))
+    one.apply(EdgePut(edge(5, nodes[0], nodes[1])))
+    route = find_route(one, nodes[0].id, nodes[1].id, penalties={NodeId("e", 1, 5): 1.0})
+    assert route.edges == (NodeId("e", 1, 100),)
+
+
+def test_links_between_maps_without_common_frame_are_driven() -> None:
+    """The two maps' frames have nothing in common: only the measured link says that the nodes are near."""
+    a, b = node(1, Pose2(0, 0)), node(1, Pose2(100, 100), "r1")
+    relative = PoseGaussian.from_sigmas(Pose2(1, 0, 0), 0.1, 0.1)
+    link = Edge(NodeId("e", 1, 1), a.id, b.id, relative, EdgeKind.MERGED)
+    one = HybridMap([NodePut(a), NodePut(b), EdgePut(link)])
+    assert find_route(one, a.id, b.id).cost == pytest.approx(1.02)
+
+
+def test_reasons() -> None:
+    nodes, one = chain(Pose2(0, 0), Pose2(1, 0))
+    lonely = node(9, Pose2(5, 5))
+    one.apply(NodePut(lonely))
+    assert find_route(one, nodes[0].id, nodes[0].id).nodes == (nodes[0].id,)
+    assert "nothing joins" in find_route(one, nodes[0].id, lonely.id).reason
+    assert "not in the map" in find_route(one, nodes[0].id, NodeId("r9", 1, 1)).reason
+    assert "no posture" in find_route(one, nodes[0].id, nodes[1].id, postures={nodes[0].id: Pose2()}).reason
