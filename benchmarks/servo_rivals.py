@@ -1,8 +1,9 @@
-"""What the servo is compared with: greedy switching as in 2004, and pursuit that ignores the field of view."""
+"""What the servo is compared with: greedy switching of 2004, and pursuit that ignores the field of view."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -120,7 +121,7 @@ class Greedy:
 
 
 class Pursuit:
-    """Turns to the goal, drives straight at it, turns to its heading: the shortest way, blind to the field."""
+    """Turns to the goal, drives straight at it, turns to its heading: the shortest way of all."""
 
     def __init__(self, goal_from_robot: Pose2, points: Array) -> None:
         """Forward or backward, whichever needs less turning."""
@@ -149,4 +150,8 @@ class Pursuit:
         return Command(*saturate(forward, 2.5 * error, ROBOT.max_forward, ROBOT.max_turn))
 
 
-CONTROLLERS = {"servo": Ours, "greedy_2004": Greedy, "pursuit_without_fov": Pursuit}
+CONTROLLERS: dict[str, Callable[[Pose2, Array], Controller]] = {
+    "servo": Ours,
+    "greedy_2004": Greedy,
+    "pursuit_without_fov": Pursuit,
+}

@@ -15,7 +15,8 @@ class ServoSettings:
         lambda_: gain lambda of the laws; 2 is critically damped.
         gain: 1/s, how fast time runs in the laws; multiplies both speeds.
         dead_zone: rho_D, m: nearer than this only the heading is mended.
-        position_tolerance: m, where the goal counts as reached.
+        position_tolerance: m, estimated distance at which the goal counts as reached. A centimetre of true
+            distance less what a pose filter may be off.
         heading_tolerance: rad.
         settle_ticks: ticks in a row inside both tolerances before the robot has arrived.
         min_visible: landmarks that must stay in view.
@@ -39,8 +40,8 @@ class ServoSettings:
 
     lambda_: float = 2.0
     gain: float = 1.5
-    dead_zone: float = 0.006
-    position_tolerance: float = 0.01
+    dead_zone: float = 0.004
+    position_tolerance: float = 0.0075
     heading_tolerance: float = 0.008
     settle_ticks: int = 3
     min_visible: int = 4

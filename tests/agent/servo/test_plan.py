@@ -1,0 +1,100 @@
+"""Plans of two legs and of the lattice end at the goal and keep the constraints, judged by projection."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from agent.observation import RobotDescription
+from agent.servo.field import Field
+from agent.servo.lattice import lattice
+from agent.servo.plan import Plan, Price, Surroundings
+from agent.servo.settings import ServoSettings
+from agent.servo.way import find_plan
+from agent.servo.zigzag import zigzag
+from hybridmap.camera import Camera
+from hybridmap.pose import Array, Pose2
+
+Seen = Callable[[Camera, Pose2, Array], NDArray[np.bool_]]
+Draw = tuple[Callable[..., Array], Callable[..., Pose2]]
+
+
+def check(plan: Plan, start: Pose2, points: Array, camera: Camera, seen: Seen, walls: Array) -> None:
+    """Everything that a plan promises, leg by leg."""
+    x, y, heading = start.x, start.y, start.heading
+    for leg in plan.legs:
+        for turned in np.linspace(heading, leg.heading, 20):
+            assert seen(camera, Pose2(x, y, float(turned)), points).sum() >= 4
+        dx, dy = leg.x - x, leg.y - y
+        assert math.hypot(dx, dy) == pytest.approx(leg.length)
+        assert dx == pytest.approx(leg.direction * leg.length * math.cos(leg.heading), abs=1e-6)
+        assert dy == pytest.approx(leg.direction * leg.length * math.sin(leg.heading), abs=1e-6)
+        for s in np.linspace(0.0, 1.0, 30):
+            at = Pose2(x + s * dx, y + s * dy, leg.heading)
+            assert seen(camera, at, points).sum() >= 4
+            if len(walls):
+                assert np.hypot(walls[:, 0] - at.x, walls[:, 1] - at.y).min() >= 0.19
+        x, y, heading = leg.x, leg.y, leg.heading
+    assert (x, y) == pytest.approx((0.0, 0.0), abs=1e-9)
+    for turned in np.linspace(heading, 2 * math.pi * round(heading / (2 * math.pi)), 20):
+        assert seen(camera, Pose2(0.0, 0.0, float(turned)), points).sum() >= 4
+
+
+@pytest.mark.parametrize("planner", [zigzag, lattice])
+def test_plans_lead_to_the_goal_in_view(
+    planner: Any, robot: RobotDescription, seen: Seen, draw: Draw
+) -> None:
+    draw_points, draw_start = draw
+    rng = np.random.default_rng(5)
+    found = 0
+    for _ in range(15):
+        points = draw_points(rng)
+        start = draw_start(rng, points)
+        around = Surroundings(Field(points, robot.camera), np.zeros((0, 2)), 0.2)
+        plan = planner(around, start, 0.02, Price())
+        if plan is not None:
+            found += 1
+            assert plan.start == start
+            assert plan.length >= math.hypot(start.x, start.y) - 1e-9
+            check(plan, start, points, robot.camera, seen, around.obstacles)
+    assert found >= 12
+
+
+def test_a_wall_in_the_way_is_driven_around(robot: RobotDescription, seen: Seen) -> None:
+    points = np.array([[x, y, 0.3] for x in (3.0, 4.0) for y in np.linspace(-2.0, 2.0, 9)])
+    wall = np.column_stack([np.full(13, -0.8), np.linspace(-0.3, 0.3, 13)])
+    around = Surroundings(Field(points, robot.camera), wall, 0.2)
+    start = Pose2(-1.6, 0.0, 0.0)
+    assert zigzag(Surroundings(around.field, np.zeros((0, 2)), 0.2), start, 0.02, Price()) is not None
+    plan = find_plan(around, start, ServoSettings())
+    assert plan is not None
+    assert plan.length > 1.65
+    check(plan, plan.start, points, robot.camera, seen, wall)
+
+
+def test_there_is_no_plan_out_of_a_ring(robot: RobotDescription) -> None:
+    points = np.array([[3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
+    angles = np.linspace(0.0, 2 * math.pi, 60)
+    ring = np.column_stack([-1.6 + 0.4 * np.cos(angles), 0.4 * np.sin(angles)])
+    around = Surroundings(Field(points, robot.camera), ring, 0.2)
+    assert find_plan(around, Pose2(-1.6, 0.0, 0.0), ServoSettings()) is None
+
+
+def test_there_is_no_plan_to_a_goal_that_sees_nothing(robot: RobotDescription) -> None:
+    points = np.array([[-3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
+    around = Surroundings(Field(points, robot.camera), np.zeros((0, 2)), 0.2)
+    assert find_plan(around, Pose2(-0.5, 0.0, math.pi), ServoSettings()) is None
+
+
+def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -> None:
+    points = np.array([[3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
+    around = Surroundings(Field(points, robot.camera), np.zeros((0, 2)), 0.2)
+    plan = zigzag(around, Pose2(0.5, 0.0, 0.0), 0.05, Price())
+    assert plan is not None
+    assert [leg.direction for leg in plan.legs] == [-1.0]
+    assert plan.length == pytest.approx(0.5)
