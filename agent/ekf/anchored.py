@@ -3,7 +3,7 @@
 A landmark is (a, b, w), slopes and inverse depth as in agent.ekf.motion, here of a camera that stands at
 the node for good. Only (a, w) are estimated, two numbers a landmark as in the paper; where the paper keeps
 the height, b is kept, which is what the node's image really fixed: the height of a landmark of uncertain
-depth is uncertain, its slope is not.
+depth is uncertain, its slope is known to a pixel (docs/decisions/ekf-localization.md).
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         The correction, or None if an iterate had a landmark behind the camera: the prior is too uncertain.
     """
     n, slots = len(seen.slots), seen.slots
-    index = (3 + 2 * slots[:, None] + np.arange(2)).ravel()
+    index = (3 + 3 * slots[:, None] + np.arange(3)).ravel()
     posture, rays = start, state.rays
     first: Array | None = None
     accepted: NDArray[np.bool_] = np.ones(n, np.bool_)
@@ -73,18 +73,15 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         if (sight.scale <= NEAREST_SCALE).any():
             return None
         by_posture = sight.by_posture[:, :2].reshape(2 * n, 3)
-        by_pair = state.by_pair(sight, slots)[:, :2]
-        columns = by_posture @ state.covariance[:3]
-        columns += (by_pair @ state.covariance[index].reshape(n, 2, -1)).reshape(2 * n, -1)
-        columns = columns.T
-        spread = by_posture @ columns[:3] + (by_pair @ columns[index].reshape(n, 2, -1)).reshape(2 * n, 2 * n)
-        noise = np.tile(seen.variances, (n, 1))
-        noise[:, 1] += state.slope_variance[slots] * sight.by_ray[:, 1, 1] ** 2
-        spread[np.arange(2 * n), np.arange(2 * n)] += noise.ravel()
+        by_ray = sight.by_ray[:, :2]
+        rows = by_posture @ state.covariance[:3]
+        rows += (by_ray @ state.covariance[index].reshape(n, 3, -1)).reshape(2 * n, -1)
+        columns = rows.T
+        spread = by_posture @ columns[:3] + (by_ray @ columns[index].reshape(n, 3, -1)).reshape(2 * n, 2 * n)
+        spread[np.arange(2 * n), np.arange(2 * n)] += np.tile(seen.variances, n)
         # The prior mean as seen from this linearisation point.
-        pairs = (state.rays - rays)[slots][:, [0, 2]]
-        expected = sight.rays[:, :2] + _linear(by_posture, by_pair, state.posture - posture, pairs)
-        innovations = seen.slopes - expected
+        back = _linear(by_posture, by_ray, state.posture - posture, (state.rays - rays)[slots])
+        innovations = seen.slopes - sight.rays[:, :2] - back
         if first is None:
             first = innovations
             accepted, information = believe(innovations, spread, seen.gate)
@@ -95,21 +92,20 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
             information = inverse(spread[np.ix_(both, both)])
         columns = columns[:, np.repeat(accepted, 2)]
         residual = innovations[accepted].ravel()
-        new_posture, new_rays = state.stepped(columns @ (information @ residual))
-        pairs = (new_rays - rays)[slots][:, [0, 2]]
-        promised = sight.rays[:, :2] + _linear(by_posture, by_pair, new_posture - posture, pairs)
+        step = columns @ (information @ residual)
+        new_posture, new_rays = state.stepped(step)
+        change = _linear(by_posture, by_ray, new_posture - posture, (new_rays - rays)[slots])
+        promised = sight.rays[:, :2] + change
         posture, rays = new_posture, new_rays
         kept = see(posture, rays[slots], mount_forward).rays[:, :2]
         if np.abs(kept - promised)[accepted].max() < seen.linear:
             break
-    root = columns @ np.linalg.cholesky(information)
-    covariance = state.covariance - root @ root.T
-    corrected = NodeState(posture, rays, state.slope, state.slope_variance, covariance)
+    corrected = state.corrected(step, columns @ np.linalg.cholesky(information))
     nis = float(residual @ information @ residual) / len(residual)
     assert first is not None
     return Fit(corrected, accepted, first, nis)
 
 
-def _linear(by_posture: Array, by_pair: Array, posture: Array, pairs: Array) -> Array:
-    """(N, 2) change of the slopes to first order, for changes of posture (3,) and (a, w) (N, 2)."""
-    return (by_posture @ posture).reshape(-1, 2) + (by_pair @ pairs[:, :, None])[:, :, 0]
+def _linear(by_posture: Array, by_ray: Array, posture: Array, rays: Array) -> Array:
+    """(N, 2) change of the slopes to first order, for changes of posture (3,) and rays (N, 3)."""
+    return (by_posture @ posture).reshape(-1, 2) + (by_ray @ rays[:, :, None])[:, :, 0]

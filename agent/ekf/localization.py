@@ -80,8 +80,8 @@ class NodeLandmarks(NamedTuple):
 class LocalizationFilter:
     """Iterated extended Kalman filter over [node_from_robot (3), landmarks (a, w) x n].
 
-    Each landmark keeps its vertical slope b at the node as a linear function of (a, w), with a residual
-    variance that counts as noise of the vertical pixel (agent.ekf.anchored).
+    Each landmark keeps the vertical slope b at the node that the map gives it. Its error is the same in
+    every image, so it is no noise: it is carried as a considered state (agent.ekf.node_state).
 
     Attributes:
         ids: (n,) landmark ids in the state's order.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.anchored import Sight, points_of_rays, see
+from agent.ekf.anchored import points_of_rays, see
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2, PoseGaussian
 
@@ -21,29 +21,20 @@ class NodeState:
 
     Attributes:
         posture: (3,) [x m, y m, heading rad], node_from_robot.
-        rays: (n, 3) [a, b, w 1/m] at the node; b is no state but follows (a, w).
-        slope: (n, 2) derivative of b by (a, w).
-        slope_variance: (n,) what remains uncertain of b when (a, w) is known.
-        covariance: (3 + 2n, 3 + 2n) of [posture, (a, w) of each landmark], additive errors.
+        rays: (n, 3) [a, b, w 1/m] at the node. The paper's two numbers a landmark, here a and w, are
+            estimated; b is known as the map gives it, and only its uncertainty is considered.
+        covariance: (3 + 3n, 3 + 3n) of [posture, (a, b, w) of each landmark], additive errors.
     """
 
     posture: Array
     rays: Array
-    slope: Array
-    slope_variance: Array
     covariance: Array
 
     @staticmethod
     def of_prior(prior: PoseGaussian) -> NodeState:
         """A posture and no landmarks."""
         turn = turning(prior.mean)
-        return NodeState(
-            prior.mean.vector,
-            np.zeros((0, 3)),
-            np.zeros((0, 2)),
-            np.zeros(0),
-            turn @ prior.covariance @ turn.T,
-        )
+        return NodeState(prior.mean.vector, np.zeros((0, 3)), turn @ prior.covariance @ turn.T)
 
     @property
     def pose(self) -> PoseGaussian:
@@ -57,26 +48,26 @@ class NodeState:
         n = len(self.rays)
         index = np.arange(n)
         points, by_ray = points_of_rays(self.rays, camera.mount_forward, camera.mount_height)
-        pairs = self.covariance[3:, 3:].reshape(n, 2, n, 2)[index, :, index, :]
-        from_pair = np.zeros((n, 3, 2))
-        from_pair[:, 0, 0] = from_pair[:, 2, 1] = 1.0
-        from_pair[:, 1] = self.slope
-        spread = from_pair @ pairs @ np.swapaxes(from_pair, 1, 2)
-        spread[:, 1, 1] += self.slope_variance
-        return points, by_ray @ spread @ np.swapaxes(by_ray, 1, 2)
-
-    def by_pair(self, sight: Sight, slots: NDArray[np.intp]) -> Array:
-        """(N, 3, 2) Jacobian of the rays that some landmarks are seen at, by (a, w) with b following."""
-        out: Array = sight.by_ray[:, :, [0, 2]] + sight.by_ray[:, :, 1:2] * self.slope[slots][:, None, :]
-        return out
+        blocks = self.covariance[3:, 3:].reshape(n, 3, n, 3)[index, :, index, :]
+        return points, by_ray @ blocks @ np.swapaxes(by_ray, 1, 2)
 
     def stepped(self, step: Array) -> tuple[Array, Array]:
-        """Posture and rays after a step (3 + 2n,) of the state."""
-        pairs = step[3:].reshape(-1, 2)
+        """Posture and rays after a step (3 + 3n,) of the state; the slopes b stay."""
         rays = self.rays.copy()
-        rays[:, [0, 2]] += pairs
-        rays[:, 1] += (self.slope * pairs).sum(axis=1)
+        rays[:, 0] += step[3::3]
+        rays[:, 2] += step[5::3]
         return self.posture + step[:3], rays
+
+    def corrected(self, step: Array, root: Array) -> NodeState:
+        """The state after an update by a step, whose gain takes `root root^T` off the covariance.
+
+        The slopes b do not follow, so the covariance among them stays as it is (Schmidt's consider filter);
+        all else is as in the full filter.
+        """
+        posture, rays = self.stepped(step)
+        covariance = self.covariance - root @ root.T
+        covariance[4::3, 4::3] = self.covariance[4::3, 4::3]
+        return NodeState(posture, rays, covariance)
 
     def grown(self, rays: Array, covariances: Array, by_posture: Array) -> NodeState:
         """The state with further landmarks.
@@ -87,38 +78,22 @@ class NodeState:
             by_posture: (N, 3, 3) how the posture's error enters them besides.
         """
         size, n = len(self.covariance), len(rays)
-        total = covariances + by_posture @ self.covariance[:3, :3] @ np.swapaxes(by_posture, 1, 2)
-        pairs = total[:, [0, 2]][:, :, [0, 2]]
-        slope = np.linalg.solve(pairs, total[:, [0, 2], 1:2])[:, :, 0]
-        variance = np.maximum(total[:, 1, 1] - (slope * total[:, [0, 2], 1]).sum(axis=1), 0.0)
-        lever = by_posture[:, [0, 2]].reshape(2 * n, 3)
-        grown = np.zeros((size + 2 * n, size + 2 * n))
+        lever = by_posture.reshape(3 * n, 3)
+        grown = np.zeros((size + 3 * n, size + 3 * n))
         grown[:size, :size] = self.covariance
         grown[size:, :size] = lever @ self.covariance[:3]
         grown[:size, size:] = grown[size:, :size].T
         # The posture's share is common to all new landmarks, their own is not.
         grown[size:, size:] = lever @ self.covariance[:3, :3] @ lever.T
-        own = grown[size:, size:].reshape(n, 2, n, 2)
+        own = grown[size:, size:].reshape(n, 3, n, 3)
         index = np.arange(n)
-        own[index, :, index, :] += covariances[:, [0, 2]][:, :, [0, 2]]
-        return NodeState(
-            self.posture,
-            np.concatenate([self.rays, rays]),
-            np.concatenate([self.slope, slope]),
-            np.concatenate([self.slope_variance, variance]),
-            grown,
-        )
+        own[index, :, index, :] += covariances
+        return NodeState(self.posture, np.concatenate([self.rays, rays]), grown)
 
     def kept(self, mask: NDArray[np.bool_]) -> NodeState:
         """The state with only some of its landmarks."""
-        index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 2))])
-        return NodeState(
-            self.posture,
-            self.rays[mask],
-            self.slope[mask],
-            self.slope_variance[mask],
-            self.covariance[np.ix_(index, index)],
-        )
+        index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])
+        return NodeState(self.posture, self.rays[mask], self.covariance[np.ix_(index, index)])
 
     def rebased(
         self, new_from_node: PoseGaussian, mount_forward: float
@@ -138,30 +113,21 @@ class NodeState:
         turn = turning(node_from_new.mean)
         edge = turn @ node_from_new.covariance @ turn.T
         seen = see(at, self.rays, mount_forward)
-        blocks = self.by_pair(seen, np.arange(n))
-        by_pair = blocks[:, [0, 2]]
-        by_edge = np.empty((3 + 2 * n, 3))
+        by_edge = np.empty((3 + 3 * n, 3))
         away = turn[:2, :2].T @ (self.posture[:2] - at[:2])
         by_edge[:3] = -turn.T
         by_edge[:2, 2] = away[1], -away[0]
-        by_edge[3:] = seen.by_posture[:, [0, 2]].reshape(2 * n, 3)
+        by_edge[3:] = seen.by_posture.reshape(3 * n, 3)
         p = self.covariance
         moved = np.empty_like(p)
         moved[:3, :3] = turn.T @ p[:3, :3] @ turn
-        moved[3:, :3] = (by_pair @ (turn.T @ p[:3, 3:]).T.reshape(n, 2, 3)).reshape(2 * n, 3)
+        moved[3:, :3] = (seen.by_ray @ (turn.T @ p[:3, 3:]).T.reshape(n, 3, 3)).reshape(3 * n, 3)
         moved[:3, 3:] = moved[3:, :3].T
-        half = (by_pair @ p[3:, 3:].reshape(n, 2, 2 * n)).reshape(2 * n, 2 * n)
-        moved[3:, 3:] = (by_pair @ half.T.reshape(n, 2, 2 * n)).reshape(2 * n, 2 * n)
+        half = (seen.by_ray @ p[3:, 3:].reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+        moved[3:, 3:] = (seen.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
         moved += by_edge @ edge @ by_edge.T
-        ahead = (seen.scale > NEAREST_SCALE) & (np.abs(np.linalg.det(by_pair)) > 1e-12)
-        # b as a function of the new (a, w), and what the edge's error leaves over.
-        solvable = np.where(ahead[:, None, None], np.swapaxes(by_pair, 1, 2), np.eye(2))
-        slope = np.linalg.solve(solvable, blocks[:, 1, :, None])[:, :, 0]
-        stray = seen.by_posture[:, 1] - np.einsum("nk,nkj->nj", slope, seen.by_posture[:, [0, 2]])
-        variance = self.slope_variance * seen.by_ray[:, 1, 1] ** 2
-        variance = variance + np.einsum("ni,ij,nj->n", stray, edge, stray)
         mean = new_from_node.mean @ Pose2.from_vector(self.posture)
-        return NodeState(mean.vector, seen.rays, slope, variance, 0.5 * (moved + moved.T)), ahead
+        return NodeState(mean.vector, seen.rays, 0.5 * (moved + moved.T)), seen.scale > NEAREST_SCALE
 
 
 def turning(pose: Pose2) -> Array:
