@@ -20,10 +20,13 @@ class RouteSettings:
     Attributes:
         per_edge: each hop means one more recognition and one more approach.
         per_turn: a radian between the headings of two nodes.
+        per_undriven: a metre of an edge that was recognised but never driven: something may stand in
+            between, as a wall does that is seen through a door.
     """
 
     per_edge: float = 0.02
-    per_turn: float = 0.3
+    per_turn: float = 0.1
+    per_undriven: float = 1.5
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,9 @@ def edge_cost(edge: Edge, places: Mapping[NodeId, Pose2], one_frame: bool, setti
     if not one_frame and edge.a.map != edge.b.map:
         relative = measured
     turn = abs(measured.heading) if edge.kind is EdgeKind.TURNED else abs(relative.heading)
-    return relative.distance(Pose2()) + settings.per_edge + settings.per_turn * turn
+    driven = edge.kind not in (EdgeKind.LOOP, EdgeKind.MERGED)
+    way = relative.distance(Pose2()) * (1.0 if driven else 1.0 + settings.per_undriven)
+    return way + settings.per_edge + settings.per_turn * turn
 
 
 def _own_postures(hybrid_map: HybridMap) -> dict[NodeId, Pose2]:

@@ -164,9 +164,8 @@ class Relocalizer:
                 words += f", and {len(places[0].sightings) - 1} more nodes with them"
             return RelocalizeAnswer(Certainty.FOUND, candidates, words)
         names = " or ".join(str(place.best.node) for place in rivals)
-        joined = {self._merged.component_of(place.best.node) for place in rivals}
         words = f"it may be {names}: they explain {most} to {len(rivals[-1].features)} features"
-        if len(joined) > 1:
+        if any(self._merged.relative(best.node, place.best.node) is None for place in rivals):
             words += ", and nothing joins their parts of the map yet"
         return RelocalizeAnswer(Certainty.AMBIGUOUS, candidates, words)
 

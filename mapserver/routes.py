@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,19 +12,37 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
-from hybridmap.route import RouteSettings, find_route
+from hybridmap.route import Route, RouteSettings, find_route
 from merge.merged import MergedMap
+
+ENTRIES = 12
+"""Nodes that are tried as the beginning of a route."""
+
+
+@dataclass(frozen=True)
+class RouterSettings:
+    """How routes are chosen.
+
+    Attributes:
+        route: what a way costs.
+        entry_reach: a robot may enter the map at nodes nearer than this, m.
+        entry_cost: what a metre from the robot to its first node costs: nobody has driven it yet.
+    """
+
+    route: RouteSettings = field(default_factory=RouteSettings)
+    entry_reach: float = 1.5
+    entry_cost: float = 3.0
 
 
 class Router:
     """Answers how to get from node to node. It stands for one merged map; make another for the next."""
 
-    def __init__(self, merged: MergedMap, settings: RouteSettings | None = None) -> None:
+    def __init__(self, merged: MergedMap, settings: RouterSettings | None = None) -> None:
         """Take a merged map."""
         self._union: HybridMap = merged.union()
         self._postures = {node: place.merged_from_robot.mean for node, place in merged.postures.items()}
         self._merged = merged
-        self._settings = settings
+        self._settings = settings or RouterSettings()
 
     def route(
         self,
@@ -30,38 +50,68 @@ class Router:
         goal: NodeId,
         blocked: Collection[tuple[NodeId, NodeId]] = (),
         penalties: Mapping[EdgeId, float] | None = None,
+        start_from_robot: Pose2 | None = None,
     ) -> RouteAnswer:
         """Find the cheapest way.
 
         Args:
-            start: where the robot is.
+            start: a node that the robot knows itself by.
             goal: where it shall be.
             blocked: pairs of nodes, in either order, between which the robot cannot drive.
             penalties: extra cost of edges, m.
+            start_from_robot: where the robot is. It may see the start node from afar, then the route begins
+                at a node that is nearer and better placed; None if it stands at the start node.
 
         Returns:
-            The legs, each with the edge's own measured relative posture: it was measured where the robot
-            will drive, while merged postures spread every edge's error over the whole map.
+            The legs. Their relative postures are those of the optimised graph: each is the best estimate
+            from all edges together. That of the first is relative to `start`.
         """
         for name, node in (("start", start), ("goal", goal)):
             if node not in self._postures:
                 return RouteAnswer((), f"{name} {node} is not in the merged map")
         if self._merged.component_of(start) != self._merged.component_of(goal):
             return RouteAnswer((), f"{start} and {goal} are in parts of the map that nothing joins yet")
-        found = find_route(
-            self._union,
-            start,
-            goal,
-            postures=self._postures,
-            penalties=penalties,
-            blocked=blocked,
-            settings=self._settings,
-        )
-        if not found.nodes:
-            return RouteAnswer((), found.reason)
-        legs = [RouteLeg(self._union.nodes[start], PoseGaussian(Pose2(), np.zeros((3, 3))), None)]
-        for node, edge_id in zip(found.nodes[1:], found.edges, strict=True):
+        best: Route | None = None
+        reason, best_cost = "", math.inf
+        for entry, cost in self._entries(start, start_from_robot, blocked):
+            if cost >= best_cost:
+                break
+            found = find_route(
+                self._union, entry, goal, postures=self._postures, penalties=penalties, blocked=blocked,
+                settings=self._settings.route,
+            )  # fmt: skip
+            reason = reason or found.reason
+            if found.nodes and cost + found.cost < best_cost:
+                best, best_cost = found, cost + found.cost
+        if best is None:
+            return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
+        legs = [RouteLeg(self._union.nodes[best.nodes[0]], self._relative(start, best.nodes[0]), None)]
+        for before, node, edge_id in zip(best.nodes, best.nodes[1:], best.edges, strict=False):
             edge = self._union.edges[edge_id]
-            relative = edge.a_from_b if edge.b == node else edge.a_from_b.inverse()
-            legs.append(RouteLeg(self._union.nodes[node], relative, edge.kind))
-        return RouteAnswer(tuple(legs), found.reason)
+            legs.append(RouteLeg(self._union.nodes[node], self._relative(before, node), edge.kind))
+        return RouteAnswer(tuple(legs), best.reason)
+
+    def _entries(
+        self, start: NodeId, start_from_robot: Pose2 | None, blocked: Collection[tuple[NodeId, NodeId]]
+    ) -> list[tuple[NodeId, float]]:
+        """Nodes where the route may begin with what it costs to get there, cheapest first."""
+        if start_from_robot is None:
+            return [(start, 0.0)]
+        s = self._settings
+        here = self._postures[start] @ start_from_robot
+        component = self._merged.component_of(start)
+        barred = {frozenset(pair) for pair in blocked}
+        near = sorted((here.distance(self._postures[n]), n) for n in self._merged.components[component or 0])
+        entries = [
+            (node, s.entry_cost * distance)
+            for distance, node in near
+            if (distance <= s.entry_reach or node == start) and frozenset((start, node)) not in barred
+        ]
+        return entries[:ENTRIES]
+
+    def _relative(self, a: NodeId, b: NodeId) -> PoseGaussian:
+        if a == b:
+            return PoseGaussian(Pose2(), np.zeros((3, 3)))
+        relative = self._merged.relative(a, b)
+        assert relative is not None, "nodes of one component"
+        return relative

@@ -28,7 +28,8 @@ class ConsistencySettings:
     """When links are believed.
 
     Attributes:
-        gate: chi-square with 3 degrees of freedom that a loop may miss by; 11.34 is 99 %.
+        gate: chi-square with 3 degrees of freedom that a loop may miss by; 16.27 is 99.9 %, since a link must
+            agree with every other one.
         floor_xy: error of any loop that no covariance tells of, m.
         floor_heading: the same, rad.
         least_links: independent links (no node in common) that join two pieces.
@@ -38,7 +39,7 @@ class ConsistencySettings:
         exact: up to as many links the best clique is searched exhaustively, beyond greedily.
     """
 
-    gate: float = 11.34
+    gate: float = 16.27
     floor_xy: float = 0.02
     floor_heading: float = 0.01
     least_links: int = 2

@@ -1,0 +1,134 @@
+"""The place index against exhaustive search."""
+
+import numpy as np
+import pytest
+
+from hybridmap.descriptor import decode
+from hybridmap.node import Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.query import View
+from hybridmap.synthetic import CAMERA, World, room, take_map, take_view
+from mapserver.placeindex import PlaceIndex, PlaceIndexSettings
+from merge.candidates import overlaps
+
+
+@pytest.fixture(scope="module")
+def building() -> tuple[World, list[Node], list[Pose2]]:
+    """Four rooms, six nodes in each."""
+    rng = np.random.default_rng(1)
+    rooms = [room(5.0 * k, 0, 5, 4, 500, rng) for k in range(4)]
+    world = rooms[0] + rooms[1] + rooms[2] + rooms[3]
+    tour = [
+        Pose2(5.0 * r + rng.uniform(1.5, 3), rng.uniform(1.5, 2.5), k) for r in range(4) for k in range(6)
+    ]
+    return world, take_map(world, MapId("a", 1), tour, rng)[0], tour
+
+
+def filled(nodes: list[Node], settings: PlaceIndexSettings | None = None) -> PlaceIndex:
+    index = PlaceIndex(settings)
+    for node in nodes:
+        index.add(node)
+    return index
+
+
+def brute_force(nodes: list[Node], view: View, s: PlaceIndexSettings) -> dict[NodeId, float]:
+    """The votes by plain loops over all descriptors of all nodes."""
+    scores = dict.fromkeys((node.id for node in nodes), 0.0)
+    everything = [(v, node.id) for node in nodes for v in decode(node.landmarks.codes)]
+    for feature in decode(view.codes):
+        nearest = sorted((float(((feature - v) ** 2).sum()), node) for v, node in everything)[: s.votes]
+        best: dict[NodeId, float] = {}
+        for squared, node in nearest:
+            if squared < s.reach**2:
+                best[node] = max(best.get(node, 0.0), 1 - squared / s.reach**2)
+        for node, weight in best.items():
+            scores[node] += weight / np.sqrt(len(best))
+    return scores
+
+
+def test_scores_against_brute_force(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    few, s = nodes[:8], PlaceIndexSettings(votes=6)
+    view, _ = take_view(world, tour[2], np.random.default_rng(2))
+    view = View(view.pixels[:40], view.codes[:40], view.camera)
+    expected = brute_force(few, view, s)
+    found = filled(few, s).query(view, k=8)
+    assert found
+    for node, score in found:
+        assert score == pytest.approx(expected[node], rel=1e-3)
+    assert [node for node, _ in found] == sorted(
+        (n for n in expected if expected[n] > 0), key=lambda n: -expected[n]
+    )
+
+
+def test_the_right_place_comes_first(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    index, rng = filled(nodes), np.random.default_rng(3)
+    first = 0
+    for node, stop in zip(nodes, tour, strict=True):
+        view, _ = take_view(world, stop @ Pose2(0.1, -0.1, 0.05), rng)
+        first += index.query(view, 1)[0][0] == node.id
+    assert first >= 22
+
+
+def test_overlaps_are_those_of_the_exhaustive_table(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    _, nodes, _ = building
+    table = overlaps(nodes)
+    index = filled(nodes)
+    assert len(table) > 10
+    for node in nodes:
+        expected = {(a if b == node.id else b): v for (a, b), v in table.items() if node.id in (a, b)}
+        found = index.overlaps(node)
+        assert set(found) == set(expected)
+        for other, value in found.items():
+            assert value == pytest.approx(expected[other], rel=1e-3)
+
+
+def test_added_is_found_at_once_and_removed_never(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    index = filled(nodes[:-1])
+    view, _ = take_view(world, tour[-1], np.random.default_rng(4))
+    last = nodes[-1]
+    assert last.id not in dict(index.query(view, 99))
+    index.add(last)
+    assert index.query(view, 1)[0][0] == last.id and last.id in index
+    assert last.id not in dict(index.query(view, 99, exclude=[last.id]))
+    index.remove(last.id)
+    index.remove(last.id)
+    assert last.id not in dict(index.query(view, 99)) and last.id not in index
+    assert index.landmarks == sum(len(node.landmarks) for node in nodes[:-1])
+
+
+def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    _, nodes, _ = building
+    index = filled(nodes)
+    before = index.landmarks
+    index.add(nodes[3])
+    assert index.landmarks == before and len(index) == len(nodes)
+
+
+def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    index = filled(nodes, PlaceIndexSettings(exact=1500, probes=0.2))
+    assert not index._flat
+    rng = np.random.default_rng(5)
+    hits = 0
+    for node, stop in zip(nodes, tour, strict=True):
+        view, _ = take_view(world, stop, rng)
+        hits += node.id in dict(index.query(view, 3))
+    assert hits >= 23
+    index.remove(nodes[0].id)
+    index.add(nodes[0])
+    assert index.landmarks == sum(len(node.landmarks) for node in nodes)
+
+
+def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    view, _ = take_view(world, tour[0], np.random.default_rng(6))
+    empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 16), np.uint8), CAMERA)
+    assert PlaceIndex().query(view) == [] and filled(nodes[:1]).query(empty) == []
+    bare = Node(NodeId("a", 1, 99), 0, nodes[0].map_from_robot, CAMERA, Landmarks.empty())
+    index = filled([bare])
+    assert index.query(view) == [] and index.overlaps(bare) == {} and len(index) == 1
+    index.remove(bare.id)
+    assert len(index) == 0

@@ -1,0 +1,228 @@
+"""Whole merges of synthetic maps, from descriptors to postures."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hybridmap.change import EdgePut, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import EdgeKind, MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.synthetic import World, room, take_map
+from merge.candidates import choose_pairs, overlaps
+from merge.links import Link, RefusedLink
+from merge.merged import MergedMap
+from merge.merging import merge_maps
+from merge.verification import verify
+
+A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
+
+
+def tour(x: float, y: float, n: int, rng: np.random.Generator) -> list[Pose2]:
+    """Looking around in a room whose corner is at (x, y), in turns that leave some of the view."""
+    heading = rng.uniform(-math.pi, math.pi)
+    return [Pose2(x + rng.uniform(1.6, 3.2), y + rng.uniform(1.4, 2.6), heading + 0.7 * k) for k in range(n)]
+
+
+def office(rng: np.random.Generator) -> list[World]:
+    return [room(5.0 * k, 0, 5, 4, 600, rng) for k in range(3)]
+
+
+class Fleet:
+    """Maps of some tours, and the truth about them."""
+
+    def __init__(self, world: World, tours: dict[MapId, list[Pose2]], rng: np.random.Generator) -> None:
+        self.maps: dict[MapId, HybridMap] = {}
+        self.truth: dict[NodeId, Pose2] = {}
+        for map_id, stops in tours.items():
+            nodes, edges = take_map(world, map_id, stops, rng)
+            self.maps[map_id] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+            self.truth |= {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
+
+    def merge(self, order: int = 1) -> MergedMap:
+        nodes = [node for one in self.maps.values() for node in one.nodes.values()][::order]
+        edges = [edge for one in self.maps.values() for edge in one.edges.values()][::order]
+        by_id = {node.id: node for node in nodes}
+        verdicts = [verify(by_id[a], by_id[b]) for a, b in choose_pairs(overlaps(nodes), edges)][::order]
+        maps = dict(list(self.maps.items())[::order])
+        links = [v for v in verdicts if isinstance(v, Link)]
+        return merge_maps(maps, links, [v for v in verdicts if isinstance(v, RefusedLink)])
+
+    def false_links(self, merged: MergedMap) -> int:
+        count = 0
+        for link in merged.links:
+            off = (self.truth[link.a].inverse() @ self.truth[link.b]).inverse() @ link.a_from_b.mean
+            count += math.hypot(off.x, off.y) > 0.5 or abs(off.heading) > math.radians(15)
+        return count
+
+    def errors(self, merged: MergedMap, component: int) -> tuple[float, float]:
+        """Root mean square error of the positions, and mean squared Mahalanobis distance of the postures."""
+        nodes = sorted(merged.components[component])
+        truth_from_merged = self.truth[nodes[0]] @ merged.postures[nodes[0]].merged_from_robot.mean.inverse()
+        off, distances = [], []
+        for node in nodes[1:]:
+            posture = merged.postures[node].merged_from_robot
+            true = truth_from_merged.inverse() @ self.truth[node]
+            off.append(posture.mean.distance(true) ** 2)
+            distances.append(posture.mahalanobis2(true))
+        return float(np.mean(off)) ** 0.5, float(np.mean(distances))
+
+
+def three_robots(seed: int, n: int = 8) -> Fleet:
+    rng = np.random.default_rng(seed)
+    rooms = office(rng)
+    tours = {
+        A: tour(0, 0, n, rng) + tour(5, 0, n, rng),
+        B: tour(5, 0, n, rng) + tour(10, 0, n, rng),
+        C: tour(10, 0, n, rng),
+    }
+    return Fleet(rooms[0] + rooms[1] + rooms[2], tours, rng)
+
+
+@pytest.fixture(scope="module")
+def office_fleet() -> tuple[Fleet, MergedMap]:
+    """Three robots' maps and their merge."""
+    fleet = three_robots(1)
+    return fleet, fleet.merge()
+
+
+def test_three_maps_become_one(office_fleet: tuple[Fleet, MergedMap]) -> None:
+    fleet, merged = office_fleet
+    assert len(merged.components) == 1
+    assert fleet.false_links(merged) == 0
+    error, distance = fleet.errors(merged, 0)
+    assert error < 0.10
+    assert distance < 5.0
+    assert merged.joined(A, C)
+    assert {link.edge().kind for link in merged.links} == {EdgeKind.MERGED, EdgeKind.LOOP}
+
+
+def test_result_does_not_depend_on_order() -> None:
+    fleet = three_robots(3, n=5)
+    one, two = fleet.merge(), fleet.merge(order=-1)
+    assert [link.pair for link in one.links] == [link.pair for link in two.links]
+    assert [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
+    assert one.components == two.components
+    for node, place in one.postures.items():
+        assert np.array_equal(
+            place.merged_from_robot.mean.vector, two.postures[node].merged_from_robot.mean.vector
+        )
+
+
+def test_maps_of_different_places_stay_apart() -> None:
+    rng = np.random.default_rng(4)
+    rooms = office(rng)
+    fleet = Fleet(rooms[0] + rooms[2], {A: tour(0, 0, 8, rng), B: tour(10, 0, 8, rng)}, rng)
+    merged = fleet.merge()
+    assert len(merged.components) == 2 and not merged.joined(A, B)
+    # Each component keeps its own map's frame.
+    for map_id in (A, B):
+        first = min(fleet.maps[map_id].nodes)
+        own = fleet.maps[map_id].nodes[first].map_from_robot.mean
+        assert merged.postures[first].merged_from_robot.mean.distance(own) < 1e-9
+
+
+def test_a_room_that_is_just_like_another_is_not_taken_for_it() -> None:
+    """Rooms 0 and 2 look exactly alike. Both robots saw the room between them, and each saw one of them."""
+    for seed in (5, 6):
+        rng = np.random.default_rng(seed)
+        left, middle = room(0, 0, 5, 4, 600, rng), room(5, 0, 5, 4, 900, rng)
+        world = left + middle + left.moved(Pose2(10, 0, 0))
+        tours = {
+            A: tour(0, 0, 4, rng) + tour(5, 0, 9, rng),
+            B: tour(5, 0, 9, rng) + tour(10, 0, 4, rng),
+        }
+        fleet = Fleet(world, tours, rng)
+        merged = fleet.merge()
+        assert fleet.false_links(merged) == 0
+        refused = [r for r in merged.refused if r.link is not None]
+        assert refused, "the alike rooms must have looked alike"
+
+
+def test_a_room_that_fits_two_others_alike_is_joined_to_neither() -> None:
+    """One robot saw two alike rooms, the other one of them: both stories have the same support."""
+    rng = np.random.default_rng(7)
+    left = room(0, 0, 5, 4, 600, rng)
+    own_a, own_b = room(5, 0, 5, 4, 600, rng), room(-5, 0, 5, 4, 600, rng)
+    world = left + own_a + left.moved(Pose2(10, 0, 0)) + own_b
+    fleet = Fleet(
+        world, {A: tour(0, 0, 8, rng) + tour(5, 0, 8, rng) + tour(10, 0, 8, rng), B: tour(0, 0, 8, rng)}, rng
+    )
+    merged = fleet.merge()
+    assert fleet.false_links(merged) == 0 and not merged.joined(A, B)
+    assert any("ambiguous" in r.reason for r in merged.refused)
+
+
+def chain(agent: str, n: int) -> HybridMap:
+    rng = np.random.default_rng(1)
+    nodes, edges = take_map(
+        room(0, 0, 30, 4, 50, rng),
+        MapId(agent, 1),
+        [Pose2(1.0 * k, 2, 0) for k in range(n)],
+        rng,
+        sigma_xy=0.01,
+    )
+    return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+
+
+def test_links_that_contradict_a_better_supported_way_round_are_refused() -> None:
+    """a-b and b-c are well supported; a-c says something else, consistently with itself."""
+    maps = {MapId(agent, 1): chain(agent, 8) for agent in "abc"}
+
+    def links(one: str, two: str, shift: float, inliers: int) -> list[Link]:
+        found = []
+        for k in range(4):
+            a, b = NodeId(one, 1, 2 * k + 1), NodeId(two, 1, 2 * k + 1)
+            true = (
+                maps[a.map].nodes[a].map_from_robot.mean.inverse() @ maps[b.map].nodes[b].map_from_robot.mean
+            )
+            mean = PoseGaussian.from_sigmas(true @ Pose2(shift, 0, 0), 0.05, 0.05)
+            found.append(Link(a, b, mean, evidence={"inliers": float(inliers), "share": 0.8}))
+        return found
+
+    false = links("a", "c", 2.0, 15)
+    merged = merge_maps(maps, [*links("a", "b", 0, 30), *links("b", "c", 0, 30), *false])
+    assert {link.pair for link in merged.links}.isdisjoint({link.pair for link in false})
+    assert len(merged.components) == 1 and len(merged.links) == 8
+    reasons = {r.reason for r in merged.refused}
+    assert reasons == {"contradicts better supported links by way of other maps"}
+    agreeing = merge_maps(maps, [*links("a", "b", 0, 30), *links("b", "c", 0, 30), *links("a", "c", 0, 15)])
+    assert len(agreeing.links) == 12
+
+
+def test_a_map_in_pieces_is_joined_piece_by_piece() -> None:
+    whole = chain("a", 6)
+    del whole.edges[NodeId("a", 1, 6)]  # between nodes 5 and 7
+    whole.graph.remove_edge(NodeId("a", 1, 5), NodeId("a", 1, 7), key=NodeId("a", 1, 6))
+    merged = merge_maps({A: whole}, [])
+    assert [len(part) for part in merged.components] == [3, 3]
+    assert set(merged.postures) == set(whole.nodes)
+
+
+def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]) -> None:
+    fleet, merged = office_fleet
+    link = merged.links[0]
+    assert "are linked: " in merged.explain(link.b, link.a)
+    refused = merged.refused[0]
+    assert refused.reason in merged.explain(refused.a, refused.b)
+    known = {link.pair for link in merged.links} | {r.pair for r in merged.refused}
+    unknown = next((a, b) for a, b in pairwise(sorted(fleet.truth)) if (a, b) not in known)
+    assert "not compared" in merged.explain(*unknown)
+    assert merged.summary().startswith("40 nodes, 3 maps, 1 component, ")
+    union = merged.union()
+    assert set(union.nodes) == set(fleet.truth)
+    assert len(union.edges) == sum(len(one.edges) for one in fleet.maps.values()) + len(merged.links)
+
+
+def test_nothing_to_merge() -> None:
+    assert merge_maps({}, []).summary() == "0 nodes, 0 maps, 0 components, 0 links, 0 refused"
+    assert MergedMap.empty().components == ()
+
+
+def test_link_edges_have_ids_of_their_own_that_stay(office_fleet: tuple[Fleet, MergedMap]) -> None:
+    _, merged = office_fleet
+    ids = [link.edge().id for link in merged.links]
+    assert len(set(ids)) == len(ids)
+    assert ids == [link.turned().canonical().edge().id for link in merged.links]
