@@ -79,7 +79,8 @@ def test_blocked_pairs_are_gone_around_in_either_order() -> None:
 
 def test_turning_costs() -> None:
     nodes, one = chain(Pose2(0, 0, 0), Pose2(0, 0, 3.0))
-    assert find_route(one, nodes[0].id, nodes[1].id).cost > 0.5
+    s = RouteSettings(per_edge=0.1, per_turn=0.4)
+    assert find_route(one, nodes[0].id, nodes[1].id, settings=s).cost == pytest.approx(0.1 + 0.4 * 3.0)
 
 
 def test_of_two_edges_the_cheaper_is_driven() -> None:
@@ -95,7 +96,8 @@ def test_links_between_maps_without_common_frame_are_driven() -> None:
     relative = PoseGaussian.from_sigmas(Pose2(1, 0, 0), 0.1, 0.1)
     link = Edge(NodeId("e", 1, 1), a.id, b.id, relative, EdgeKind.MERGED)
     one = HybridMap([NodePut(a), NodePut(b), EdgePut(link)])
-    assert find_route(one, a.id, b.id).cost == pytest.approx(1.02)
+    s = RouteSettings(per_edge=0.1, per_turn=0.0, per_undriven=0.5)
+    assert find_route(one, a.id, b.id, settings=s).cost == pytest.approx(1.5 + 0.1)
 
 
 def test_reasons() -> None:
