@@ -65,17 +65,36 @@ def lattice(
         cell * np.arange(low[0], high[0] + 1), cell * np.arange(low[1], high[1] + 1), indexing="ij"
     )
     allowed = surroundings.field.slack_table(x, y, _HEADINGS) >= margin
-    allowed &= surroundings.distance(np.stack([x, y], axis=-1)) >= surroundings.clearance
+    free = _free_half_cells(surroundings, start, low, high, cell)
+    allowed &= free[::2, ::2]
     goal = (0, int(-low[0]), int(-low[1]))
     near = _nearest(allowed, start, low, cell)
     if near is None or not allowed[goal]:
         return None
-    costs = _costs_to_go(allowed, goal, near, cell, price)
+    costs = _costs_to_go(allowed, free, goal, cell, price)
     if not np.isfinite(costs[near]):
         return None
-    states = _descend(costs, near, goal, cell, price)
+    states = _descend(costs, free, near, goal, cell, price)
     points = np.array([[cell * (i + low[0]), cell * (j + low[1])] for _, i, j in states])
     return _shorten(surroundings, start, _thin(points), margin, price)
+
+
+def _free_half_cells(
+    surroundings: Surroundings, start: Pose2, low: NDArray[np.intp], high: NDArray[np.intp], cell: float
+) -> NDArray[np.bool_]:
+    """(2X-1, 2Y-1) whether cells and the points half way between them are clear of obstacles.
+
+    Away from start and goal a little more room is asked for: what lies between two such points must be clear.
+    """
+    x, y = np.meshgrid(
+        0.5 * cell * np.arange(2 * low[0], 2 * high[0] + 1),
+        0.5 * cell * np.arange(2 * low[1], 2 * high[1] + 1),
+        indexing="ij",
+    )
+    near = np.minimum(np.hypot(x, y), np.hypot(x - start.x, y - start.y)) < 1.5 * cell
+    wanted = surroundings.clearance + np.where(near, 0.0, 0.2 * cell)
+    free: NDArray[np.bool_] = surroundings.distance(np.stack([x, y], axis=-1)) >= wanted
+    return free
 
 
 def _nearest(
@@ -100,45 +119,66 @@ def _nearest(
 
 def _costs_to_go(
     allowed: NDArray[np.bool_],
+    free: NDArray[np.bool_],
     goal: tuple[int, int, int],
-    start: tuple[int, int, int],
     cell: float,
     price: Price,
 ) -> Array:
-    """(32, X, Y) m, infinite where no way leads to the goal; iterated until the start's cost has settled."""
+    """(32, X, Y) m, infinite where no way leads to the goal.
+
+    Args:
+        allowed: (32, X, Y) admissible states.
+        free: (2X-1, 2Y-1) points clear of obstacles, half cells apart.
+        goal: state.
+        cell: m.
+        price: of turns.
+    """
     headings, nx, ny = allowed.shape
     b = _BORDER
     padded = np.full((headings, nx + 2 * b, ny + 2 * b), np.inf)
     costs: Array = padded[:, b : b + nx, b : b + ny]
     costs[goal] = 0.0
     wall = np.where(allowed, 0.0, np.inf)
+    halves = np.full((2 * nx - 1 + 2 * b, 2 * ny - 1 + 2 * b), np.inf)
+    halves[b:-b, b:-b] = np.where(free, 0.0, np.inf)
     turn = price.turn * np.diff(np.append(_HEADINGS, 2.0 * math.pi))
     way = cell * np.hypot(_STEPS[:, 0], _STEPS[:, 1])
+    # What a move costs from each cell: its length, or infinity through an obstacle half way.
+    moves = [
+        [
+            w + halves[b + dx : b + dx + 2 * nx - 1 : 2, b + dy : b + dy + 2 * ny - 1 : 2] + wall[h]
+            for dx, dy in (step, -step)
+        ]
+        for h, (w, step) in enumerate(zip(way, _STEPS, strict=True))
+    ]
     previous = np.inf
     for sweep in range(400):
-        total = float(np.where(np.isfinite(costs), costs, 1e3).sum()) if sweep % 4 == 0 else previous
-        if sweep % 4 == 0 and total == previous:
-            break
-        previous = total
+        if sweep % 4 == 0:
+            total = float(np.where(np.isfinite(costs), costs, 1e3).sum())
+            if total == previous:
+                break
+            previous = total
         for h in range(headings):
             dx, dy = _STEPS[h]
-            here = costs[h]
-            ahead = padded[h, b + dx : b + dx + nx, b + dy : b + dy + ny]
-            behind = padded[h, b - dx : b - dx + nx, b - dy : b - dy + ny]
-            step = np.minimum(ahead, behind) + way[h]
-            step += wall[h]
-            np.minimum(here, step, out=here)
-        for order in (range(headings), range(headings - 1, -1, -1)):
-            back = 1 if order.step > 0 else -1
-            for h in order:
-                source = (h - back) % headings
-                price_of_turn = turn[source] if back > 0 else turn[h]
-                np.minimum(costs[h], costs[source] + price_of_turn + wall[h], out=costs[h])
+            ahead = padded[h, b + dx : b + dx + nx, b + dy : b + dy + ny] + moves[h][0]
+            behind = padded[h, b - dx : b - dx + nx, b - dy : b - dy + ny] + moves[h][1]
+            np.minimum(ahead, behind, out=ahead)
+            np.minimum(costs[h], ahead, out=costs[h])
+        for h in [*range(headings), *range(headings)]:
+            np.minimum(costs[h], costs[h - 1] + turn[h - 1] + wall[h], out=costs[h])
+        for h in [*reversed(range(headings)), *reversed(range(headings))]:
+            after = (h + 1) % headings
+            np.minimum(costs[h], costs[after] + turn[h] + wall[h], out=costs[h])
     return costs
 
 
 def _descend(
-    costs: Array, state: tuple[int, int, int], goal: tuple[int, int, int], cell: float, price: Price
+    costs: Array,
+    free: NDArray[np.bool_],
+    state: tuple[int, int, int],
+    goal: tuple[int, int, int],
+    cell: float,
+    price: Price,
 ) -> list[tuple[int, int, int]]:
     """The states along the cheapest moves from a state to the goal."""
     _, nx, ny = costs.shape
@@ -153,7 +193,7 @@ def _descend(
             turned = abs(wrap_angle(float(_HEADINGS[other] - _HEADINGS[h])))
             options.append((float(costs[other, i, j]) + price.turn * turned, (other, i, j)))
             a, b = i + side * int(_STEPS[h, 0]), j + side * int(_STEPS[h, 1])
-            if 0 <= a < nx and 0 <= b < ny:
+            if 0 <= a < nx and 0 <= b < ny and free[i + a, j + b]:
                 step = cell * math.hypot(*_STEPS[h])
                 options.append((float(costs[h, a, b]) + step, (h, a, b)))
         state = min(options)[1]

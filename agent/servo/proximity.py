@@ -67,7 +67,7 @@ def guard(command: Command, proximity: NDArray[Any], description: RobotDescripti
         proximity: (K,) m from the robot's edge, one for each of the description's ranger bearings.
         description: footprint, rangers and tick.
     """
-    if command.forward == 0.0:
+    if abs(command.forward) < 1e-6:
         return Guarded(command, "")
     points = ranger_points(proximity, description)
     if not len(points):

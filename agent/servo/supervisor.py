@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,16 +19,8 @@ from agent.servo.rollout import roll_out
 from agent.servo.settings import ServoSettings
 from agent.servo.sight import Sight
 from agent.servo.step import ServoStep, State
-from agent.servo.way import find_plan
+from agent.servo.way import needs_thought, quick_plan, thorough_plan
 from hybridmap.pose import Pose2, wrap_angle
-
-
-@dataclass(slots=True)
-class _LawDrive:
-    """A law at work: its index and the chart's branch."""
-
-    law: int
-    polar: Polar
 
 
 class Servo:
@@ -64,12 +55,13 @@ class Servo:
             points_in_goal: (N, 3) m, landmarks in the goal's robot frame; rows with NaN are ignored.
 
         Returns:
-            Whether a way that keeps the landmarks in view is known already.
+            Whether a way is known already; if not, `command` makes a longer search with the robot at rest.
         """
         self.switches = 0
         self._sight = Sight(self._description.camera, self.settings)
         self._memory = ObstacleMemory()
-        self._law: _LawDrive | None = None
+        self._law: int | None = None
+        self._polar = Polar(0.0, 0.0, 0.0)  # continued from tick to tick while a law is at work
         self._plan: Plan | None = None
         self._leg = 0
         self._follower: LegFollower | None = None
@@ -77,9 +69,10 @@ class Servo:
         self._in_dead_zone = False
         self._settled = 0
         self._recovery = Recovery(self.settings, self._limits)
-        self._wait, self._patience = 0, 2
+        self._wait, self._patience, self._thinking = 0, 2, False
         self._sight.update(goal_from_robot, points_in_goal, None)
         self._choose(goal_from_robot, self._surroundings(goal_from_robot))
+        self._thinking = False
         return self._law is not None or self._plan is not None
 
     @property
@@ -123,6 +116,8 @@ class Servo:
                 self._choose(pose, surroundings)
             if self._law is not None:
                 return self._drive_law(pose, surroundings)
+            if self._thinking:
+                return self._step(Command(), "driving", "standing still to think the way over", pose)
             if self._plan is None:
                 break
             step = self._drive_leg(pose, surroundings)
@@ -150,12 +145,10 @@ class Servo:
         """Drop the law or plan at work when its way has become inadmissible; let a law relieve a plan."""
         hard = 0.5 * self.settings.least_margin
         if self._law is not None:
-            polar = continued(pose, self._law.polar)
-            rollouts = roll_out(polar, self.settings.lambda_, self.settings.dead_zone)
-            working = self._law.law
-            if rollouts.parked[working] and around.admits(rollouts.postures[working], hard):
-                self._law.polar = polar
-            else:
+            self._polar = continued(pose, self._polar)
+            rollouts = roll_out(self._polar, self.settings.lambda_, self.settings.dead_zone)
+            way = rollouts.postures[self._law]
+            if not (rollouts.parked[self._law] and around.admits(way, hard)):
                 self._law = None
                 self._broken_laws += 1
         elif self._plan is not None:
@@ -171,14 +164,22 @@ class Servo:
                 self._take_law(law, pose)
 
     def _choose(self, pose: Pose2, around: Surroundings) -> None:
-        """Find a way from here: the cheaper of laws and plan, laws favoured."""
+        """Find a way from here: the cheaper of laws and plan, laws favoured.
+
+        A long search is made only after a tick of standing still: the wheels do not turn while it takes.
+        """
         if self._wait > 0:
             self._wait -= 1
             return
         if math.hypot(pose.x, pose.y) < 1e-9 or self._sight.field.count < self.settings.min_visible:
             return
-        plan = find_plan(around, pose, self.settings)
+        search = thorough_plan if self._thinking else quick_plan
+        plan = search(around, pose, self.settings)
         law = self._best_law(polar_of(pose), around, plan.cost if plan else math.inf)
+        if law is None and not self._thinking and needs_thought(plan):
+            self._thinking = True
+            return
+        self._thinking = False
         if law is not None:
             self._take_law(law, pose)
         elif plan is not None:
@@ -209,7 +210,7 @@ class Servo:
         return None
 
     def _take_law(self, law: int, pose: Pose2) -> None:
-        self._law = _LawDrive(law, polar_of(pose))
+        self._law, self._polar = law, polar_of(pose)
         self.switches += 1
 
     def _drop_plan(self) -> None:
@@ -241,15 +242,15 @@ class Servo:
     def _drive_law(self, pose: Pose2, around: Surroundings) -> ServoStep:
         """Equation (5) with v = rho u, slowed to the limits without a change of curvature."""
         assert self._law is not None
-        polar, gain = self._law.polar, self.settings.gain
+        polar, gain = self._polar, self.settings.gain
         u, omega = control(polar.phi, polar.beta, self.settings.lambda_)
         speeds = saturate(
             gain * polar.rho * float(u),
-            gain * float(omega[self._law.law]),
+            gain * float(omega[self._law]),
             self._limits.forward,
             self._limits.turn,
         )
-        return self._checked(Command(*speeds), "driving", f"law {self._law.law + 1}", pose, around)
+        return self._checked(Command(*speeds), "driving", f"law {self._law + 1}", pose, around)
 
     def _drive_leg(self, pose: Pose2, around: Surroundings) -> ServoStep | None:
         """Follow the plan; None when it has ended short of the goal."""
@@ -289,7 +290,7 @@ class Servo:
     def _step(self, command: Command, state: State, reason: str, pose: Pose2) -> ServoStep:
         rooms = self._sight.field.rooms(arc(pose, command.forward, command.turn, self.settings.horizon))
         seen = int((rooms >= 0.0).sum(axis=-1).min())
-        law = self._law.law if self._law is not None and state == "driving" else None
+        law = self._law if state == "driving" else None
         return ServoStep(command, state, law, reason, seen)
 
 

@@ -19,8 +19,32 @@ _DETOUR_M = 0.6
 """if it is also this much longer, m."""
 
 
-def find_plan(around: Surroundings, start: Pose2, settings: ServoSettings) -> Plan | None:
-    """A plan from a posture to the goal, with as wide a margin as there is one for.
+def quick_plan(around: Surroundings, start: Pose2, settings: ServoSettings) -> Plan | None:
+    """A plan of two legs with as wide a margin as there is one for: milliseconds.
+
+    Args:
+        around: constraints.
+        start: posture in goal.
+        settings: margins and price.
+
+    Returns:
+        The plan, or None if two legs will not do.
+    """
+    for margin in settings.margins():
+        turned = turned_inside(around, start, margin)
+        plan = zigzag(around, turned, margin, settings.price) if turned is not None else None
+        if plan is not None:
+            return plan
+    return None
+
+
+def needs_thought(plan: Plan | None) -> bool:
+    """Whether a quick plan is so long, or missing, that the thorough search is worth its time."""
+    return plan is None or plan.length > _DETOUR * math.hypot(plan.start.x, plan.start.y) + _DETOUR_M
+
+
+def thorough_plan(around: Surroundings, start: Pose2, settings: ServoSettings) -> Plan | None:
+    """The cheapest plan that two legs or the lattice know: tens to hundreds of milliseconds.
 
     Args:
         around: constraints.
@@ -30,22 +54,16 @@ def find_plan(around: Surroundings, start: Pose2, settings: ServoSettings) -> Pl
     Returns:
         The plan, or None if none was found.
     """
-    distance = math.hypot(start.x, start.y)
-    for margin in settings.margins():
+    quick = quick_plan(around, start, settings)
+    wide, *_, least = settings.margins()
+    for margin, cell, room in ((0.6 * wide, 0.1, 1.2), (least, 0.1, 1.2), (least, 0.06, 1.5)):
+        if quick is not None and margin < quick.margin:
+            break
         turned = turned_inside(around, start, margin)
-        if turned is None:
-            continue
-        plan = zigzag(around, turned, margin, settings.price)
-        if plan is None or plan.length > _DETOUR * distance + _DETOUR_M:
-            other = lattice(around, turned, margin, settings.price)
-            if plan is None or (other is not None and other.cost < plan.cost):
-                plan = other
+        plan = lattice(around, turned, margin, settings.price, cell, room) if turned is not None else None
         if plan is not None:
-            return plan
-    turned = turned_inside(around, start, settings.least_margin)
-    if turned is None:
-        return None
-    return lattice(around, turned, settings.least_margin, settings.price, cell=0.06, room=1.5)
+            return plan if quick is None or plan.cost < quick.cost else quick
+    return quick
 
 
 def turned_inside(around: Surroundings, start: Pose2, margin: float) -> Pose2 | None:
