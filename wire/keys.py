@@ -1,6 +1,6 @@
 """Every key of a fleet: the version first, then who, then what. No data stands in a key.
 
-    mapweave/1/<fleet>/agent/<agent>/change/<epoch>   changes, one a message; attachment: see wire.messages
+    mapweave/1/<fleet>/agent/<agent>/change/<epoch>   one change each; see wire.log_messages
     mapweave/1/<fleet>/agent/<agent>/head/<epoch>     beacon: the newest sequence number
     mapweave/1/<fleet>/agent/<agent>/log/<epoch>      question: a range of the log
     mapweave/1/<fleet>/agent/<agent>/alive/<epoch>    liveliness

@@ -1,0 +1,230 @@
+"""Changes as bytes: what is kept on disks and sent over the wire. The layout stands in docs/wire.md.
+
+A change is an envelope (sequence number, stamp) around a *body*. The body alone is what a map file holds. Ids
+of the body's own map are written as a bare number, ids of other maps in full.
+
+Encoding rounds (see wire.landmark_codec); what was decoded encodes to the same bytes again.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from wire.landmark_codec import (
+    LANDMARK_BYTES,
+    MAX_LANDMARKS,
+    pack_camera,
+    pack_landmarks,
+    pack_posture,
+    unpack_camera,
+    unpack_landmarks,
+    unpack_posture,
+)
+from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+
+MAX_BODY_BYTES = MAX_LANDMARKS * LANDMARK_BYTES + 2048
+MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
+MAX_SHARED = MAX_LANDMARKS
+MAX_EVIDENCE = 64
+
+NODE_PUT, NODE_RETIRED, EDGE_PUT, EDGE_RETIRED = 1, 2, 3, 4
+
+EDGE_KINDS = {
+    EdgeKind.MAPPED: 1,
+    EdgeKind.TURNED: 2,
+    EdgeKind.DRIVEN: 3,
+    EdgeKind.LOOP: 4,
+    EdgeKind.MERGED: 5,
+}
+KINDS_OF_EDGE = {number: kind for kind, number in EDGE_KINDS.items()}
+
+
+def element_of(body: ChangeBody) -> NodeId:
+    """The id of the node or edge that a body is about."""
+    match body:
+        case NodePut(node):
+            return node.id
+        case EdgePut(edge):
+            return edge.id
+        case NodeRetired(element) | EdgeRetired(element):
+            return element
+
+
+def encode_body(body: ChangeBody) -> bytes:
+    """Encode a body.
+
+    Raises:
+        InvalidValue: it would not decode: too many landmarks, a number out of range.
+    """
+    element = element_of(body)
+    head = {"i": list(element)}
+    match body:
+        case NodePut(node):
+            data = pack({"k": NODE_PUT, **head, **_node_fields(node)})
+        case EdgePut(edge):
+            data = pack({"k": EDGE_PUT, **head, **_edge_fields(edge)}, single_floats=True)
+        case NodeRetired():
+            data = pack({"k": NODE_RETIRED, **head})
+        case EdgeRetired():
+            data = pack({"k": EDGE_RETIRED, **head})
+    try:
+        # One rule for both sides: what a receiver would refuse is not sent.
+        decode_body(data)
+    except InvalidMessage as error:
+        raise InvalidValue(str(error)) from None
+    return data
+
+
+def decode_body(data: bytes) -> ChangeBody:
+    """Decode a body.
+
+    Raises:
+        InvalidMessage: anything is wrong with it.
+    """
+    reader = Reader(data, "change", MAX_BODY_BYTES)
+    kind = reader.integer("k", NODE_PUT, EDGE_RETIRED)
+    element = reader.node_id("i")
+    if kind == NODE_PUT:
+        return NodePut(_read_node(reader, element))
+    if kind == EDGE_PUT:
+        return EdgePut(_read_edge(reader, element))
+    return NodeRetired(element) if kind == NODE_RETIRED else EdgeRetired(element)
+
+
+def encode_change(change: Change) -> bytes:
+    """Encode a change.
+
+    Raises:
+        InvalidValue: it would not decode, or its body belongs to another map.
+    """
+    if element_of(change.body).map != change.map:
+        raise InvalidValue(f"a change of {change.map} cannot be about {element_of(change.body)}")
+    return wrap_body(change.sequence, change.stamp_ns, encode_body(change.body))
+
+
+def decode_change(data: bytes) -> Change:
+    """Decode a change.
+
+    Raises:
+        InvalidMessage: anything is wrong with it.
+    """
+    sequence, stamp_ns, encoded = unwrap_body(data)
+    body = decode_body(encoded)
+    return Change(element_of(body).map, sequence, stamp_ns, body)
+
+
+def wrap_body(sequence: int, stamp_ns: int, encoded: bytes) -> bytes:
+    """The change's envelope around an encoded body.
+
+    Raises:
+        InvalidValue: a number is out of range.
+    """
+    if not (1 <= sequence <= MAX_NUMBER and 0 <= stamp_ns <= MAX_STAMP_NS):
+        raise InvalidValue(f"change: sequence {sequence} or stamp {stamp_ns} is out of range")
+    return pack({"q": sequence, "t": stamp_ns, "b": encoded})
+
+
+def unwrap_body(data: bytes) -> tuple[int, int, bytes]:
+    """Sequence number, stamp and the encoded body of a change; the body is not looked at.
+
+    Raises:
+        InvalidMessage: the envelope is broken.
+    """
+    reader = Reader(data, "change", MAX_CHANGE_BYTES)
+    sequence = reader.integer("q", 1, MAX_NUMBER)
+    return sequence, reader.integer("t", 0, MAX_STAMP_NS), reader.binary("b", MAX_BODY_BYTES)
+
+
+def _node_fields(node: Node) -> dict[str, object]:
+    return {
+        "t": node.stamp_ns,
+        "p": pack_posture(node.map_from_robot),
+        "c": pack_camera(node.camera),
+        "l": pack_landmarks(node.landmarks, node.camera),
+    }
+
+
+def _read_node(reader: Reader, element: NodeId) -> Node:
+    camera = unpack_camera(reader.binary("c", MAX_BODY_BYTES))
+    return Node(
+        id=element,
+        stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
+        map_from_robot=unpack_posture(reader.binary("p", MAX_BODY_BYTES)),
+        camera=camera,
+        landmarks=unpack_landmarks(reader.binary("l", MAX_BODY_BYTES), camera),
+    )
+
+
+def _edge_fields(edge: Edge) -> dict[str, object]:
+    fields: dict[str, object] = {
+        "a": _reference(edge.a, edge.id.map),
+        "b": _reference(edge.b, edge.id.map),
+        "p": pack_posture(edge.a_from_b),
+        "w": EDGE_KINDS[edge.kind],
+    }
+    if len(edge.shared):
+        fields["h"] = _pack_shared(edge.shared)
+    if edge.evidence:
+        fields["x"] = {name: _small(value) for name, value in edge.evidence.items()}
+    return fields
+
+
+def _read_edge(reader: Reader, element: NodeId) -> Edge:
+    a, b = (_read_reference(reader, end, element.map) for end in "ab")
+    if a == b:
+        raise reader.error(f"edge {element} joins {a} to itself")
+    evidence = reader.table("x", MAX_EVIDENCE) if reader.has("x") else {}
+    return Edge(
+        id=element,
+        a=a,
+        b=b,
+        a_from_b=unpack_posture(reader.binary("p", MAX_BODY_BYTES)),
+        kind=KINDS_OF_EDGE[reader.integer("w", 1, len(EDGE_KINDS))],
+        shared=_unpack_shared(reader.binary("h", 1 + 4 * MAX_SHARED) if reader.has("h") else b"\x01"),
+        evidence={name: reader.as_number(value, name, -1e30, 1e30) for name, value in evidence.items()},
+    )
+
+
+def _reference(element: NodeId, home: MapId) -> int | list[str | int]:
+    return element.number if element.map == home else list(element)
+
+
+def _read_reference(reader: Reader, name: str, home: MapId) -> NodeId:
+    value = reader.any(name)
+    if type(value) is int:
+        return NodeId(*home, reader.integer(name, 0, MAX_NUMBER))
+    return reader.node_id(name)
+
+
+def _small(value: float) -> int | float:
+    """A whole number packs into one to five bytes, another one into five."""
+    number = float(value)
+    return int(number) if math.isfinite(number) and number == int(number) and abs(number) < 2**24 else number
+
+
+def _pack_shared(shared: NDArray[Any]) -> bytes:
+    """Bytes an index (1 or 2), then all indices in a, then all in b, little-endian."""
+    pairs = np.asarray(shared)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.integer):
+        raise InvalidValue(f"edge: shared landmarks need (K, 2) integers, not {pairs.shape} {pairs.dtype}")
+    if len(pairs) > MAX_SHARED or pairs.min() < 0 or pairs.max() >= MAX_LANDMARKS:
+        raise InvalidValue(f"edge: shared landmarks are too many or not in 0..{MAX_LANDMARKS - 1}")
+    width = 1 if pairs.max() < 256 else 2
+    return bytes([width]) + pairs.T.astype(f"<u{width}").tobytes()
+
+
+def _unpack_shared(data: bytes) -> NDArray[np.int64]:
+    width = data[0] if data else 0
+    if width not in (1, 2) or (len(data) - 1) % (2 * width):
+        raise InvalidMessage("edge: shared landmarks are no pairs of indices")
+    pairs = np.frombuffer(data, f"<u{width}", offset=1).reshape(2, -1).T.astype(np.int64)
+    if len(pairs) > MAX_SHARED or (pairs >= MAX_LANDMARKS).any():
+        raise InvalidMessage(f"edge: shared landmarks are too many or not in 0..{MAX_LANDMARKS - 1}")
+    return pairs

@@ -1,0 +1,100 @@
+"""SQLite files that survive the loss of power, belong to one process, and say clearly what is wrong."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hybridmap.errors import InvalidFile
+
+
+class Database:
+    """One SQLite file in WAL mode, each commit on the disk before it returns (synchronous=FULL).
+
+    The file is locked for as long as it is open: two processes that append to one log would number their
+    changes alike.
+    """
+
+    def __init__(self, path: Path, what: str, application_id: int, version: int, schema: str) -> None:
+        """Open the file, or make it.
+
+        Args:
+            path: of the file; its folder must be there.
+            what: what it is for people, for example "agent journal".
+            application_id: marks files of this kind.
+            version: of the schema.
+            schema: SQL that makes the tables of a new file.
+
+        Raises:
+            InvalidFile: damaged, of another kind or version, in use, or not readable.
+        """
+        self.path = path
+        self.what = what
+        with self.guard():
+            # Threads take turns: whoever shares a Database holds a lock of its own.
+            self.connection = sqlite3.connect(
+                path, timeout=5.0, isolation_level=None, check_same_thread=False
+            )
+        try:
+            with self.guard():
+                self._prepare(application_id, version, schema)
+        except BaseException:
+            self.connection.close()
+            raise
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Turn SQLite's errors into InvalidFile with one line."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            if "locked" in str(error):
+                raise InvalidFile(f"{self.path}: {self.what} is in use by another process") from None
+            raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error})") from None
+
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """All that is done inside is committed at the end, or nothing of it.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        with self.guard():
+            self.connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield self.connection
+                self.connection.execute("COMMIT")
+            except BaseException:
+                # A full disk may have rolled back by itself.
+                if self.connection.in_transaction:
+                    self.connection.execute("ROLLBACK")
+                raise
+
+    def close(self) -> None:
+        """Let go of the file. Twice is no error."""
+        self.connection.close()
+
+    def _prepare(self, application_id: int, version: int, schema: str) -> None:
+        run = self.connection.execute
+        run("PRAGMA locking_mode=EXCLUSIVE")
+        run("PRAGMA synchronous=FULL")
+        kind = run("PRAGMA application_id").fetchone()[0]
+        empty = run("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        if not empty and kind != application_id:
+            raise InvalidFile(f"{self.path}: is not a Mapweave {self.what}")
+        found = run("PRAGMA user_version").fetchone()[0]
+        if not empty and found != version:
+            raise InvalidFile(f"{self.path}: {self.what} of format {found}, this program uses {version}")
+        run("PRAGMA journal_mode=WAL")
+        if empty:
+            run("BEGIN IMMEDIATE")
+            for statement in filter(str.strip, schema.split(";")):
+                run(statement)
+            run(f"PRAGMA application_id={application_id}")
+            run(f"PRAGMA user_version={version}")
+            run("COMMIT")
+        damage = run("PRAGMA quick_check(1)").fetchone()[0]
+        if damage != "ok":
+            raise InvalidFile(f"{self.path}: {self.what} is damaged ({damage.splitlines()[0]})")

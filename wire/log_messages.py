@@ -1,0 +1,215 @@
+"""The small messages around a log: beacon, acknowledgement, range of a log, and flat records for people."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import MapId
+from wire.codec import MAX_CHANGE_BYTES
+from wire.packing import MAX_NUMBER, Reader, pack
+
+MARK = struct.Struct("<QQ")
+MAX_ROWS = 256
+"""Changes in one answer for a range of a log."""
+
+MAX_SERVERS = 64
+MAX_REFUSALS = 16
+MAX_REASON = 300
+MAX_RECORD_FIELDS = 64
+MAX_SMALL_BYTES = 65536
+
+Scalar = bool | int | float | str
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """What the attachment of a published change says, so that a receiver can order it undecoded.
+
+    Attributes:
+        sequence: of the change.
+        log_id: which log this is. Drawn by chance when the log is begun: an agent that has lost its disk
+            and counts from one again must not be taken for the one before.
+    """
+
+    sequence: int
+    log_id: int
+
+    def encode(self) -> bytes:
+        """16 bytes: both as little-endian uint64."""
+        return MARK.pack(self.sequence, self.log_id)
+
+    @staticmethod
+    def decode(data: bytes) -> Mark:
+        """Read an attachment.
+
+        Raises:
+            InvalidMessage: it is none.
+        """
+        if len(data) != MARK.size:
+            raise InvalidMessage(f"change: an attachment of {len(data)} bytes instead of {MARK.size}")
+        sequence, log_id = MARK.unpack(data)
+        if not 1 <= sequence <= MAX_NUMBER:
+            raise InvalidMessage(f"change: sequence {sequence} is out of range")
+        return Mark(sequence, log_id)
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """An agent's beacon.
+
+    Attributes:
+        log_id: see Mark.
+        newest: sequence number of the newest change, 0 if there is none.
+        acknowledged: what the agent believes to be on which server's disk. A server that has more says so
+            again.
+    """
+
+    log_id: int
+    newest: int
+    acknowledged: Mapping[str, int] = field(default_factory=dict)
+
+    def encode(self) -> bytes:
+        """Encode."""
+        return pack({"l": self.log_id, "q": self.newest, "a": dict(self.acknowledged)})
+
+    @staticmethod
+    def decode(data: bytes) -> Head:
+        """Decode; raises InvalidMessage."""
+        reader = Reader(data, "head", MAX_SMALL_BYTES)
+        acknowledged = {
+            reader.as_name(server, "server"): reader.as_integer(watermark, "watermark", 0, MAX_NUMBER)
+            for server, watermark in reader.table("a", MAX_SERVERS).items()
+        }
+        return Head(_log_id(reader), reader.integer("q", 0, MAX_NUMBER), acknowledged)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A change that a server could not take, and why. Sequence 0: the whole log."""
+
+    sequence: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """What a server has on its disk.
+
+    Attributes:
+        map: whose log.
+        log_id: see Mark.
+        watermark: every change up to this one is settled: stored, or refused for good.
+        refusals: the newest of those that were refused.
+    """
+
+    map: MapId
+    log_id: int
+    watermark: int
+    refusals: tuple[Refusal, ...] = ()
+
+    def encode(self) -> bytes:
+        """Encode."""
+        refusals = [[one.sequence, one.reason[:MAX_REASON]] for one in self.refusals[-MAX_REFUSALS:]]
+        return pack({"m": list(self.map), "l": self.log_id, "q": self.watermark, "r": refusals})
+
+    @staticmethod
+    def decode(data: bytes) -> Ack:
+        """Decode; raises InvalidMessage."""
+        reader = Reader(data, "ack", MAX_SMALL_BYTES)
+        refusals = []
+        for element in reader.array("r", MAX_REFUSALS):
+            pair = reader.as_array(element, "refusal", 2)
+            if len(pair) != 2:
+                raise reader.error("a refusal must be [sequence, reason]")
+            sequence = reader.as_integer(pair[0], "refused sequence", 0, MAX_NUMBER)
+            refusals.append(Refusal(sequence, reader.as_text(pair[1], "reason", MAX_REASON)))
+        watermark = reader.integer("q", 0, MAX_NUMBER)
+        return Ack(reader.map_id("m"), _log_id(reader), watermark, tuple(refusals))
+
+
+@dataclass(frozen=True, slots=True)
+class LogRequest:
+    """A server asks for the changes first to last, both included."""
+
+    first: int
+    last: int
+
+    def encode(self) -> bytes:
+        """Encode."""
+        return pack({"f": self.first, "q": self.last})
+
+    @staticmethod
+    def decode(data: bytes) -> LogRequest:
+        """Decode; raises InvalidMessage."""
+        reader = Reader(data, "log request", MAX_SMALL_BYTES)
+        first = reader.integer("f", 1, MAX_NUMBER)
+        return LogRequest(first, reader.integer("q", first, MAX_NUMBER))
+
+
+@dataclass(frozen=True, slots=True)
+class LogAnswer:
+    """A piece of a log.
+
+    Attributes:
+        log_id: see Mark.
+        first: as asked.
+        covered: how far the answer reaches; less than asked if that would be too much for one answer. What
+            is missing up to here was superseded by a later change and is no longer kept.
+        changes: encoded, in order.
+    """
+
+    log_id: int
+    first: int
+    covered: int
+    changes: tuple[bytes, ...]
+
+    def encode(self) -> bytes:
+        """Encode."""
+        return pack({"l": self.log_id, "f": self.first, "q": self.covered, "c": list(self.changes)})
+
+    @staticmethod
+    def decode(data: bytes) -> LogAnswer:
+        """Decode; raises InvalidMessage. The changes are not looked at."""
+        reader = Reader(data, "log answer", MAX_ROWS * MAX_CHANGE_BYTES + MAX_SMALL_BYTES)
+        changes = tuple(
+            reader.as_binary(change, "a change", MAX_CHANGE_BYTES) for change in reader.array("c", MAX_ROWS)
+        )
+        first = reader.integer("f", 1, MAX_NUMBER)
+        return LogAnswer(_log_id(reader), first, reader.integer("q", first - 1, MAX_NUMBER), changes)
+
+
+def encode_record(values: Mapping[str, Scalar]) -> bytes:
+    """Encode a flat record of names and plain values: status lines, missions, commands to the simulator.
+
+    Raises:
+        InvalidValue: it would not decode.
+    """
+    data = pack({"s": dict(values)})
+    try:
+        decode_record(data)
+    except InvalidMessage as error:
+        raise InvalidValue(str(error)) from None
+    return data
+
+
+def decode_record(data: bytes) -> dict[str, Scalar]:
+    """Decode a flat record; raises InvalidMessage. What the values mean is the caller's to check."""
+    reader = Reader(data, "record", MAX_SMALL_BYTES)
+    values: dict[str, Scalar] = {}
+    for name, value in reader.table("s", MAX_RECORD_FIELDS).items():
+        if type(value) is bool:
+            values[name] = value
+        elif type(value) is int:
+            values[name] = reader.as_integer(value, name, -MAX_NUMBER * 1024, MAX_NUMBER * 1024)
+        elif type(value) is float:
+            values[name] = reader.as_number(value, name, -1e300, 1e300)
+        else:
+            values[name] = reader.as_text(value, name, 1024)
+    return values
+
+
+def _log_id(reader: Reader) -> int:
+    return reader.integer("l", 0, 2**64 - 1)

@@ -1,0 +1,180 @@
+"""Map files: a whole map in one file that can be checked.
+
+    magic    8 bytes   MAPWEAVE
+    version  uint32    little-endian, like the next
+    length   uint64    of the content
+    content            MessagePack, see `_pack`
+    digest   32 bytes  SHA-256 over everything before
+
+Postures and landmarks have the wire's precision. A file is written beside its place and then moved there, so
+that a reader, or a loss of power, finds either the old file or the new one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+from hybridmap.change import ChangeBody
+from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from hybridmap.node import NodeId
+from hybridmap.pose import PoseGaussian
+from wire.codec import MAX_BODY_BYTES, decode_body, encode_body
+from wire.landmark_codec import POSTURE, pack_posture, unpack_posture
+from wire.packing import MAX_NUMBER, Reader, pack
+
+MAGIC = b"MAPWEAVE"
+VERSION = 1
+HEADER = struct.Struct("<8sIQ")
+DIGEST_BYTES = 32
+MAX_CONTENT_BYTES = 2**32 - 1
+MAX_ELEMENTS = 10_000_000
+MAX_TITLE = 200
+
+Kind = Literal["agent", "merged"]
+KIND_NAMES: dict[Kind, str] = {"agent": "agent map", "merged": "merged map"}
+
+
+@dataclass(frozen=True, eq=False)
+class MapFile:
+    """What is in a map file.
+
+    Attributes:
+        kind: one agent's own map, or the merged map of a fleet.
+        title: one line for people.
+        changes: the map is their replay; a merged map's links are edges among them.
+        postures: of a merged map's nodes: number of the component, posture in that component's frame.
+    """
+
+    kind: Kind
+    title: str
+    changes: tuple[ChangeBody, ...]
+    postures: Mapping[NodeId, tuple[int, PoseGaussian]] = field(default_factory=dict)
+
+
+def write_map_file(path: Path, content: MapFile) -> None:
+    """Write a map file, all or nothing.
+
+    Raises:
+        InvalidValue: the content cannot be encoded.
+        InvalidFile: the disk does not take it.
+    """
+    data = pack_map_file(content)
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with beside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise InvalidFile(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
+    """Read and check a map file.
+
+    Args:
+        path: of the file.
+        kind: refuse files of another kind.
+
+    Raises:
+        InvalidFile: it cannot be read, is truncated, altered or of another kind; one line says which.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        content = unpack_map_file(data)
+    except InvalidMessage as error:
+        raise InvalidFile(f"{path}: {error}") from None
+    if kind not in ("any", content.kind):
+        raise InvalidFile(f"{path}: is of kind {content.kind!r}, not {kind!r}")
+    return content
+
+
+def pack_map_file(content: MapFile) -> bytes:
+    """The bytes of a map file.
+
+    Raises:
+        InvalidValue: the content cannot be encoded.
+    """
+    packed = _pack(content)
+    data = HEADER.pack(MAGIC, VERSION, len(packed)) + packed
+    data += hashlib.sha256(data).digest()
+    try:
+        # The title, the counts and the ids are checked by the one who will read them.
+        _unpack(packed)
+    except InvalidMessage as error:
+        raise InvalidValue(str(error)) from None
+    return data
+
+
+def unpack_map_file(data: bytes) -> MapFile:
+    """Check and decode the bytes of a map file.
+
+    Raises:
+        InvalidMessage: they are truncated, altered, or no map file.
+    """
+    if data[: len(MAGIC)] != MAGIC[: len(data)] or not data:
+        raise InvalidMessage("is not a Mapweave map file")
+    if len(data) < HEADER.size:
+        raise InvalidMessage(f"is truncated: {len(data)} bytes, not even a header")
+    _, version, length = HEADER.unpack_from(data)
+    if version != VERSION:
+        raise InvalidMessage(f"has format version {version}, this program reads {VERSION}")
+    whole = HEADER.size + length + DIGEST_BYTES
+    if len(data) < whole:
+        raise InvalidMessage(f"is truncated: {len(data)} of {whole} bytes")
+    if len(data) > whole:
+        raise InvalidMessage(f"has {len(data) - whole} bytes too many")
+    if hashlib.sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
+        raise InvalidMessage("is damaged: its content does not match its checksum")
+    return _unpack(data[HEADER.size : -DIGEST_BYTES])
+
+
+def _pack(content: MapFile) -> bytes:
+    postures = [
+        [list(node), component, pack_posture(posture)]
+        for node, (component, posture) in content.postures.items()
+    ]
+    changes = [encode_body(body) for body in content.changes]
+    return pack({"kind": content.kind, "title": content.title, "changes": changes, "postures": postures})
+
+
+def _unpack(content: bytes) -> MapFile:
+    reader = Reader(content, "map file", MAX_CONTENT_BYTES)
+    name = reader.text("kind", 16)
+    kinds: dict[str, Kind] = {kind: kind for kind in get_args(Kind)}
+    if name not in kinds:
+        raise reader.error(f"kind {name!r} is unknown")
+    changes = tuple(
+        decode_body(reader.as_binary(body, "change", MAX_BODY_BYTES))
+        for body in reader.array("changes", MAX_ELEMENTS)
+    )
+    postures: dict[NodeId, tuple[int, PoseGaussian]] = {}
+    for value in reader.array("postures", MAX_ELEMENTS):
+        parts = reader.as_array(value, "posture", 3)
+        if len(parts) != 3:
+            raise reader.error("a posture must be [node, component, posture]")
+        posture = unpack_posture(reader.as_binary(parts[2], "posture", POSTURE.size))
+        component = reader.as_integer(parts[1], "component", 0, MAX_NUMBER)
+        postures[reader.as_node_id(parts[0], "node")] = (component, posture)
+    return MapFile(kinds[name], reader.text("title", MAX_TITLE), changes, postures)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a move in a folder outlast a loss of power."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,177 @@
+"""Questions about the fleet's map and their answers as bytes: see hybridmap.query for what they mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hybridmap.change import NodePut
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from wire.codec import EDGE_KINDS, KINDS_OF_EDGE, MAX_BODY_BYTES, decode_body, encode_body
+from wire.landmark_codec import (
+    FEATURE_BYTES,
+    MAX_LANDMARKS,
+    MAX_POSITION,
+    pack_camera,
+    pack_features,
+    pack_posture,
+    unpack_camera,
+    unpack_features,
+    unpack_posture,
+)
+from wire.packing import MAX_NUMBER, Reader, pack
+
+MAX_VIEW_BYTES = MAX_LANDMARKS * FEATURE_BYTES + 256
+MAX_CANDIDATES = 64
+MAX_LEGS = 1024
+MAX_REASON = 1024
+NO_KIND = 0
+"""Stands for the first leg's missing edge kind."""
+
+
+MAX_BLOCKED = 256
+
+
+@dataclass(frozen=True, slots=True)
+class RouteRequest:
+    """How does one get from node to node?
+
+    Attributes:
+        start: node that the robot knows itself by.
+        goal: node where it wants to be.
+        blocked: pairs of nodes between which it could not drive.
+        start_from_robot: where it is exactly.
+    """
+
+    start: NodeId
+    goal: NodeId
+    blocked: tuple[tuple[NodeId, NodeId], ...] = ()
+    start_from_robot: Pose2 = field(default_factory=Pose2)
+
+
+def encode_view(view: View) -> bytes:
+    """Encode a view; raises InvalidValue if it would not decode."""
+    return pack({"c": pack_camera(view.camera), "f": pack_features(view.pixels, view.codes, view.camera)})
+
+
+def decode_view(data: bytes) -> View:
+    """Decode a view; raises InvalidMessage."""
+    reader = Reader(data, "view", MAX_VIEW_BYTES)
+    camera = unpack_camera(reader.binary("c", MAX_VIEW_BYTES))
+    pixels, codes = unpack_features(reader.binary("f", MAX_VIEW_BYTES), camera)
+    return View(pixels, codes, camera)
+
+
+def encode_relocalize_answer(answer: RelocalizeAnswer) -> bytes:
+    """Encode where a view was taken; raises InvalidValue if it would not decode."""
+    candidates = [_candidate(candidate) for candidate in answer.candidates]
+    data = pack({"y": answer.certainty.value, "w": candidates, "r": answer.reason})
+    return _checked(data, decode_relocalize_answer)
+
+
+def decode_relocalize_answer(data: bytes) -> RelocalizeAnswer:
+    """Decode where a view was taken; raises InvalidMessage."""
+    reader = Reader(data, "relocalization", MAX_CANDIDATES * 512 + 4 * MAX_REASON)
+    certainty = reader.text("y", 16)
+    if certainty not in set(Certainty):
+        raise reader.error(f"certainty {certainty!r} is unknown")
+    candidates = tuple(_read_candidate(reader, one) for one in reader.array("w", MAX_CANDIDATES))
+    return RelocalizeAnswer(Certainty(certainty), candidates, reader.text("r", MAX_REASON))
+
+
+def encode_route_request(request: RouteRequest) -> bytes:
+    """Encode a wish for a way; raises InvalidValue if it would not decode."""
+    blocked = [[list(a), list(b)] for a, b in request.blocked]
+    here = [float(number) for number in request.start_from_robot.vector]
+    data = pack({"a": list(request.start), "b": list(request.goal), "n": blocked, "s": here})
+    return _checked(data, decode_route_request)
+
+
+def decode_route_request(data: bytes) -> RouteRequest:
+    """Decode a wish for a way; raises InvalidMessage."""
+    reader = Reader(data, "route request", MAX_BLOCKED * 128 + 1024)
+    blocked = []
+    for value in reader.array("n", MAX_BLOCKED) if reader.has("n") else []:
+        pair = reader.as_array(value, "blocked pair", 2)
+        if len(pair) != 2:
+            raise reader.error("a blocked pair must be two nodes")
+        blocked.append((reader.as_node_id(pair[0], "node"), reader.as_node_id(pair[1], "node")))
+    here = reader.array("s", 3) if reader.has("s") else [0.0, 0.0, 0.0]
+    if len(here) != 3:
+        raise reader.error("start_from_robot must be three numbers")
+    x, y, heading = (
+        reader.as_number(number, "start_from_robot", -MAX_POSITION, MAX_POSITION) for number in here
+    )
+    return RouteRequest(reader.node_id("a"), reader.node_id("b"), tuple(blocked), Pose2(x, y, heading))
+
+
+def encode_route_answer(answer: RouteAnswer) -> bytes:
+    """Encode a way; raises InvalidValue if it would not decode."""
+    legs = [
+        [
+            encode_body(NodePut(leg.node)),
+            pack_posture(leg.previous_from_node),
+            NO_KIND if leg.kind is None else EDGE_KINDS[leg.kind],
+        ]
+        for leg in answer.legs
+    ]
+    return _checked(pack({"g": legs, "r": answer.reason}), decode_route_answer)
+
+
+def decode_route_answer(data: bytes) -> RouteAnswer:
+    """Decode a way; raises InvalidMessage."""
+    reader = Reader(data, "route", MAX_LEGS * (MAX_BODY_BYTES + 64) + 4 * MAX_REASON)
+    legs = tuple(_read_leg(reader, leg) for leg in reader.array("g", MAX_LEGS))
+    return RouteAnswer(legs, reader.text("r", MAX_REASON))
+
+
+def _candidate(place: Whereabouts) -> list[object]:
+    merged = b"" if place.merged_from_robot is None else pack_posture(place.merged_from_robot)
+    return [
+        list(place.node),
+        pack_posture(place.node_from_robot),
+        merged,
+        place.component,
+        place.inliers,
+        float(place.probability),
+    ]
+
+
+def _read_candidate(reader: Reader, value: Any) -> Whereabouts:
+    parts = reader.as_array(value, "candidate", 32)
+    # More parts than are known here are a newer program's.
+    if len(parts) < 6:
+        raise reader.error(f"a candidate has {len(parts)} parts instead of 6")
+    merged = reader.as_binary(parts[2], "merged posture", 64)
+    return Whereabouts(
+        node=reader.as_node_id(parts[0], "node"),
+        node_from_robot=unpack_posture(reader.as_binary(parts[1], "posture", 64)),
+        merged_from_robot=unpack_posture(merged) if merged else None,
+        component=reader.as_integer(parts[3], "component", 0, MAX_NUMBER),
+        inliers=reader.as_integer(parts[4], "inliers", 0, MAX_LANDMARKS),
+        probability=reader.as_number(parts[5], "probability", 0.0, 1.0),
+    )
+
+
+def _read_leg(reader: Reader, value: Any) -> RouteLeg:
+    parts = reader.as_array(value, "leg", 32)
+    if len(parts) < 3:
+        raise reader.error(f"a leg has {len(parts)} parts instead of 3")
+    body = decode_body(reader.as_binary(parts[0], "node", MAX_BODY_BYTES))
+    if not isinstance(body, NodePut):
+        raise reader.error("a leg leads to what is no node")
+    posture: PoseGaussian = unpack_posture(reader.as_binary(parts[1], "posture", 64))
+    kind = reader.as_integer(parts[2], "edge kind", NO_KIND, len(EDGE_KINDS))
+    return RouteLeg(body.node, posture, None if kind == NO_KIND else KINDS_OF_EDGE[kind])
+
+
+def _checked(data: bytes, decode: Any) -> bytes:
+    """What a receiver would refuse is not sent."""
+    try:
+        decode(data)
+    except InvalidMessage as error:
+        raise InvalidValue(str(error)) from None
+    return data

@@ -1,0 +1,179 @@
+"""MessagePack with a guard at the door: every message is a map with its schema version, read field by field.
+
+A reader asks for the fields that it knows and says what each must be; other fields are not looked at, so a
+newer program may add some. Whatever is wrong with a message, an InvalidMessage with one line comes out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import MapId, NodeId, check_name
+from wire.keys import MAX_EPOCH
+
+SCHEMA = 1
+"""Version of all messages; raised when a program of the version before would misread one."""
+
+MAX_NUMBER = 2**53
+"""Largest node number, sequence number and the like: exact in every language's numbers."""
+
+MAX_STAMP_NS = 2**63 - 1
+
+
+def pack(fields: Mapping[str, object], *, single_floats: bool = False) -> bytes:
+    """Make a message of fields; the schema version goes first.
+
+    Raises:
+        InvalidValue: a number is too large for MessagePack.
+    """
+    try:
+        packed: bytes = msgpack.packb({"v": SCHEMA, **fields}, use_single_float=single_floats)
+    except (OverflowError, ValueError, TypeError) as error:
+        raise InvalidValue(f"cannot be packed: {error}") from None
+    return packed
+
+
+class Reader:
+    """A message taken apart. Every method raises InvalidMessage if the field is missing or not as asked."""
+
+    def __init__(self, data: bytes, what: str, limit: int) -> None:
+        """Take a message apart.
+
+        Args:
+            data: as it came.
+            what: what it should be, for the reason.
+            limit: longest message that is looked at, bytes.
+
+        Raises:
+            InvalidMessage: too long, no MessagePack map with text keys, or of another schema.
+        """
+        self._what = what
+        if len(data) > limit:
+            raise self.error(f"{len(data)} bytes, at most {limit} are allowed")
+        try:
+            # The lengths that a message may claim are bounded by its own, so nothing huge is allocated.
+            fields = msgpack.unpackb(data, strict_map_key=True, max_ext_len=0)
+        except Exception as error:
+            # msgpack raises a dozen types, depending on the byte at which it stumbles.
+            reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
+            raise self.error(f"no MessagePack ({reason})") from error
+        if not isinstance(fields, dict):
+            raise self.error("no map of fields")
+        self._fields: dict[Any, Any] = fields
+        version = self.integer("v", 0, MAX_NUMBER)
+        if version != SCHEMA:
+            raise self.error(f"schema version {version}, this program speaks {SCHEMA}")
+
+    def error(self, reason: str) -> InvalidMessage:
+        """What to raise."""
+        return InvalidMessage(f"{self._what}: {reason}")
+
+    def has(self, name: str) -> bool:
+        """Whether the field is there."""
+        return name in self._fields
+
+    def any(self, name: str) -> Any:
+        """Whatever it is; give it to the methods that begin with `as_`."""
+        return self._get(name)
+
+    def integer(self, name: str, low: int, high: int) -> int:
+        """An integer in a closed range."""
+        return self.as_integer(self._get(name), name, low, high)
+
+    def number(self, name: str, low: float, high: float) -> float:
+        """A finite number in a closed range."""
+        return self.as_number(self._get(name), name, low, high)
+
+    def text(self, name: str, longest: int) -> str:
+        """Printable text, on one line."""
+        return self.as_text(self._get(name), name, longest)
+
+    def name(self, name: str) -> str:
+        """What an agent, server or fleet may be called."""
+        return self.as_name(self._get(name), name)
+
+    def binary(self, name: str, longest: int) -> bytes:
+        """Bytes."""
+        return self.as_binary(self._get(name), name, longest)
+
+    def array(self, name: str, most: int) -> list[Any]:
+        """A list whose elements nobody has looked at yet; give them to the methods that begin with `as_`."""
+        return self.as_array(self._get(name), name, most)
+
+    def table(self, name: str, most: int) -> dict[str, Any]:
+        """A map with text keys of at most 32 characters whose values nobody has looked at yet."""
+        value = self._get(name)
+        if not isinstance(value, dict) or len(value) > most:
+            raise self.error(f"{name} must be a map of at most {most}")
+        return {self.as_text(key, f"a key of {name}", 32): element for key, element in value.items()}
+
+    def map_id(self, name: str) -> MapId:
+        """[agent, epoch]."""
+        parts = self.as_array(self._get(name), name, 2)
+        if len(parts) != 2:
+            raise self.error(f"{name} must be [agent, epoch]")
+        return MapId(self.as_name(parts[0], name), self.as_integer(parts[1], f"{name}'s epoch", 0, MAX_EPOCH))
+
+    def node_id(self, name: str) -> NodeId:
+        """[agent, epoch, number]."""
+        return self.as_node_id(self._get(name), name)
+
+    # The same for elements of lists and maps.
+
+    def as_array(self, value: Any, name: str, most: int) -> list[Any]:
+        """See `array`."""
+        if not isinstance(value, list) or len(value) > most:
+            raise self.error(f"{name} must be a list of at most {most}")
+        return value
+
+    def as_node_id(self, value: Any, name: str) -> NodeId:
+        """See `node_id`."""
+        parts = self.as_array(value, name, 3)
+        if len(parts) != 3:
+            raise self.error(f"{name} must be [agent, epoch, number]")
+        return NodeId(
+            self.as_name(parts[0], name),
+            self.as_integer(parts[1], f"{name}'s epoch", 0, MAX_EPOCH),
+            self.as_integer(parts[2], f"{name}'s number", 0, MAX_NUMBER),
+        )
+
+    def _get(self, name: str) -> Any:
+        if name not in self._fields:
+            raise self.error(f"{name} is missing")
+        return self._fields[name]
+
+    def as_integer(self, value: Any, name: str, low: int, high: int) -> int:
+        """See `integer`."""
+        if type(value) is not int or not low <= value <= high:
+            raise self.error(f"{name} must be an integer in {low}..{high}")
+        return value
+
+    def as_number(self, value: Any, name: str, low: float, high: float) -> float:
+        """See `number`."""
+        if type(value) not in (int, float) or not math.isfinite(value) or not low <= value <= high:
+            raise self.error(f"{name} must be a number in {low:g}..{high:g}")
+        return float(value)
+
+    def as_text(self, value: Any, name: str, longest: int) -> str:
+        """See `text`."""
+        if type(value) is not str or len(value) > longest or not value.isprintable():
+            raise self.error(f"{name} must be printable text of at most {longest} characters")
+        return value
+
+    def as_name(self, value: Any, name: str) -> str:
+        """See `name`."""
+        try:
+            return check_name(self.as_text(value, name, 32))
+        except InvalidValue as error:
+            raise self.error(str(error)) from None
+
+    def as_binary(self, value: Any, name: str, longest: int) -> bytes:
+        """See `binary`."""
+        if type(value) is not bytes or len(value) > longest:
+            raise self.error(f"{name} must be at most {longest} bytes")
+        return value
