@@ -1,0 +1,182 @@
+"""A world: solid blocks for the physics, textured panels for the cameras, a floor plan for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Array, Pose2
+from sim.floorplan import FloorPlan, Rectangle
+from sim.texture import Texture
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A solid box that stands on, or hangs above, a rectangle of the floor.
+
+    Attributes:
+        base: where.
+        bottom: height of its lower face, m.
+        top: height of its upper face, m.
+    """
+
+    base: Rectangle
+    bottom: float
+    top: float
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A textured parallelogram, seen from its front alone.
+
+    Attributes:
+        corner: (3,) m, in world (or in the robot that carries it): upper left as seen from the front.
+        along: (3,) m, from the upper left to the upper right corner.
+        down: (3,) m, from the upper left to the lower left corner.
+        texture: what is on it.
+    """
+
+    corner: Array
+    along: Array
+    down: Array
+    texture: Texture
+
+
+class PanelSet:
+    """N panels in columns, the form in which they are drawn.
+
+    Attributes:
+        corner: (N, 3) m.
+        along: (N, 3) m.
+        down: (N, 3) m.
+        textures: N.
+    """
+
+    def __init__(self, corner: Array, along: Array, down: Array, textures: Sequence[Texture]) -> None:
+        """Take columns of equal length."""
+        self.corner = corner
+        self.along = along
+        self.down = down
+        self.textures = tuple(textures)
+
+    @staticmethod
+    def of(panels: Sequence[Panel]) -> PanelSet:
+        """From single panels."""
+        columns = [
+            np.array([getattr(p, name) for p in panels], dtype=np.float64).reshape(-1, 3)
+            for name in ("corner", "along", "down")
+        ]
+        return PanelSet(columns[0], columns[1], columns[2], [p.texture for p in panels])
+
+    @staticmethod
+    def joined(sets: Sequence[PanelSet]) -> PanelSet:
+        """All panels of several sets."""
+        return PanelSet(
+            np.concatenate([s.corner for s in sets]),
+            np.concatenate([s.along for s in sets]),
+            np.concatenate([s.down for s in sets]),
+            [texture for s in sets for texture in s.textures],
+        )
+
+    def placed(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> PanelSet:
+        """Panels of a body, in the frame in which the body stands.
+
+        Args:
+            rotation: (3, 3) turns vectors of the body into that frame.
+            position: (3,) m, of the body in that frame.
+        """
+        return PanelSet(
+            self.corner @ rotation.T + position,
+            self.along @ rotation.T,
+            self.down @ rotation.T,
+            self.textures,
+        )
+
+
+def upright_panel(
+    start: tuple[float, float], end: tuple[float, float], bottom: float, top: float, texture: Texture
+) -> Panel:
+    """A panel on a wall. Its front is where, looking at it, `start` is left and `end` is right."""
+    return Panel(
+        np.array([*start, top]),
+        np.array([end[0] - start[0], end[1] - start[1], 0.0]),
+        np.array([0.0, 0.0, bottom - top]),
+        texture,
+    )
+
+
+def block_panels(block: Block, sides: Sequence[Texture], top: Texture | None = None) -> list[Panel]:
+    """The four sides, and the upper face, of a block.
+
+    Args:
+        block: the block.
+        sides: four, for the faces towards its own +x, +y, -x and -y.
+        top: for the upper face, if it can be seen.
+    """
+    base = block.base
+    frame = Pose2(base.x, base.y, base.heading)
+    panels = []
+    for quarter, texture in enumerate(sides):
+        face = frame @ Pose2(heading=quarter * math.pi / 2)
+        reach, half = (base.length / 2, base.width / 2)[:: 1 if quarter % 2 == 0 else -1]
+        ends = face.apply(np.array([[reach, -half], [reach, half]]))
+        # Seen from outside, with the face's normal towards the viewer, -y is on the left.
+        panels.append(
+            upright_panel(
+                (float(ends[0, 0]), float(ends[0, 1])),
+                (float(ends[1, 0]), float(ends[1, 1])),
+                block.bottom,
+                block.top,
+                texture,
+            )
+        )
+    if top is not None:
+        corners = np.column_stack([base.corners, np.full(4, block.top)])
+        panels.append(Panel(corners[3], corners[2] - corners[3], corners[0] - corners[3], top))
+    return panels
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """All that stands still.
+
+    Attributes:
+        name: of the world.
+        plan: seen from above.
+        blocks: what one can run into.
+        panels: what one can see.
+        background: grey where no panel is (the ceiling).
+    """
+
+    name: str
+    plan: FloorPlan
+    blocks: tuple[Block, ...]
+    panels: tuple[Panel, ...]
+    background: int = 200
+
+    def start_poses(self, robots: int, seed: int, clearance: float = 0.45) -> tuple[Pose2, ...]:
+        """Free poses, robot i in room i (counted around), where no two robots come close.
+
+        Args:
+            robots: how many.
+            seed: other seeds, other poses.
+            clearance: to walls and furniture, m.
+
+        Raises:
+            InvalidValue: there is no such place.
+        """
+        rng = np.random.default_rng([seed, 0x57A27])
+        rooms = [room.name for room in self.plan.rooms if room.name.startswith("room")]
+        poses: list[Pose2] = []
+        for robot in range(robots):
+            room = rooms[robot % len(rooms)]
+            tries = [self.plan.random_free_pose(rng, clearance, room) for _ in range(30)]
+            # The farthest of a few random places from those already taken: never on top of one another.
+            apart = [min((p.distance(q) for q in poses), default=math.inf) for p in tries]
+            good = [p for p, gap in zip(tries, apart, strict=True) if gap > 1.0]
+            poses.append(good[0] if good else tries[int(np.argmax(apart))])
+        return tuple(poses)
