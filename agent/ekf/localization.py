@@ -15,10 +15,10 @@ from agent.ekf.iterated import Measurement, iterated_update
 from agent.ekf.motion import WheelNoise, move_posture
 from agent.ekf.node_state import NEAREST_SCALE, NodeState, turning
 from agent.ekf.report import UpdateReport
-from agent.ekf.static_fix import LEAST, static_fix
 from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
+from hybridmap.planar_pose import PlanarPoseSettings, solve_planar_pose
 from hybridmap.pose import Array, Pose2, PoseGaussian
 
 Ids = NDArray[np.int64]
@@ -37,7 +37,8 @@ class LocalizationSettings:
         loose_heading: a heading less certain than this is first fixed by static least squares, rad.
         lost_position: uncertainty of a position that was refuted, m (the paper's 1 m).
         lost_heading: uncertainty of a heading that was refuted, rad (the paper's 1 rad).
-        fix_chi2: a static fix with more than this per degree of freedom is not used.
+        least_fixed: landmarks that a static fix needs (paper, section 6).
+        least_refound: landmarks that a static fix needs to replace a posture that was refuted.
         least_agreeing: fewer accepted landmarks than this are no good update.
         least_agreeing_share: nor is a smaller share of those seen.
         patience: so many bad updates in a row make the filter unhealthy.
@@ -54,7 +55,8 @@ class LocalizationSettings:
     loose_heading: float = 0.15
     lost_position: float = 1.0
     lost_heading: float = 1.0
-    fix_chi2: float = 4.0
+    least_fixed: int = 4
+    least_refound: int = 6
     least_agreeing: int = 3
     least_agreeing_share: float = 0.35
     patience: int = 3
@@ -122,6 +124,7 @@ class LocalizationFilter:
         self._state = NodeState.of_prior(prior)
         self._bad = 0
         self._bad_reason = ""
+        self._rng = np.random.default_rng(0)
         self._insert(ids, points_in_node, covariances, np.zeros((len(ids), 3, 3)))
 
     def predict(self, odometry: Odometry) -> None:
@@ -255,20 +258,27 @@ class LocalizationFilter:
         """
         s, state = self.settings, self._state
         refuted = self._bad >= s.patience
-        if len(slots) < LEAST or not (refuted or state.covariance[2, 2] > s.loose_heading**2):
+        if not (refuted or state.covariance[2, 2] > s.loose_heading**2):
             return state.posture
         points, covariances = state.points(self._camera)
-        finite = np.isfinite(points[slots]).all(axis=1)
-        chosen = slots[finite]
-        fix = static_fix(self._camera, points[chosen], covariances[chosen], pixels[finite], s.pixel_sigma)
-        if fix is None or fix.chi2 > s.fix_chi2:
+        fix = solve_planar_pose(
+            points[slots],
+            pixels,
+            self._camera,
+            rng=self._rng,
+            point_covariances=covariances[slots],
+            settings=PlanarPoseSettings(
+                pixel_sigma=s.pixel_sigma, least_inliers=s.least_refound if refuted else s.least_fixed
+            ),
+        )
+        if fix is None:
             return state.posture
         start = fix.node_from_robot.mean.vector
         if refuted:
             p = state.covariance.copy()
             p[:3, :] = p[:, :3] = 0.0
             p[[0, 1, 2], [0, 1, 2]] = s.lost_position**2, s.lost_position**2, s.lost_heading**2
-            self._state = replace(state, posture=start, covariance=p)
+            self._state = replace(state, posture=start.copy(), covariance=p)
         # The same turn of the circle as the prior's heading.
         start[2] += 2 * math.pi * round((self._state.posture[2] - start[2]) / (2 * math.pi))
         return start
