@@ -1,0 +1,187 @@
+"""What travels between an agent and a body that lives elsewhere: MessagePack, validated field by field.
+
+    describe    question: empty; answer: RobotDescription
+    step        question: StepRequest; answer: Observation
+
+A body refuses with a reason. Two reasons are part of the protocol: ENDED and AGAIN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.observation import Command, Observation, Odometry, RobotDescription
+from hybridmap.errors import InvalidMessage, InvalidValue
+from wire.landmark_codec import pack_camera, unpack_camera
+from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+
+ENDED = "the simulation has ended"
+"""Refusal: there will be no more observations, and that is no failure."""
+
+AGAIN = "ask again later"
+"""A refusal with this in it is answered by asking the same again (the bus itself says so when it is full)."""
+
+MAX_IMAGE_BYTES = 16 * 2**20
+MAX_SIDE_PX = 16384
+MAX_RANGERS = 256
+MAX_SMALL_BYTES = 16384
+"""Longest message without an image."""
+
+FARTHEST = 1e4
+"""No ranger reaches farther and no robot drives farther between two observations, m."""
+FASTEST = 1e3
+"""No robot drives or turns faster, m/s and rad/s."""
+
+RAW = "raw"
+COMPRESSED = ("jpeg", "png")
+
+
+@dataclass(frozen=True, slots=True)
+class StepRequest:
+    """Apply a command for one tick, then tell what is sensed.
+
+    Attributes:
+        sequence: 1 begins a conversation; each further step is one more. The same number again asks for the
+            same answer again, and moves nothing.
+        command: what the wheels shall do.
+    """
+
+    sequence: int
+    command: Command
+
+
+def encode_step(step: StepRequest) -> bytes:
+    """Encode a step."""
+    return pack({"q": step.sequence, "c": [step.command.forward, step.command.turn]})
+
+
+def decode_step(data: bytes) -> StepRequest:
+    """Decode a step.
+
+    Raises:
+        InvalidMessage: anything is wrong with it.
+    """
+    reader = Reader(data, "step", MAX_SMALL_BYTES)
+    forward, turn = _numbers(reader, "c", 2, 2, -FASTEST, FASTEST)
+    return StepRequest(reader.integer("q", 1, MAX_NUMBER), Command(forward, turn))
+
+
+def encode_observation(observation: Observation) -> bytes:
+    """Encode an observation; its image goes as raw grey bytes.
+
+    Raises:
+        InvalidValue: the image is no (H, W) uint8.
+    """
+    fields: dict[str, object] = {
+        "t": observation.stamp_ns,
+        "u": [observation.odometry.forward, observation.odometry.turn],
+        "r": observation.proximity.tolist(),
+        "b": observation.bumped,
+    }
+    if observation.image is not None:
+        image = np.ascontiguousarray(observation.image)
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise InvalidValue(f"image: must be (H, W) uint8, not {image.shape} {image.dtype}")
+        # A view: the bytes are copied once, into the message.
+        fields |= {"s": list(image.shape), "encoding": RAW, "i": image.data}
+    return pack(fields)
+
+
+def decode_observation(data: bytes) -> Observation:
+    """Decode an observation. A raw image is a read-only view of the message's bytes.
+
+    Raises:
+        InvalidMessage: anything is wrong with it.
+    """
+    reader = Reader(data, "observation", MAX_IMAGE_BYTES + MAX_SMALL_BYTES)
+    forward, turn = _numbers(reader, "u", 2, 2, -FARTHEST, FARTHEST)
+    bumped = reader.any("b")
+    if type(bumped) is not bool:
+        raise reader.error("b must be true or false")
+    return Observation(
+        stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
+        odometry=Odometry(forward, turn),
+        image=_read_image(reader) if reader.has("i") else None,
+        proximity=np.array(_numbers(reader, "r", 0, MAX_RANGERS, 0.0, FARTHEST)),
+        bumped=bumped,
+    )
+
+
+def encode_description(description: RobotDescription) -> bytes:
+    """Encode a description."""
+    return pack(
+        {
+            "camera": pack_camera(description.camera),
+            "distortion": list(description.distortion),
+            "radius": description.radius,
+            "axle": description.axle,
+            "wheel_noise": description.wheel_noise,
+            "ranger_bearings": list(description.ranger_bearings),
+            "ranger_reach": description.ranger_reach,
+            "max_forward": description.max_forward,
+            "max_turn": description.max_turn,
+            "tick": description.tick,
+        }
+    )
+
+
+def decode_description(data: bytes) -> RobotDescription:
+    """Decode a description.
+
+    Raises:
+        InvalidMessage: anything is wrong with it.
+    """
+    reader = Reader(data, "robot description", MAX_SMALL_BYTES)
+    k1, k2, p1, p2, k3 = _numbers(reader, "distortion", 5, 5, -FARTHEST, FARTHEST)
+    return RobotDescription(
+        camera=unpack_camera(reader.binary("camera", MAX_SMALL_BYTES)),
+        distortion=(k1, k2, p1, p2, k3),
+        radius=reader.number("radius", 1e-3, 100.0),
+        axle=reader.number("axle", 1e-3, 100.0),
+        wheel_noise=reader.number("wheel_noise", 0.0, 1.0),
+        ranger_bearings=tuple(_numbers(reader, "ranger_bearings", 0, MAX_RANGERS, -7.0, 7.0)),
+        ranger_reach=reader.number("ranger_reach", 0.0, FARTHEST),
+        max_forward=reader.number("max_forward", 0.0, FASTEST),
+        max_turn=reader.number("max_turn", 0.0, FASTEST),
+        tick=reader.number("tick", 1e-4, 3600.0),
+    )
+
+
+def _numbers(reader: Reader, name: str, least: int, most: int, low: float, high: float) -> list[float]:
+    values = reader.array(name, most)
+    if len(values) < least:
+        raise reader.error(f"{name} must be a list of at least {least}")
+    return [reader.as_number(value, name, low, high) for value in values]
+
+
+def _read_image(reader: Reader) -> NDArray[np.uint8]:
+    shape = [reader.as_integer(side, "s", 1, MAX_SIDE_PX) for side in reader.array("s", 2)]
+    if len(shape) != 2:
+        raise reader.error("s must be [height, width]")
+    encoding = reader.text("encoding", 16)
+    data = reader.binary("i", MAX_IMAGE_BYTES)
+    if encoding == RAW:
+        if len(data) != shape[0] * shape[1]:
+            raise reader.error(f"a raw image of {shape[1]}x{shape[0]} px cannot have {len(data)} bytes")
+        return np.frombuffer(data, np.uint8).reshape(shape)
+    if encoding not in COMPRESSED:
+        raise reader.error(f"image encoding {encoding!r} is not {', '.join((RAW, *COMPRESSED))}")
+    if shape[0] * shape[1] > MAX_IMAGE_BYTES:
+        raise reader.error(f"an image of {shape[1]}x{shape[0]} px is too large")
+    return _decompress(reader, encoding, data, shape)
+
+
+def _decompress(reader: Reader, encoding: str, data: bytes, shape: Sequence[int]) -> NDArray[np.uint8]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error as error:
+        # OpenCV raises for some broken input and returns nothing for other.
+        raise InvalidMessage(f"observation: no {encoding} image") from error
+    if image is None or list(image.shape) != list(shape):
+        raise reader.error(f"no {encoding} image of {shape[1]}x{shape[0]} px")
+    return np.asarray(image, np.uint8)

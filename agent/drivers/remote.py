@@ -1,0 +1,144 @@
+"""A robot whose body is behind the bus: the simulator, or a computer on a real base."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from agent.drivers.messages import (
+    AGAIN,
+    ENDED,
+    StepRequest,
+    decode_description,
+    decode_observation,
+    encode_step,
+)
+from agent.observation import Command, Observation, RobotDescription
+from hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
+from wire.bus import Bus
+from wire.keys import Keys
+
+ASK_TIMEOUT = 3.0
+"""After what silence a question is asked again, s. A lost question costs no more than this."""
+
+PAUSE = 0.05
+"""Between two questions when nobody is there, s."""
+
+_T = TypeVar("_T")
+
+
+def clip(command: Command, description: RobotDescription) -> Command:
+    """The command within the robot's limits.
+
+    Raises:
+        InvalidValue: it is not finite.
+    """
+    if not (math.isfinite(command.forward) and math.isfinite(command.turn)):
+        raise InvalidValue(f"command: {command} is not finite")
+    forward, turn = description.max_forward, description.max_turn
+    return Command(
+        min(max(command.forward, -forward), forward),
+        min(max(command.turn, -turn), turn),
+    )
+
+
+class RemoteRobot:
+    """The Robot protocol over questions to a body.
+
+    Each `sense` carries the last command there and the observation back: one question a tick.
+    """
+
+    def __init__(self, bus: Bus, fleet: str, name: str, patience: float = 30.0) -> None:
+        """Nothing is asked yet.
+
+        Args:
+            bus: the connection.
+            fleet: which fleet.
+            name: the robot's.
+            patience: how long to ask a body that does not answer, s; longer than a bridge's patience with
+                its other robots.
+        """
+        keys = Keys(fleet)
+        self._bus = bus
+        self._describe_key = keys.robot_describe(name)
+        self._step_key = keys.robot_step(name)
+        self._patience = patience
+        self._sequence = 0
+        self._command = Command()
+        self._description: RobotDescription | None = None
+        self._closed = threading.Event()
+
+    def describe(self) -> RobotDescription:
+        """What the body says of itself; asked once.
+
+        Raises:
+            DeviceError: nobody answers, or not properly.
+        """
+        if self._description is None:
+            self._description = self._ask(self._describe_key, b"", decode_description)
+            if self._description is None:
+                raise DeviceError(f"{self._describe_key}: {ENDED}")
+        return self._description
+
+    def sense(self) -> Observation | None:
+        """Let the last command act for one tick; None when the simulation has ended.
+
+        Raises:
+            DeviceError: nobody answers, or not properly.
+        """
+        if self._closed.is_set():
+            return None
+        # Counted when it is answered: a step that failed is asked again under its own number.
+        step = StepRequest(self._sequence + 1, self._command)
+        observation = self._ask(self._step_key, encode_step(step), decode_observation)
+        self._sequence += 1
+        return observation
+
+    def act(self, command: Command) -> Command:
+        """Keep the command for the next tick.
+
+        Returns:
+            The command within the body's limits.
+
+        Raises:
+            DeviceError: the body was never asked for its limits and does not answer.
+            InvalidValue: the command is not finite.
+        """
+        self._command = clip(command, self.describe())
+        return self._command
+
+    def close(self) -> None:
+        """Ask no more. A body stands still by itself when its agent asks no more or is no longer alive."""
+        self._closed.set()
+
+    def _ask(self, key: str, payload: bytes, decode: Callable[[bytes], _T]) -> _T | None:
+        """Ask until there is an answer; None if there will be none, or this robot was closed."""
+        end = time.monotonic() + self._patience
+        reason = "nobody answers"
+        while True:
+            # A short patience still gives every question time for its answer.
+            replies = self._bus.ask(key, payload, min(ASK_TIMEOUT, max(end - time.monotonic(), PAUSE)))
+            answers = [reply.payload for reply in replies if not reply.error]
+            if len(answers) > 1:
+                raise DeviceError(f"{key}: {len(answers)} bodies answer; stop all but one")
+            if answers:
+                try:
+                    return decode(answers[0])
+                except InvalidMessage as error:
+                    raise DeviceError(f"{key}: {error}") from error
+            for reply in replies:
+                reason = reply.error
+                if reason == ENDED:
+                    return None
+                if AGAIN not in reason:
+                    raise DeviceError(f"{key}: refused: {reason}")
+            if time.monotonic() >= end:
+                raise DeviceError(
+                    f"{key}: {reason} for {self._patience:g} s; start the robot's body (for a simulated one: "
+                    "mapweave sim) with the same fleet and endpoint"
+                )
+            if self._closed.wait(PAUSE):
+                return None

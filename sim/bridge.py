@@ -1,0 +1,189 @@
+"""The simulation on the bus: time advances when every active robot has asked for its next step."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from agent.drivers.messages import ENDED, StepRequest, decode_step, encode_description, encode_observation
+from agent.drivers.remote import clip
+from hybridmap.errors import MapweaveError
+from sim.control import ControlDesk
+from sim.lockstep import Lockstep, Seat
+from sim.simulated import Simulated
+from wire.bus import Bus, Request
+from wire.keys import Keys
+
+log = logging.getLogger(__name__)
+
+POLL = 0.1
+"""How often a bridge that has nothing to do looks whether it shall stop or lose its patience, s."""
+
+
+class SimBridge:
+    """Serves every robot of a simulation, and the control key.
+
+    The bus's thread only puts questions into an inbox. The simulation is touched by the thread that calls
+    `run` and by nobody else, so it needs no locks, and interventions happen between ticks.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulated,
+        bus: Bus,
+        fleet: str,
+        patience: float = 20.0,
+        expected: int | None = None,
+        farewell: float = 2.0,
+    ) -> None:
+        """Serve from now on; questions wait for `run`.
+
+        Args:
+            simulation: what is simulated.
+            bus: the connection.
+            fleet: which fleet.
+            patience: how long the other robots wait for one that does not ask, s.
+            expected: how many robots must have asked before the first tick; all if not given.
+            farewell: how long `close` waits for agents that have not heard yet that the end has come, s.
+        """
+        keys = Keys(fleet)
+        self._keys = keys
+        self._simulation = simulation
+        self._farewell = farewell
+        self._lockstep = Lockstep(simulation.robots, patience, expected)
+        self._wall = dict.fromkeys(("waiting", "replying", "control"), 0.0)
+        self._desk = ControlDesk(simulation, lambda: self._lockstep.active, self._wall, self._stop)
+        self._changed = threading.Condition()
+        self._inbox: deque[Callable[[], None]] = deque()
+        self._stopping = False
+        self._ended = False
+        self._told: set[str] = set()
+        self._declared = [bus.watch(keys.agents_alive(), self._presence)]
+        for name in simulation.robots:
+            self._declared.append(bus.serve(keys.robot_describe(name), self._describer(name)))
+            self._declared.append(bus.serve(keys.robot_step(name), self._stepper(name)))
+        self._declared.append(bus.serve(keys.sim_control(), self._control))
+        self._declared.append(bus.announce(keys.sim_alive()))
+
+    def run(self, stop: threading.Event) -> None:
+        """Simulate until told to stop, here or by a control message; then refuse whoever still asks.
+
+        Raises:
+            MapweaveError: the simulation fails.
+        """
+        try:
+            while not (self._stopping or stop.is_set()):
+                self._read_inbox()
+                seats = self._lockstep.due(time.monotonic())
+                if seats:
+                    self._tick(seats)
+                else:
+                    self._wait()
+        finally:
+            self._end()
+
+    def close(self) -> None:
+        """Tell the agents that the simulation has ended, then leave the bus. Twice is no error."""
+        self._end()
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._lockstep.active <= self._told, self._farewell):
+                untold = sorted(self._lockstep.active - self._told)
+                log.info("these robots' agents have not asked since the end: %s", ", ".join(untold))
+                self._told.update(untold)
+        for declared in self._declared:
+            declared.close()
+
+    # In the thread that runs the simulation.
+
+    def _tick(self, seats: list[Seat]) -> None:
+        """Advance by one tick, then sense and answer robot by robot: one thinks while the next is sensed."""
+        commands = {}
+        for seat in seats:
+            if seat.step is not None:
+                commands[seat.name] = clip(seat.step.command, self._simulation.describe(seat.name))
+        self._simulation.advance(commands)
+        for seat in seats:
+            observation = self._simulation.observe(seat.name)
+            with self._timed("replying"):
+                self._lockstep.answer(seat, encode_observation(observation), time.monotonic())
+
+    def _read_inbox(self) -> None:
+        while self._inbox:
+            self._inbox.popleft()()
+
+    def _wait(self) -> None:
+        with self._timed("waiting"), self._changed:
+            self._changed.wait_for(lambda: bool(self._inbox), POLL)
+
+    def _answer_control(self, request: Request) -> None:
+        with self._timed("control"):
+            try:
+                request.reply(self._desk.answer(request.payload))
+            except MapweaveError as error:
+                request.refuse(str(error))
+
+    def _stop(self) -> None:
+        self._stopping = True
+
+    def _end(self) -> None:
+        with self._changed:
+            if self._ended:
+                return
+            self._ended = True
+        # From here on handlers refuse by themselves, so that nothing comes after this.
+        self._read_inbox()
+        self._tell(self._lockstep.refuse_all(ENDED))
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._wall[part] += time.perf_counter() - begin
+
+    # In the bus's thread.
+
+    def _describer(self, name: str) -> Callable[[Request], None]:
+        answer = encode_description(self._simulation.describe(name))
+        return lambda request: request.reply(answer)
+
+    def _stepper(self, name: str) -> Callable[[Request], None]:
+        def take(request: Request) -> None:
+            step = decode_step(request.payload)
+            if not self._put(lambda: self._receive(name, step, request)):
+                request.refuse(ENDED)
+                self._tell({name})
+
+        return take
+
+    def _receive(self, name: str, step: StepRequest, request: Request) -> None:
+        self._lockstep.receive(name, step, request, time.monotonic())
+
+    def _control(self, request: Request) -> None:
+        if not self._put(lambda: self._answer_control(request)):
+            request.refuse(ENDED)
+
+    def _presence(self, key: str, alive: bool) -> None:
+        agent, epoch = self._keys.parse_agent_alive(key)
+        if not self._put(lambda: self._lockstep.presence(agent, epoch, alive)) and not alive:
+            self._tell({agent})
+
+    def _put(self, task: Callable[[], None]) -> bool:
+        """Leave a task for the simulation's thread; False if that has ended."""
+        with self._changed:
+            if self._ended:
+                return False
+            self._inbox.append(task)
+            self._changed.notify_all()
+            return True
+
+    def _tell(self, names: set[str]) -> None:
+        """Remember who knows of the end, or needs to know no more."""
+        with self._changed:
+            self._told |= names
+            self._changed.notify_all()
