@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from agent.observation import Command, Odometry, RobotDescription
 from hybridmap.pose import Array, Pose2
 from sim import surface
 from sim.floorplan import Rectangle
+from sim.physics import Physics
 from sim.texture import Texture
 from sim.world import Block, PanelSet, block_panels
 
@@ -22,6 +22,8 @@ BODY_HEIGHT = 0.2
 """Top of the footprint's cylinder, m; the camera stands on a mast above."""
 CASTER_AT = 0.11
 """Casters ahead of and behind the axle, m."""
+EPISODE_TICKS = 10
+"""A collision is over when the robot has touched nothing for so long."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +54,13 @@ class Body:
 
     Attributes:
         number: PyBullet's number of the body.
-        collisions: contact episodes with anything but the floor.
+        bumped: whether the robot touched anything but the floor at the end of the last tick.
+        collisions: how often it has run into something; what comes within a second is the same collision.
     """
 
     def __init__(
         self,
-        physics: Any,
+        physics: Physics,
         floor: int,
         pose: Pose2,
         description: RobotDescription,
@@ -67,7 +70,7 @@ class Body:
         """Put a robot on the floor.
 
         Args:
-            physics: a PyBullet client.
+            physics: where it lives.
             floor: number of the floor's body.
             pose: world_from_robot.
             description: what the robot is believed to be; its true wheels and axle differ a little.
@@ -89,7 +92,8 @@ class Body:
         self._angles: Array = self._wheel_angles()
         self._turned: Array = np.zeros(2)
         self._ticks: Array = np.zeros(2)
-        self._touching = False
+        self._free_ticks = EPISODE_TICKS
+        self.bumped = False
         self.collisions = 0
 
     def _build(self, pose: Pose2) -> int:
@@ -151,9 +155,11 @@ class Body:
         # The encoder sees the wheel turn; of that, the slip was lost on the floor.
         self._turned += (angles - self._angles) / (1.0 - self._slips)
         self._angles = angles
-        touching = self.bumped
-        self.collisions += int(touching and not self._touching)
-        self._touching = touching
+        self.bumped = self._touches()
+        # A robot that is pressed against a wall rattles: it may be free for a moment.
+        if self.bumped:
+            self.collisions += int(self._free_ticks >= EPISODE_TICKS)
+        self._free_ticks = 0 if self.bumped else self._free_ticks + 1
 
     def odometry(self) -> Odometry:
         """What the encoders say since the last call, by the nominal wheels and axle."""
@@ -163,9 +169,7 @@ class Body:
         self._ticks = ticks
         return Odometry(float(left + right) / 2, float(right - left) / self._description.axle)
 
-    @property
-    def bumped(self) -> bool:
-        """Whether the robot touches anything but the floor."""
+    def _touches(self) -> bool:
         contacts = self._physics.getContactPoints(bodyA=self.number)
         return any(c[2] != self._floor and c[1] != c[2] and c[8] <= 0.0 for c in contacts)
 
@@ -191,6 +195,8 @@ class Body:
             p.resetJointState(self.number, wheel, angle, 0.0)
         self._speeds[:] = 0.0
         self._targets[:] = 0.0
+        self.bumped = False
+        self._free_ticks = EPISODE_TICKS
 
     def _wheel_angles(self) -> Array:
         return np.array([state[0] for state in self._physics.getJointStates(self.number, [0, 1])])

@@ -44,7 +44,7 @@ def photograph(rng: np.random.Generator, width_px: int, height_px: int) -> Image
     picture = 127 + 70 * clouds(rng, width_px, height_px, float(rng.uniform(1.6, 2.4)))
     canvas = np.clip(picture, 0, 255).astype(np.uint8)
     things = int(rng.integers(25, 60))
-    sizes = np.sort(rng.uniform(0.015, 0.22, things) ** 1.0)[::-1] * min(width_px, height_px)
+    sizes = np.sort(rng.uniform(0.015, 0.22, things))[::-1] * min(width_px, height_px)
     for size in sizes:
         centre = (int(rng.integers(0, width_px)), int(rng.integers(0, height_px)))
         axes = (max(2, int(size * rng.uniform(0.5, 1.6))), max(2, int(size)))

@@ -37,7 +37,7 @@ def wall(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
 
 
 def wood(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
-    """Wood grain along the longer side."""
+    """Wood with its grain along the width."""
     base = float(rng.uniform(70, 170))
     rings = noise(rng, width_px, height_px, 6.0)
     long_rings = cv2.resize(

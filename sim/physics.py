@@ -1,0 +1,35 @@
+"""PyBullet without its global state: one object is one physics, and its calls go there."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from typing import Any
+
+import pybullet
+
+
+class Physics:
+    """A physics in this process, with PyBullet's functions as methods.
+
+    Not `pybullet_utils.bullet_client`, which connects with an empty option string: PyBullet then prints
+    "argv[0]=" on stdout, where a program's `--json` shall be.
+    """
+
+    def __init__(self) -> None:
+        """Make an empty physics."""
+        self._client = int(pybullet.connect(pybullet.DIRECT))
+
+    def __getattr__(self, name: str) -> Any:
+        """PyBullet's function or constant of this name; a function is bound to this physics once."""
+        found = getattr(pybullet, name)
+        if inspect.isbuiltin(found):
+            found = functools.partial(found, physicsClientId=self._client)
+        setattr(self, name, found)
+        return found
+
+    def close(self) -> None:
+        """Let everything go. Twice is no error."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
