@@ -105,7 +105,7 @@ def test_a_decoded_image_works_with_opencv_though_it_is_read_only() -> None:
     assert decoded is not None
     assert not decoded.flags.writeable
     assert decoded.base is not None
-    assert len(cv2.SIFT_create().detect(decoded, None)) == len(cv2.SIFT_create().detect(image, None)) > 10
+    assert len(cv2.SIFT.create().detect(decoded, None)) == len(cv2.SIFT.create().detect(image, None)) > 10
 
 
 @pytest.mark.parametrize(("encoding", "suffix", "error"), [("png", ".png", 0), ("jpeg", ".jpg", 3)])
