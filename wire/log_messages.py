@@ -158,27 +158,35 @@ class LogAnswer:
         first: as asked.
         covered: how far the answer reaches; less than asked if that would be too much for one answer. What
             is missing up to here was superseded by a later change and is no longer kept.
-        changes: encoded, in order.
+        changes: (sequence, encoded change), in order.
     """
 
     log_id: int
     first: int
     covered: int
-    changes: tuple[bytes, ...]
+    changes: tuple[tuple[int, bytes], ...]
 
     def encode(self) -> bytes:
         """Encode."""
-        return pack({"l": self.log_id, "f": self.first, "q": self.covered, "c": list(self.changes)})
+        changes = [list(entry) for entry in self.changes]
+        return pack({"l": self.log_id, "f": self.first, "q": self.covered, "c": changes})
 
     @staticmethod
     def decode(data: bytes) -> LogAnswer:
         """Decode; raises InvalidMessage. The changes are not looked at."""
         reader = Reader(data, "log answer", MAX_ROWS * MAX_CHANGE_BYTES + MAX_SMALL_BYTES)
-        changes = tuple(
-            reader.as_binary(change, "a change", MAX_CHANGE_BYTES) for change in reader.array("c", MAX_ROWS)
-        )
         first = reader.integer("f", 1, MAX_NUMBER)
-        return LogAnswer(_log_id(reader), first, reader.integer("q", first - 1, MAX_NUMBER), changes)
+        covered = reader.integer("q", first - 1, MAX_NUMBER)
+        changes = []
+        lowest = first
+        for value in reader.array("c", MAX_ROWS):
+            pair = reader.as_array(value, "a change", 2)
+            if len(pair) != 2:
+                raise reader.error("a change must be [sequence, change]")
+            sequence = reader.as_integer(pair[0], "a change's sequence", lowest, covered)
+            changes.append((sequence, reader.as_binary(pair[1], "a change", MAX_CHANGE_BYTES)))
+            lowest = sequence + 1
+        return LogAnswer(_log_id(reader), first, covered, tuple(changes))
 
 
 def encode_record(values: Mapping[str, Scalar]) -> bytes:

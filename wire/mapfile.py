@@ -34,10 +34,9 @@ HEADER = struct.Struct("<8sIQ")
 DIGEST_BYTES = 32
 MAX_CONTENT_BYTES = 2**32 - 1
 MAX_ELEMENTS = 10_000_000
-MAX_TITLE = 200
+MAX_TITLE = 1000
 
 Kind = Literal["agent", "merged"]
-KIND_NAMES: dict[Kind, str] = {"agent": "agent map", "merged": "merged map"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
     except InvalidMessage as error:
         raise InvalidFile(f"{path}: {error}") from None
     if kind not in ("any", content.kind):
-        raise InvalidFile(f"{path}: is of kind {content.kind!r}, not {kind!r}")
+        raise InvalidFile(f"{path}: is a map file of kind {content.kind}, not {kind}")
     return content
 
 
