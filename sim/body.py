@@ -22,6 +22,8 @@ BODY_HEIGHT = 0.2
 """Top of the footprint's cylinder, m; the camera stands on a mast above."""
 CASTER_AT = 0.11
 """Casters ahead of and behind the axle, m."""
+CASTER_GAP = 5e-5
+"""Casters end above the wheels' lowest points, else a robot with small wheels stands on casters alone, m."""
 EPISODE_TICKS = 10
 """A collision is over when the robot has touched nothing for so long."""
 
@@ -107,7 +109,11 @@ class Body:
             collisionFramePosition=[0, 0, 0.03 + height / 2 - WHEEL_RADIUS],
         )  # fmt: skip
         half = self._axle / 2
-        places = [[0, half, 0], [0, -half, 0], [CASTER_AT, 0, 0], [-CASTER_AT, 0, 0]]
+        # Suspended such that wheels of any size end at the same height: the robot stands level.
+        left, right = (self._radii - WHEEL_RADIUS).tolist()
+        places = [
+            [0, half, left], [0, -half, right], [CASTER_AT, 0, CASTER_GAP], [-CASTER_AT, 0, CASTER_GAP],
+        ]  # fmt: skip
         number = int(
             p.createMultiBody(
                 baseMass=s.mass, baseCollisionShapeIndex=base, basePosition=[pose.x, pose.y, WHEEL_RADIUS],

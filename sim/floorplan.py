@@ -129,6 +129,14 @@ class FloorPlan:
         centres: Array = np.stack(np.meshgrid(xs, ys), axis=-1)
         return centres, self.clearances(centres.reshape(-1, 2)).reshape(centres.shape[:2])
 
+    def furnished(self, piece: Rectangle) -> FloorPlan:
+        """The same plan with one more piece of furniture; what was measured of the rest is kept."""
+        plan = FloorPlan(self.rooms, self.walls, (*self.furniture, piece))
+        centres, clearances = self._grid
+        to_piece = distances_to([piece], centres.reshape(-1, 2)).reshape(clearances.shape)
+        plan.__dict__["_grid"] = centres, np.minimum(clearances, to_piece)
+        return plan
+
     def free_regions(self, radius: float) -> list[Array]:
         """Connected sets of points where a disc fits, each (N, 2) m, in world, largest set first.
 

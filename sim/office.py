@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from itertools import count
 
+import cv2
 import numpy as np
 
 from hybridmap.errors import InvalidValue
@@ -22,8 +23,17 @@ DOOR = 1.0
 """Width of doorways, m."""
 PASSAGE = 0.45
 """Furniture leaves a way for a disc of this radius from the middle of each room to the corridor, m."""
+ROBOT = 0.28
+"""Furniture leaves no corner where a disc of this radius fits and cannot get out, m."""
+CROWDED = 0.475
+"""Centres of furniture are farther apart than this share of their lengths together."""
 SEGMENT = 1.3
 """Walls are papered in pieces at most this wide, m."""
+TILE = 3.0
+"""Floors are laid in pieces at most this long, m."""
+
+MakeTexture = Callable[[float, float, Painter], Texture]
+"""A fresh texture of a width and height in m."""
 
 PIECES: dict[str, tuple[float, float, float, Painter]] = {
     "cupboard": (1.0, 0.45, 1.7, surface.cupboard),
@@ -47,8 +57,7 @@ def make_office(seed: int, rooms: int = 3) -> World:
     if not 1 <= rooms <= 32:
         raise InvalidValue(f"an office has 1 to 32 rooms, not {rooms}")
     rng = np.random.default_rng([seed, 0x0FF1CE])
-    plan = _plan(rng, rooms)
-    plan = FloorPlan(plan.rooms, plan.walls, _furniture(rng, plan))
+    plan = _furnished(rng, _plan(rng, rooms))
     numbers = count()
 
     def texture(width: float, height: float, painter: Painter) -> Texture:
@@ -65,7 +74,7 @@ def make_office(seed: int, rooms: int = 3) -> World:
         widths = (piece.width, piece.length, piece.width, piece.length)
         sides = [texture(width, height, painter) for width in widths]
         panels += block_panels(block, sides, texture(piece.length, piece.width, surface.wood))
-    panels += [_floor(room, texture) for room in plan.rooms]
+    panels += [panel for room in plan.rooms for panel in _floor(room, texture)]
     return World(f"office-{seed}", plan, tuple(blocks), tuple(panels))
 
 
@@ -95,19 +104,21 @@ def _plan(rng: np.random.Generator, rooms: int) -> FloorPlan:
     return FloorPlan(tuple(spaces), tuple(walls))
 
 
-def _furniture(rng: np.random.Generator, plan: FloorPlan) -> tuple[Rectangle, ...]:
+def _furnished(rng: np.random.Generator, plan: FloorPlan) -> FloorPlan:
     """Pieces against the walls and one or two in the room, as many as leave a way to every middle."""
-    placed: list[Rectangle] = []
     for room in (r for r in plan.rooms if r.name.startswith("room")):
         for index in range(int(rng.integers(4, 7))):
-            name = ("cupboard", "bookshelf", "desk", "crate")[int(rng.integers(4))]
+            name = tuple(PIECES)[int(rng.integers(len(PIECES)))]
+            place = _against_wall if index < 4 else _standing
             for _ in range(8):
-                free_standing = index >= 4
-                piece = _standing(rng, room, name) if free_standing else _against_wall(rng, room, name)
-                if _fits(piece, placed) and _passable(plan, [*placed, piece]):
-                    placed.append(piece)
+                piece = place(rng, room, name)
+                if not _fits(piece, room, plan.furniture):
+                    continue
+                tried = plan.furnished(piece)
+                if _passable(tried):
+                    plan = tried
                     break
-    return tuple(placed)
+    return plan
 
 
 def _against_wall(rng: np.random.Generator, room: Rectangle, name: str) -> Rectangle:
@@ -130,31 +141,38 @@ def _standing(rng: np.random.Generator, room: Rectangle, name: str) -> Rectangle
     return Rectangle(x, y, length, width, float(rng.uniform(0.0, math.pi)), name)
 
 
-def _fits(piece: Rectangle, placed: list[Rectangle]) -> bool:
-    """Whether two pieces keep apart: their surrounding circles or at least their corners do."""
+def _fits(piece: Rectangle, room: Rectangle, placed: tuple[Rectangle, ...]) -> bool:
+    """Whether a piece is inside its (upright) room and neither cuts nor crowds another piece."""
+    beyond = np.abs(piece.corners - [room.x, room.y]) - [room.length / 2, room.width / 2]
+    if (beyond > 0.0).any():
+        return False
     for other in placed:
-        apart = math.hypot(piece.x - other.x, piece.y - other.y)
-        if apart < 0.5 * (piece.length + other.length) * 0.95:
+        if math.hypot(piece.x - other.x, piece.y - other.y) < CROWDED * (piece.length + other.length):
+            return False
+        if cv2.rotatedRectangleIntersection(_box(piece), _box(other))[0] != cv2.INTERSECT_NONE:
             return False
     return True
 
 
-def _passable(plan: FloorPlan, furniture: list[Rectangle]) -> bool:
+def _box(piece: Rectangle) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """OpenCV's form of a rectangle."""
+    return (piece.x, piece.y), (piece.length, piece.width), math.degrees(piece.heading)
+
+
+def _passable(plan: FloorPlan) -> bool:
     """Whether the corridor, every doorway and most of every room are one region for a wide disc."""
-    furnished = FloorPlan(plan.rooms, plan.walls, tuple(furniture))
-    regions = furnished.free_regions(PASSAGE)
+    regions = plan.free_regions(PASSAGE)
     if not regions:
         return False
     for room in plan.rooms:
-        reach = [np.abs(r - [room.x, room.y]).max(axis=1).min() if len(r) else math.inf for r in regions[:1]]
-        if reach[0] > (0.08 if room.name.startswith("door") else 0.75):
+        nearest = np.abs(regions[0] - [room.x, room.y]).max(axis=1).min()
+        if nearest > (0.08 if room.name.startswith("door") else 0.75):
             return False
     # No pocket in which a robot could start and not get out.
-    robot = furnished.free_regions(0.28)
-    return len(robot) == 1 or sum(len(r) for r in robot[1:]) == 0
+    return len(plan.free_regions(ROBOT)) == 1
 
 
-def _papered(wall: Rectangle, texture: Callable[[float, float, Painter], Texture]) -> list[Panel]:
+def _papered(wall: Rectangle, texture: MakeTexture) -> list[Panel]:
     """The four faces of an upright wall, in pieces with prints of their own."""
     panels = []
     corners = wall.corners
@@ -171,10 +189,18 @@ def _papered(wall: Rectangle, texture: Callable[[float, float, Painter], Texture
     return panels
 
 
-def _floor(room: Rectangle, texture: Callable[[float, float, Painter], Texture]) -> Panel:
-    """Seen from above: x to the right, y up the picture."""
-    corners = np.column_stack([room.corners, np.zeros(4)])
-    return Panel(
-        corners[3], corners[2] - corners[3], corners[0] - corners[3],
-        texture(room.length, room.width, surface.floor),
-    )  # fmt: skip
+def _floor(room: Rectangle, texture: MakeTexture) -> list[Panel]:
+    """An upright room's floor in tiles, each seen from above: x to the right, y up the picture."""
+    columns, rows = math.ceil(room.length / TILE), math.ceil(room.width / TILE)
+    length, width = room.length / columns, room.width / rows
+    left, top = room.x - room.length / 2, room.y + room.width / 2
+    return [
+        Panel(
+            np.array([left + column * length, top - row * width, 0.0]),
+            np.array([length, 0.0, 0.0]),
+            np.array([0.0, -width, 0.0]),
+            texture(length, width, surface.floor),
+        )
+        for row in range(rows)
+        for column in range(columns)
+    ]

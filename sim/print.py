@@ -54,7 +54,7 @@ def photograph(rng: np.random.Generator, width_px: int, height_px: int) -> Image
             spot = (centre[0] - axes[0] // 4, centre[1] - axes[1] // 4)
             cv2.circle(canvas, spot, max(1, axes[1] // 3), (grey + 110) % 256, -1, cv2.LINE_AA)
     shaded = canvas + 26 * clouds(rng, width_px, height_px, 1.5)
-    return np.clip(shaded, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(shaded, 0, 255), np.uint8)
 
 
 def geometric_art(rng: np.random.Generator, width_px: int, height_px: int) -> Image:

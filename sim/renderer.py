@@ -3,10 +3,12 @@
 Every surface is flat, so each is one homography away from the image and its inverse depth is linear in
 the pixel. That makes an exact renderer of a few numpy and OpenCV calls, which filters textures properly:
 PyBullet's TinyRenderer samples the nearest texel, so that distant walls shimmer, and takes several times
-as long. tests/sim compares the two.
+as long: docs/decisions/renderer.md.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -100,7 +102,8 @@ class Renderer:
         low, high = self._spans(forms)
         nearest = self._nearest(forms, low, high)
         order = np.argsort(-nearest, kind="stable")
-        order = order[(low <= high).any(axis=1)[order]]
+        filled = np.asarray((low <= high).any(axis=1))
+        order = order[filled[order]]
         return _Drawn(index[order], forms[order], low[order], high[order], nearest[order])
 
     def _spans(self, forms: Array) -> tuple[Array, Array]:
@@ -192,6 +195,7 @@ class Renderer:
         np.copyto(image[top : top + height, left : left + width], patch, where=mask)
 
 
+@dataclass(frozen=True, eq=False)
 class _Drawn:
     """Panels in view, nearest first.
 
@@ -203,14 +207,11 @@ class _Drawn:
         nearest: (n,) largest inverse depth, 1/m.
     """
 
-    def __init__(
-        self, index: NDArray[np.intp], forms: Array, low: Array, high: Array, nearest: Array
-    ) -> None:
-        self.index = index
-        self.forms = forms
-        self.low = low
-        self.high = high
-        self.nearest = nearest
+    index: NDArray[np.intp]
+    forms: Array
+    low: Array
+    high: Array
+    nearest: Array
 
 
 def _halvings(texels_per_pixel: float, size_px: int) -> int:

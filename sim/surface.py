@@ -18,7 +18,7 @@ def wall(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
     base = float(rng.uniform(140, 215))
     surface = base + 7 * clouds(rng, width_px, height_px, 1.3)
     surface *= lighting(rng, width_px, height_px)
-    canvas = np.clip(surface, 0, 255).astype(np.uint8)
+    canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
     metre = TEXELS_PER_METRE
     # Low prints are what a robot sees near by, high ones what it sees across the room.
     bands = ((0.12, 0.75), (0.8, 1.45), (1.5, 2.1))
@@ -44,7 +44,7 @@ def wood(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
         rings[:, : max(2, width_px // 12)], (width_px, height_px), interpolation=cv2.INTER_CUBIC
     )
     surface = base + 10 * long_rings + 4 * clouds(rng, width_px, height_px, 1.3)
-    return np.clip(surface, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(surface, 0, 255), np.uint8)
 
 
 def cupboard(rng: np.random.Generator, width_px: int, height_px: int) -> Image:

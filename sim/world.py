@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan, Rectangle
 from sim.texture import Texture
@@ -171,6 +172,8 @@ class World:
         """
         rng = np.random.default_rng([seed, 0x57A27])
         rooms = [room.name for room in self.plan.rooms if room.name.startswith("room")]
+        if not rooms:
+            raise InvalidValue(f"world {self.name} has no room to start in")
         poses: list[Pose2] = []
         for robot in range(robots):
             room = rooms[robot % len(rooms)]
