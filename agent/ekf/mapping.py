@@ -14,15 +14,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.gating import believe, pixel_gate
-from agent.ekf.motion import WheelNoise, move_posture, move_rays
+from agent.ekf.anchored import points_of_rays
+from agent.ekf.gating import believe, inverse, pixel_gate
+from agent.ekf.motion import WheelNoise
+from agent.ekf.moving_state import MovingState, Step
 from agent.ekf.report import UpdateReport
 from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.pose import Array, PoseGaussian
 
 Ids = NDArray[np.int64]
+
+SAME_STEP = 1e-4
+"""m and rad; a step is not linearised again for less: its second-order part is then below 1e-5 px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +38,11 @@ class FilterSettings:
         pixel_sigma: standard deviation of a tracked pixel, px.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
         posture_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
+        slip: sigma of (forward m, turn rad) of a step whose wheels the landmarks refute.
         prior_depth: depth at which a landmark is expected when nothing is known, m.
         prior_spread: sigma of the prior inverse depth, in units of 1 / prior_depth. 1.2 reaches from
             0.3 prior_depth (two sigma) to infinity (one sigma).
+        relinearisations: how often at most a step is linearised again in the light of its image.
         gate_probability: share of true measurements that each gate lets pass.
         least_agreeing: fewer accepted landmarks than this are no healthy update.
         least_agreeing_share: nor is a smaller share of those seen.
@@ -48,8 +55,10 @@ class FilterSettings:
     pixel_sigma: float = 0.7
     wheel_floor: float = 1e-5
     posture_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slip: tuple[float, float] = (0.1, 0.2)
     prior_depth: float = 2.5
     prior_spread: float = 1.2
+    relinearisations: int = 3
     gate_probability: float = 0.999
     least_agreeing: int = 3
     least_agreeing_share: float = 0.4
@@ -104,30 +113,24 @@ class MappingFilter:
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._gate = pixel_gate(self.settings.gate_probability)
-        self._posture = np.zeros(3)
-        self._rays = np.zeros((0, 3))
-        self._covariance = np.zeros((3, 3))
+        self._state = MovingState.at_anchor()
+        self._step: Step | None = None
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are let go."""
-        n = len(self.ids)
-        self._posture, by_posture, by_input = move_posture(self._posture, odometry)
-        moved = move_rays(self._rays, odometry, self._camera.mount_forward)
-        self._rays = moved.rays
-        old = self._covariance
-        new = np.empty_like(old)
-        new[:3, :3] = by_posture @ old[:3, :3] @ by_posture.T
-        # The transition is block diagonal: 3x3 blocks times rows, never the dense product.
-        cross = moved.by_ray @ (by_posture @ old[:3, 3:]).T.reshape(n, 3, 3)
-        new[3:, :3] = cross.reshape(3 * n, 3)
-        new[:3, 3:] = new[3:, :3].T
-        half = (moved.by_ray @ old[3:, 3:].reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        new[3:, 3:] = (moved.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        inputs = np.concatenate([by_input, moved.by_input.reshape(3 * n, 2)]) @ self._wheels.root(odometry)
-        new += inputs @ inputs.T
-        new[[0, 1, 2], [0, 1, 2]] += np.square(self.settings.posture_noise)
-        self._covariance = 0.5 * (new + new.T)
-        self._let_go(moved.scale)
+        taken = Step.predict(
+            self._state,
+            odometry,
+            self._wheels.root(odometry),
+            np.square(self.settings.posture_noise),
+            self._camera.mount_forward,
+        )
+        rays = taken.state.rays
+        near = rays[:, 2] * self.settings.nearest > 1.0
+        stays = (taken.scale > 1e-3) & ~near & (np.abs(rays[:, 0]) <= self.settings.widest_slope)
+        self.lost += int((~stays).sum())
+        self.ids = self.ids[stays]
+        self._take(taken.kept(stays))
 
     def add(
         self,
@@ -162,13 +165,9 @@ class MappingFilter:
         else:
             rays[:, 2] = inverse_depths
             variances[:, 2] = np.square(sigmas)
-        size = len(self._covariance)
-        grown = np.zeros((size + 3 * n, size + 3 * n))
-        grown[:size, :size] = self._covariance
-        grown[np.arange(size, size + 3 * n), np.arange(size, size + 3 * n)] = variances.ravel()
-        self._covariance = grown
-        self._rays = np.concatenate([self._rays, rays])
+        self._state = self._state.grown(rays, variances)
         self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)])
+        self._step = None
 
     def update(self, ids: Ids, pixels: Array) -> UpdateReport:
         """Correct by the pixels of one image.
@@ -180,23 +179,23 @@ class MappingFilter:
         slots, rows = self._slots(ids, pixels)
         if not len(slots):
             return UpdateReport.blind(ids, "no landmark of the filter is in view")
-        index = (3 + 3 * slots[:, None] + np.arange(2)).ravel()
-        innovations = (pixels[rows] - self._centre) / self._focal - self._rays[slots, :2]
-        spread = self._covariance[np.ix_(index, index)]
-        spread[np.arange(len(index)), np.arange(len(index))] += np.tile(
-            (self.settings.pixel_sigma / self._focal) ** 2, len(slots)
-        )
-        believed, information = believe(innovations, spread, self._gate)
-        kept = int(believed.sum())
-        nis = math.nan
-        if kept:
-            residual = innovations[believed].ravel()
-            nis = float(residual @ information @ residual) / (2 * kept)
-            self._correct(index.reshape(-1, 2)[believed].ravel(), residual, information)
-        needed = max(
-            min(self.settings.least_agreeing, len(self.ids)), self.settings.least_agreeing_share * len(slots)
-        )
-        reason = "" if kept >= needed else f"{kept} of {len(slots)} landmarks agree"
+        slopes = (pixels[rows] - self._centre) / self._focal
+        innovations = slopes - self._state.rays[slots, :2]
+        believed, _ = believe(innovations, self._spread(slots), self._gate)
+        reason = self._doubt(int(believed.sum()), len(slots))
+        if reason and self._step is not None:
+            # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
+            step, believed_before = self._step, believed
+            self._take(step.again(wheel_root=np.diag(self.settings.slip)))
+            believed, _ = believe(innovations, self._spread(slots), self._gate)
+            kept = int(believed.sum())
+            if self._doubt(kept, len(slots)):
+                self._take(step)
+                believed = believed_before
+            else:
+                reason = f"the wheels are refuted by {kept} of {len(slots)} landmarks"
+        nis = self._correct(slots[believed], slopes[believed]) if believed.any() else math.nan
+        self._step = None
         accepted = np.zeros(len(ids), np.bool_)
         accepted[rows[believed]] = True
         innovations_px = np.full((len(ids), 2), np.nan)
@@ -205,15 +204,16 @@ class MappingFilter:
 
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
-        self._keep(~np.isin(self.ids, ids))
+        keep = ~np.isin(self.ids, ids)
+        if not keep.all():
+            self._state = self._state.kept(keep)
+            self.ids = self.ids[keep]
+            self._step = self._step.kept(keep) if self._step is not None else None
 
     @property
     def pose(self) -> PoseGaussian:
         """`anchor_from_robot`."""
-        posture = Pose2.from_vector(self._posture)
-        turn = np.eye(3)
-        turn[:2, :2] = posture.rotation.T
-        return PoseGaussian(posture, turn @ self._covariance[:3, :3] @ turn.T)
+        return self._state.pose
 
     def reanchor(self) -> PoseGaussian:
         """Make the present posture the anchor.
@@ -224,14 +224,13 @@ class MappingFilter:
             `old_anchor_from_new_anchor`.
         """
         pose = self.pose
-        self._posture = np.zeros(3)
-        self._covariance[:3, :] = 0.0
-        self._covariance[:, :3] = 0.0
+        self._state = self._state.reanchored()
+        self._step = None
         return pose
 
     def predict_pixels(self, ids: Ids | None = None) -> Array:
         """(N, 2) px where landmarks are expected now; NaN for ids that the filter does not hold."""
-        pixels: Array = self._centre + self._focal * self._rays[:, :2]
+        pixels: Array = self._centre + self._focal * self._state.rays[:, :2]
         if ids is None:
             return pixels
         slots, rows = self._slots(ids)
@@ -241,20 +240,14 @@ class MappingFilter:
 
     def landmarks(self) -> LandmarkEstimates:
         """All landmarks as they are known now."""
-        n = len(self.ids)
-        w = self._rays[:, 2]
+        state = self._state
+        w = state.rays[:, 2]
         known = w > 0.0
         depths = np.where(known, 1.0 / np.where(known, w, 1.0), np.inf)
-        sigmas = np.where(known, np.sqrt(self._blocks()[:, 2, 2]) * depths**2, np.inf)
-        finite = np.where(known, depths, np.nan)
-        points = self._camera.back_project(self._centre + self._focal * self._rays[:, :2], finite)
-        # Point (1, -a, -b) / w + mount, by (a, b, w).
-        by_ray = np.zeros((n, 3, 3))
-        by_ray[:, 1, 0] = by_ray[:, 2, 1] = -finite
-        by_ray[:, 0, 2] = -(finite**2)
-        by_ray[:, 1, 2] = self._rays[:, 0] * finite**2
-        by_ray[:, 2, 2] = self._rays[:, 1] * finite**2
-        covariances = by_ray @ self._blocks() @ np.swapaxes(by_ray, 1, 2)
+        blocks = state.blocks
+        sigmas = np.where(known, np.sqrt(blocks[:, 2, 2]) * depths**2, np.inf)
+        points, by_ray = points_of_rays(state.rays, self._camera.mount_forward, self._camera.mount_height)
+        covariances = by_ray @ blocks @ np.swapaxes(by_ray, 1, 2)
         covariances[~known] = np.inf
         return LandmarkEstimates(self.ids.copy(), points, covariances, depths, sigmas)
 
@@ -264,13 +257,6 @@ class MappingFilter:
         limit = np.maximum(self.settings.converged_sigma, self.settings.converged_share * now.depths)
         return np.asarray(np.isfinite(now.depths) & (now.depth_sigmas <= limit), np.bool_)
 
-    def _blocks(self) -> Array:
-        """(n, 3, 3) covariance of each landmark by itself."""
-        n = len(self.ids)
-        index = np.arange(n)
-        blocks: Array = self._covariance[3:, 3:].reshape(n, 3, n, 3)[index, :, index, :]
-        return blocks
-
     def _slots(self, ids: Ids, pixels: Array | None = None) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Places in the state of those ids that are held and seen, and their rows among the ids given."""
         held, slots, rows = np.intersect1d(self.ids, ids, return_indices=True)
@@ -279,24 +265,46 @@ class MappingFilter:
             slots, rows = slots[seen], rows[seen]
         return slots, rows
 
-    def _correct(self, index: NDArray[np.intp], residual: Array, information: Array) -> None:
-        """Kalman update by direct measurements of some entries of the state."""
-        columns = self._covariance[:, index]
-        step = columns @ (information @ residual)
-        root = columns @ np.linalg.cholesky(information)
-        self._covariance -= root @ root.T
-        self._posture += step[:3]
-        self._rays += step[3:].reshape(-1, 3)
+    def _take(self, step: Step) -> None:
+        self._step, self._state = step, step.state
 
-    def _let_go(self, scale: Array) -> None:
-        near = self._rays[:, 2] * self.settings.nearest > 1.0
-        gone = (scale <= 1e-3) | near | (np.abs(self._rays[:, 0]) > self.settings.widest_slope)
-        if gone.any():
-            self.lost += int(gone.sum())
-            self._keep(~gone)
+    def _spread(self, slots: NDArray[np.intp]) -> Array:
+        """(2N, 2N) joint covariance of the innovations of some landmarks."""
+        index = _measured(slots)
+        spread = self._state.covariance[np.ix_(index, index)]
+        diagonal = np.arange(len(index))
+        spread[diagonal, diagonal] += np.tile((self.settings.pixel_sigma / self._focal) ** 2, len(slots))
+        return spread
 
-    def _keep(self, mask: NDArray[np.bool_]) -> None:
-        index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])
-        self._covariance = self._covariance[np.ix_(index, index)]
-        self._rays = self._rays[mask]
-        self.ids = self.ids[mask]
+    def _doubt(self, agreeing: int, seen: int) -> str:
+        """Why so many landmarks of those seen are no good update; empty if they are."""
+        s = self.settings
+        needed = max(min(s.least_agreeing, len(self.ids)), s.least_agreeing_share * seen)
+        return "" if agreeing >= needed else f"{agreeing} of {seen} landmarks agree"
+
+    def _correct(self, slots: NDArray[np.intp], slopes: Array) -> float:
+        """Correct by believed measurements; returns their normalised innovation squared.
+
+        The image tells better than the wheels by how much the robot has turned, so the step is linearised
+        again at what it then seems to have been. Without this each step leaves a second-order error of one
+        sign, an expansion of the image that passes for a way forward (docs/decisions/ekf-parametrisation.md).
+        """
+        index = _measured(slots)
+        residual = (slopes - self._state.rays[slots, :2]).ravel()
+        information = inverse(self._spread(slots))
+        for _ in range(self.settings.relinearisations):
+            if self._step is None:
+                break
+            likely, at = self._step.likely(index, information @ residual), self._step.at
+            if max(abs(likely.forward - at.forward), abs(likely.turn - at.turn)) < SAME_STEP:
+                break
+            self._take(self._step.again(at=likely))
+            residual = (slopes - self._state.rays[slots, :2]).ravel()
+            information = inverse(self._spread(slots))
+        self._state = self._state.corrected(index, residual, information)
+        return float(residual @ information @ residual) / len(residual)
+
+
+def _measured(slots: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(2N,) entries of the state that the pixels of some landmarks measure: their a and b."""
+    return np.asarray((3 + 3 * slots[:, None] + np.arange(2)).ravel(), np.intp)
