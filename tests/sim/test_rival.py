@@ -97,7 +97,7 @@ def test_same_picture_sooner_and_steadier(office: World, stand, tmp_path: Path) 
 
 
 def flow_error(pictures: list[Array]) -> float:
-    """Median px by which Lucas-Kanade misses, going to the next of four pictures and back by another window."""
+    """Median px that Lucas-Kanade misses, going to the next of four pictures and back by another window."""
     misses = []
     neighbours = [pair for k in range(0, len(pictures), 4) for pair in pairwise(pictures[k : k + 4])]
     for before, after in neighbours:
