@@ -9,6 +9,7 @@ Encoding rounds (see wire.landmark_codec); what was decoded encodes to the same 
 from __future__ import annotations
 
 import math
+import struct
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 MAX_BODY_BYTES = MAX_LANDMARKS * LANDMARK_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 MAX_SHARED = MAX_LANDMARKS
+SINGLE = struct.Struct("<f")
 MAX_EVIDENCE = 64
 
 NODE_PUT, NODE_RETIRED, EDGE_PUT, EDGE_RETIRED = 1, 2, 3, 4
@@ -204,9 +206,15 @@ def _read_reference(reader: Reader, name: str, home: MapId) -> NodeId:
 
 
 def _small(value: float) -> int | float:
-    """A whole number packs into one to five bytes, another one into five."""
-    number = float(value)
-    return int(number) if math.isfinite(number) and number == int(number) and abs(number) < 2**24 else number
+    """A whole number packs into one to five bytes, another one, rounded to float32, into five."""
+    try:
+        # Rounded first: what becomes whole by it must look the same when it is encoded again.
+        (number,) = SINGLE.unpack(SINGLE.pack(value))
+    except OverflowError:
+        raise InvalidValue(f"edge: {value:g} in its evidence is out of range") from None
+    if math.isfinite(number) and number == int(number) and abs(number) < 2**24:
+        return int(number)
+    return float(number)
 
 
 def _pack_shared(shared: NDArray[Any]) -> bytes:

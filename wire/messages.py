@@ -150,7 +150,7 @@ def _read_candidate(reader: Reader, value: Any) -> Whereabouts:
         node=reader.as_node_id(parts[0], "node"),
         node_from_robot=unpack_posture(reader.as_binary(parts[1], "posture", 64)),
         merged_from_robot=unpack_posture(merged) if merged else None,
-        component=reader.as_integer(parts[3], "component", 0, MAX_NUMBER),
+        component=reader.as_integer(parts[3], "component", -1, MAX_NUMBER),
         inliers=reader.as_integer(parts[4], "inliers", 0, MAX_LANDMARKS),
         probability=reader.as_number(parts[5], "probability", 0.0, 1.0),
     )

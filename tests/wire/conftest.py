@@ -1,0 +1,138 @@
+"""Values of the map as they may come: hypothesis strategies and a plain sample of everything."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from hybridmap.camera import Camera
+from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+
+names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
+numbers = st.integers(0, 2**53)
+node_ids = st.builds(NodeId, names, numbers, numbers)
+coordinates = st.floats(-1e4, 1e4)
+seeds = st.integers(0, 2**32 - 1)
+
+
+@st.composite
+def postures(draw: st.DrawFn) -> PoseGaussian:
+    """Postures whose covariance may be singular and may mix large and small variances."""
+    random = np.random.default_rng(draw(seeds))
+    scales = 10.0 ** np.array([draw(st.floats(-6, 2)) for _ in range(3)])
+    root = random.normal(size=(3, draw(st.integers(0, 4)))) * scales[:, None]
+    heading = draw(st.floats(-math.pi, math.pi))
+    return PoseGaussian(Pose2(draw(coordinates), draw(coordinates), heading), root @ root.T)
+
+
+@st.composite
+def cameras(draw: st.DrawFn) -> Camera:
+    width, height = draw(st.integers(16, 2047)), draw(st.integers(16, 2047))
+    positive = st.floats(1.0, 1e4)
+    return Camera(
+        width, height, draw(positive), draw(positive), draw(st.floats(0, width)), draw(st.floats(0, height)),
+        draw(st.floats(0, 2)), draw(st.floats(-1, 1)),
+    )  # fmt: skip
+
+
+@st.composite
+def landmarks(draw: st.DrawFn, camera: Camera, most: int = 40) -> Landmarks:
+    random = np.random.default_rng(draw(seeds))
+    n = draw(st.integers(0, most))
+    depths = np.exp(random.uniform(math.log(0.011), math.log(9.9e3), n))
+    depths[random.random(n) < draw(st.floats(0, 1))] = np.nan
+    sigmas = np.exp(random.uniform(math.log(0.0011), math.log(99.0), n))
+    sigmas[np.isnan(depths)] = np.nan
+    pixels = random.uniform(-0.45, 1.45, (n, 2)) * [camera.width, camera.height]
+    codes = random.integers(0, 256, (n, 16)).astype(np.uint8)
+    return Landmarks(pixels.astype(np.float32), codes, depths.astype(np.float32), sigmas.astype(np.float32))
+
+
+@st.composite
+def nodes(draw: st.DrawFn) -> Node:
+    camera = draw(cameras())
+    stamp_ns = draw(st.integers(0, 2**63 - 1))
+    return Node(draw(node_ids), stamp_ns, draw(postures()), camera, draw(landmarks(camera)))
+
+
+@st.composite
+def edges(draw: st.DrawFn) -> Edge:
+    own = draw(node_ids)
+    ends = st.one_of(node_ids, st.builds(NodeId, st.just(own.agent), st.just(own.epoch), numbers))
+    a = draw(ends)
+    b = draw(ends.filter(lambda end: end != a))
+    index = st.integers(0, draw(st.sampled_from([3, 255, 256, 1999])))
+    pairs = draw(st.lists(st.tuples(index, index), max_size=20))
+    return Edge(
+        own, a, b, draw(postures()), draw(st.sampled_from(EdgeKind)),
+        np.array(pairs, np.int64).reshape(-1, 2),
+        draw(st.dictionaries(names, st.floats(-1e6, 1e6), max_size=6)),
+    )  # fmt: skip
+
+
+@st.composite
+def bodies(draw: st.DrawFn) -> ChangeBody:
+    return draw(
+        st.one_of(
+            st.builds(NodePut, nodes()),
+            st.builds(EdgePut, edges()),
+            st.builds(NodeRetired, node_ids),
+            st.builds(EdgeRetired, node_ids),
+        )
+    )
+
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)
+MAP = MapId("robot-0", 3)
+
+
+def sample_node(count: int = 150, number: int = 17, map_id: MapId = MAP, seed: int = 0) -> Node:
+    """A node as a robot makes it."""
+    random = np.random.default_rng(seed)
+    depths = random.uniform(0.3, 8.0, count).astype(np.float32)
+    depths[::5] = np.nan
+    pixels = (random.uniform(0, 1, (count, 2)) * [319, 239]).astype(np.float32)
+    codes = random.integers(0, 256, (count, 16)).astype(np.uint8)
+    posture = PoseGaussian.from_sigmas(Pose2(1.2345, -2.0, 0.3), 0.02, 0.01)
+    stamp_ns = 1_700_000_000_000_000_000
+    return Node(
+        NodeId(*map_id, number), stamp_ns, posture, CAMERA, Landmarks(pixels, codes, depths, depths / 8)
+    )
+
+
+def sample_edge(count: int = 60, map_id: MapId = MAP) -> Edge:
+    """An edge as a robot makes it."""
+    random = np.random.default_rng(1)
+    shared = np.stack([random.permutation(150)[:count], random.permutation(150)[:count]], axis=1)
+    evidence = {"inliers": 43.0, "rms_px": 0.613}
+    posture = PoseGaussian.from_sigmas(Pose2(0.5, 0.1, 0.2), 0.01, 0.01)
+    a, b = NodeId(*map_id, 16), NodeId(*map_id, 17)
+    return Edge(NodeId(*map_id, 18), a, b, posture, EdgeKind.MAPPED, shared, evidence)
+
+
+def sample_changes() -> list[Change]:
+    stamp_ns = 1_700_000_000_123_456_789
+    bodies: list[ChangeBody] = [
+        NodePut(sample_node()),
+        NodePut(sample_node(0, 16)),
+        EdgePut(sample_edge()),
+        EdgeRetired(NodeId(*MAP, 18)),
+        NodeRetired(NodeId(*MAP, 17)),
+    ]
+    return [Change(MAP, 1000 + k, stamp_ns + k, body) for k, body in enumerate(bodies)]
+
+
+@pytest.fixture(scope="session")
+def some() -> SimpleNamespace:
+    """Strategies and samples, by name."""
+    return SimpleNamespace(
+        bodies=bodies(), nodes=nodes(), edges=edges(), postures=postures(), node_ids=node_ids, names=names,
+        cameras=cameras(), landmarks=landmarks, node=sample_node, edge=sample_edge, changes=sample_changes,
+        map=MAP, camera=CAMERA,
+    )  # fmt: skip

@@ -1,0 +1,326 @@
+"""The codec: sizes, rounding, borders, and a second decoder written by hand from docs/wire.md."""
+
+from __future__ import annotations
+
+import math
+import struct
+from types import SimpleNamespace
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap.camera import Camera
+from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import Edge, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from wire.codec import decode_body, decode_change, element_of, encode_body, encode_change
+
+data = st.data()
+
+
+def test_a_node_of_150_landmarks_keeps_its_byte_budget(some: SimpleNamespace) -> None:
+    longest = MapId("r" * 32, 2**41)
+    for map_id, most in ((some.map, 3650), (longest, 3700)):
+        change = Change(map_id, 100_000, 2**62, NodePut(some.node(map_id=map_id)))
+        assert len(encode_change(change)) <= most
+
+
+def test_an_edge_of_60_shared_landmarks_is_small(some: SimpleNamespace) -> None:
+    assert len(encode_change(Change(some.map, 1000, 2**62, EdgePut(some.edge())))) < 250
+
+
+@given(data)
+def test_encoding_what_was_decoded_gives_the_same_bytes(some: SimpleNamespace, data: st.DataObject) -> None:
+    encoded = encode_body(data.draw(some.bodies))
+    assert encode_body(decode_body(encoded)) == encoded
+
+
+@given(data)
+def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -> None:
+    node: Node = data.draw(some.nodes)
+    body = decode_body(encode_body(NodePut(node)))
+    assert isinstance(body, NodePut)
+    back = body.node
+    assert (back.id, back.stamp_ns, back.camera) == (node.id, node.stamp_ns, node.camera)
+    assert_close(back.map_from_robot, node.map_from_robot)
+    old, new = node.landmarks, back.landmarks
+    assert len(old) == len(new)
+    assert np.array_equal(old.codes, new.codes)
+    assert new.codes.flags.writeable
+    if len(old):
+        assert np.abs(old.pixels.astype(float) - new.pixels).max() <= 1 / 32 + 1e-9
+    assert np.array_equal(old.has_depth, new.has_depth)
+    known = old.has_depth
+    np.testing.assert_allclose(new.depths[known], old.depths[known], rtol=1.2e-4)
+    np.testing.assert_allclose(new.depth_sigmas[known], old.depth_sigmas[known], rtol=0.023)
+    assert np.isnan(new.depth_sigmas[~known]).all()
+
+
+@given(data)
+def test_an_edge_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -> None:
+    edge: Edge = data.draw(some.edges)
+    body = decode_body(encode_body(EdgePut(edge)))
+    assert isinstance(body, EdgePut)
+    back = body.edge
+    assert (back.id, back.a, back.b, back.kind) == (edge.id, edge.a, edge.b, edge.kind)
+    assert_close(back.a_from_b, edge.a_from_b)
+    assert np.array_equal(back.shared, edge.shared)
+    assert back.shared.dtype == np.int64
+    assert list(back.evidence) == list(edge.evidence)
+    for name, value in edge.evidence.items():
+        assert back.evidence[name] == pytest.approx(value, rel=1e-7, abs=1e-37)
+
+
+@given(data)
+def test_a_change_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -> None:
+    body = data.draw(some.bodies)
+    map_id = element_of(body).map
+    change = Change(map_id, data.draw(st.integers(1, 2**53)), data.draw(st.integers(0, 2**63 - 1)), body)
+    back = decode_change(encode_change(change))
+    assert (back.map, back.sequence, back.stamp_ns) == (change.map, change.sequence, change.stamp_ns)
+    assert encode_body(back.body) == encode_body(body)
+
+
+def assert_close(new: PoseGaussian, old: PoseGaussian) -> None:
+    """Within float32, each covariance against the sigmas that it belongs to."""
+    np.testing.assert_allclose(new.mean.vector, old.mean.vector, rtol=1e-7, atol=1e-30)
+    np.testing.assert_allclose(new.covariance, old.covariance, rtol=1e-6, atol=1e-30)
+
+
+def test_a_second_decoder_reads_a_node(some: SimpleNamespace) -> None:
+    node: Node = some.node(150)
+    change = Change(some.map, 77, 123_456_789_012, NodePut(node))
+    envelope = msgpack.unpackb(encode_change(change))
+    assert (envelope["v"], envelope["q"], envelope["t"]) == (1, 77, 123_456_789_012)
+    fields = msgpack.unpackb(envelope["b"])
+    assert (fields["v"], fields["k"], fields["i"], fields["t"]) == (1, 1, ["robot-0", 3, 17], node.stamp_ns)
+    assert struct.unpack("<HH6d", fields["c"]) == (320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)
+    x, y, heading, xx, xy, xh, yy, yh, hh = struct.unpack("<9f", fields["p"])
+    assert (x, y, heading) == pytest.approx((1.2345, -2.0, 0.3))
+    assert (xx, yy, hh) == pytest.approx((4e-4, 4e-4, 1e-4))
+    assert (xy, xh, yh) == (0.0, 0.0, 0.0)
+    packed = fields["l"]
+    assert len(packed) == 150 * 23
+    for n in range(150):
+        code = packed[16 * n : 16 * n + 16]
+        (u,) = struct.unpack_from("<H", packed, 150 * 16 + 2 * n)
+        (v,) = struct.unpack_from("<H", packed, 150 * 18 + 2 * n)
+        (depth,) = struct.unpack_from("<H", packed, 150 * 20 + 2 * n)
+        (sigma,) = struct.unpack_from("<B", packed, 150 * 22 + n)
+        assert code == node.landmarks.codes[n].tobytes()
+        # 65535 // (2 * 320) = 102: steps of 1/64 px from half an image left of and above the image.
+        assert u / 64 - 160 == pytest.approx(node.landmarks.pixels[n, 0], abs=1 / 128)
+        assert v / 64 - 120 == pytest.approx(node.landmarks.pixels[n, 1], abs=1 / 128)
+        if math.isnan(node.landmarks.depths[n]):
+            assert (depth, sigma) == (0, 0)
+        else:
+            assert 0.01 * 1e6 ** ((depth - 1) / 65534) == pytest.approx(node.landmarks.depths[n], rel=1.2e-4)
+            assert 0.001 * 1e5 ** ((sigma - 1) / 254) == pytest.approx(
+                node.landmarks.depth_sigmas[n], rel=0.023
+            )
+
+
+def test_a_second_decoder_reads_an_edge(some: SimpleNamespace) -> None:
+    edge: Edge = some.edge(5)
+    fields = msgpack.unpackb(encode_body(EdgePut(edge)))
+    assert (fields["k"], fields["i"], fields["a"], fields["b"], fields["w"]) == (
+        3,
+        ["robot-0", 3, 18],
+        16,
+        17,
+        1,
+    )
+    assert fields["h"] == bytes([1, *edge.shared[:, 0], *edge.shared[:, 1]])
+    assert fields["x"] == {"inliers": 43, "rms_px": pytest.approx(0.613)}
+
+
+def test_what_is_not_there_costs_nothing_and_comes_back_empty(some: SimpleNamespace) -> None:
+    edge: Edge = some.edge(0)
+    bare = Edge(edge.id, edge.a, edge.b, edge.a_from_b, edge.kind)
+    encoded = encode_body(EdgePut(bare))
+    assert len(encoded) < 80
+    body = decode_body(encoded)
+    assert isinstance(body, EdgePut)
+    assert body.edge.shared.shape == (0, 2)
+    assert body.edge.evidence == {}
+
+
+@pytest.mark.parametrize("far", [0.009, 1.1e4, math.inf])
+def test_depths_beyond_use_become_unknown(some: SimpleNamespace, far: float) -> None:
+    back = through(some, depth=far, sigma=1.0)
+    assert np.isnan(back.depths).all()
+    assert np.isnan(back.depth_sigmas).all()
+
+
+@pytest.mark.parametrize(("sigma", "clipped"), [(0.0, 0.001), (1e-9, 0.001), (1e4, 100.0)])
+def test_sigmas_are_clipped(some: SimpleNamespace, sigma: float, clipped: float) -> None:
+    assert through(some, depth=2.0, sigma=sigma).depth_sigmas[0] == pytest.approx(clipped, rel=1e-6)
+
+
+def through(some: SimpleNamespace, depth: float, sigma: float) -> Landmarks:
+    """One landmark, there and back."""
+    one = Landmarks(
+        np.full((1, 2), 100, np.float32), np.zeros((1, 16), np.uint8),
+        np.array([depth], np.float32), np.array([sigma], np.float32),
+    )  # fmt: skip
+    body = decode_body(encode_body(NodePut(replaced(some.node(), landmarks=one))))
+    assert isinstance(body, NodePut)
+    return body.node.landmarks
+
+
+def replaced(node: Node, **new: Any) -> Node:
+    fields = {
+        name: getattr(node, name) for name in ("id", "stamp_ns", "map_from_robot", "camera", "landmarks")
+    }
+    return Node(**{**fields, **new})
+
+
+def bad_landmarks(count: int = 1, pixel: float = 10.0, depth: float = 1.0, sigma: float = 0.1) -> Landmarks:
+    return Landmarks(
+        np.full((count, 2), pixel, np.float32), np.zeros((count, 16), np.uint8),
+        np.full(count, depth, np.float32), np.full(count, sigma, np.float32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "new",
+    [
+        {"landmarks": bad_landmarks(2001)},
+        {"landmarks": bad_landmarks(pixel=math.nan)},
+        {"landmarks": bad_landmarks(pixel=1e6)},
+        {"landmarks": bad_landmarks(pixel=-1e6)},
+        {"landmarks": bad_landmarks(depth=0.0)},
+        {"landmarks": bad_landmarks(depth=-1.0)},
+        {"landmarks": bad_landmarks(sigma=math.nan)},
+        {"landmarks": bad_landmarks(sigma=-0.1)},
+        {"stamp_ns": -1},
+        {"stamp_ns": 2**63},
+        {"id": NodeId("r0", 1, -1)},
+        {"id": NodeId("r0", -1, 1)},
+        {"id": NodeId("R0!", 1, 1)},
+        {"map_from_robot": PoseGaussian(Pose2(1e7, 0, 0), np.eye(3))},
+        {"map_from_robot": PoseGaussian(Pose2(), 1e39 * np.eye(3))},
+        {"camera": Camera(320, 240, 1e300, 277, 160, 120, 0.2)},
+    ],
+)
+def test_what_cannot_be_sent_is_refused_before(some: SimpleNamespace, new: dict[str, Any]) -> None:
+    with pytest.raises(InvalidValue):
+        encode_body(NodePut(replaced(some.node(), **new)))
+
+
+def test_an_edge_that_cannot_be_sent_is_refused_before(some: SimpleNamespace) -> None:
+    good: Edge = some.edge()
+
+    def edge(**new: Any) -> EdgePut:
+        names = ("id", "a", "b", "a_from_b", "kind", "shared", "evidence")
+        return EdgePut(Edge(**{**{name: getattr(good, name) for name in names}, **new}))
+
+    for new in (
+        {"b": good.a},
+        {"shared": np.array([[0, 2000]])},
+        {"shared": np.array([[-1, 0]])},
+        {"shared": np.array([0, 1])},
+        {"shared": np.array([[0.5, 1.0]])},
+        {"evidence": {"inliers": math.nan}},
+        {"evidence": {"inliers": math.inf}},
+        {"evidence": {"x" * 33: 1.0}},
+        {"evidence": {f"x{k}": 1.0 for k in range(65)}},
+    ):
+        with pytest.raises(InvalidValue):
+            encode_body(edge(**new))
+    encode_body(edge())
+
+
+def test_a_change_must_be_about_its_own_map(some: SimpleNamespace) -> None:
+    with pytest.raises(InvalidValue, match="cannot be about"):
+        encode_change(Change(MapId("other", 1), 1, 1, NodePut(some.node())))
+
+
+@pytest.mark.parametrize(("sequence", "stamp_ns"), [(0, 0), (-1, 0), (2**54, 0), (1, -1), (1, 2**63)])
+def test_numbers_of_a_change_are_bounded(sequence: int, stamp_ns: int) -> None:
+    with pytest.raises(InvalidValue):
+        encode_change(Change(MapId("r0", 1), sequence, stamp_ns, NodeRetired(NodeId("r0", 1, 1))))
+
+
+FORGERIES: list[tuple[str, dict[str, Any], str]] = [
+    ("node", {"v": 2}, "schema version 2"),
+    ("node", {"v": True}, "v must be an integer"),
+    ("node", {"k": 5}, "k must be an integer in 1..4"),
+    ("node", {"k": "1"}, "k must be"),
+    ("node", {"i": ["robot-0", 3]}, "must be .agent, epoch, number."),
+    ("node", {"i": ["Robot", 3, 1]}, "use 1 to 32"),
+    ("node", {"i": ["a/*", 3, 1]}, "use 1 to 32"),
+    ("node", {"i": ["r0", 3, 1.0]}, "number must be an integer"),
+    ("node", {"t": -1}, "t must be"),
+    ("node", {"p": struct.pack("<9f", math.nan, *[0] * 8)}, "not finite"),
+    ("node", {"p": struct.pack("<9f", 0, 0, 0, math.inf, *[0] * 5)}, "not finite"),
+    ("node", {"p": struct.pack("<9f", 0, 0, 0, -1, 0, 0, 1, 0, 1)}, "positive semi-definite"),
+    ("node", {"p": struct.pack("<9f", 0, 0, 0, 1, 2, 0, 1, 0, 1)}, "positive semi-definite"),
+    ("node", {"p": b"\0" * 35}, "35 bytes instead of 36"),
+    ("node", {"c": struct.pack("<HH6d", 8, 240, 1, 1, 1, 1, 1, 1)}, "image size"),
+    ("node", {"c": struct.pack("<HH6d", 320, 240, -1, 1, 1, 1, 1, 1)}, "focal"),
+    ("node", {"c": struct.pack("<HH6d", 320, 240, math.nan, 1, 1, 1, 1, 1)}, "out of range"),
+    ("node", {"l": b"\0" * 22}, "22 bytes are no"),
+    ("node", {"l": b"\0" * 23 * 2001}, "46023 bytes"),
+    ("node", {"l": b"\0" * 20 + b"\1\0" + b"\0"}, "depth and sigma"),
+    ("node", {"l": "text"}, "l must be at most"),
+    ("edge", {"a": -1}, "a must be"),
+    ("edge", {"a": 17}, "to itself"),
+    ("edge", {"a": ["robot-0", 3, 17]}, "to itself"),
+    ("edge", {"a": None}, "a must be"),
+    ("edge", {"w": 0}, "w must be"),
+    ("edge", {"h": b""}, "no pairs"),
+    ("edge", {"h": b"\3\0\0"}, "no pairs"),
+    ("edge", {"h": b"\1\0\0\0"}, "no pairs"),
+    ("edge", {"h": b"\2\xff\xff\0\0"}, "not in 0..1999"),
+    ("edge", {"x": {"inliers": "many"}}, "inliers must be a number"),
+    ("edge", {"x": {"inliers": math.nan}}, "inliers must be a number"),
+    ("edge", {"x": {"a\nb": 1.0}}, "printable"),
+    ("edge", {"x": [1]}, "x must be a map"),
+]
+
+
+@pytest.mark.parametrize(("kind", "forgery", "reason"), FORGERIES)
+def test_forgeries_are_refused_with_a_reason(
+    some: SimpleNamespace, kind: str, forgery: dict[str, Any], reason: str
+) -> None:
+    encoded = encode_body(NodePut(some.node(3)) if kind == "node" else EdgePut(some.edge(3)))
+    fields = msgpack.unpackb(encoded)
+    assert decode_body(msgpack.packb(fields))
+    with pytest.raises(InvalidMessage, match=reason) as error:
+        decode_body(msgpack.packb({**fields, **forgery}))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["v", "k", "i", "t", "p", "c", "l"])
+def test_what_is_missing_is_named(some: SimpleNamespace, name: str) -> None:
+    fields = msgpack.unpackb(encode_body(NodePut(some.node(3))))
+    del fields[name]
+    with pytest.raises(InvalidMessage, match=f"{name} is missing"):
+        decode_body(msgpack.packb(fields))
+
+
+def test_unknown_fields_are_ignored(some: SimpleNamespace) -> None:
+    encoded = encode_body(NodePut(some.node(3)))
+    newer = {"new": [1, {"deep": b"x"}], **msgpack.unpackb(encoded), "newer": None}
+    assert encode_body(decode_body(msgpack.packb(newer))) == encoded
+
+
+@settings(max_examples=30)
+@given(data)
+def test_whatever_a_camera_sees_fits(some: SimpleNamespace, data: st.DataObject) -> None:
+    """Every pixel from half an image outside on one side to half an image outside on the other."""
+    camera: Camera = data.draw(some.cameras)
+    far = np.array([[-0.5, -0.5], [1.5, 1.5], [1.5, -0.5]]) * [camera.width, camera.height]
+    corners = Landmarks(
+        np.trunc(far).astype(np.float32), np.zeros((3, 16), np.uint8),
+        np.full(3, np.nan, np.float32), np.full(3, np.nan, np.float32),
+    )  # fmt: skip
+    body = decode_body(encode_body(NodePut(replaced(some.node(), camera=camera, landmarks=corners))))
+    assert isinstance(body, NodePut)
+    assert np.array_equal(body.node.landmarks.pixels, corners.pixels)

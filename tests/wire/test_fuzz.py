@@ -1,0 +1,181 @@
+"""Whatever comes from outside: nothing but InvalidMessage comes out, and nothing huge is made of it."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from hybridmap.change import NodePut
+from hybridmap.errors import InvalidMessage
+from hybridmap.node import EdgeKind, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from wire.codec import decode_body, decode_change, encode_body, encode_change
+from wire.log_messages import (
+    Ack,
+    Head,
+    LogAnswer,
+    LogRequest,
+    Mark,
+    Refusal,
+    decode_record,
+    encode_record,
+)
+from wire.mapfile import MapFile, pack_map_file, unpack_map_file
+from wire.messages import (
+    RouteRequest,
+    decode_relocalize_answer,
+    decode_route_answer,
+    decode_route_request,
+    decode_view,
+    encode_relocalize_answer,
+    encode_route_answer,
+    encode_route_request,
+    encode_view,
+)
+
+Decoder = Callable[[bytes], object]
+
+
+def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
+    """One good message for each decoder."""
+    changes = [(decode_change, encode_change(change)) for change in some.changes()]
+    here = PoseGaussian.from_sigmas(Pose2(0.1, 0.2, 0.3), 0.1, 0.1)
+    node = some.node(20)
+    view = View(node.landmarks.pixels, node.landmarks.codes, some.camera)
+    places = (Whereabouts(node.id, here, here, -1, 20, 0.9), Whereabouts(node.id, here, None, 0, 12, 0.1))
+    request = RouteRequest(node.id, NodeId("r1", 1, 1), ((node.id, node.id),), Pose2(1, 2, 3))
+    legs = (RouteLeg(node, here, None), RouteLeg(node, here, EdgeKind.LOOP))
+    return [
+        *changes,
+        (decode_body, encode_body(NodePut(some.node(5)))),
+        (Mark.decode, Mark(7, 2**63).encode()),
+        (Head.decode, Head(5, 7, {"s0": 3, "s1": 7}).encode()),
+        (Ack.decode, Ack(some.map, 5, 7, (Refusal(3, "because"), Refusal(5, "of this"))).encode()),
+        (LogRequest.decode, LogRequest(3, 200).encode()),
+        (LogAnswer.decode, LogAnswer(5, 3, 6, ((3, b"abc"), (5, b""))).encode()),
+        (decode_record, encode_record({"a": 1, "b": 0.5, "c": "text", "d": True})),
+        (decode_view, encode_view(view)),
+        (decode_relocalize_answer,
+         encode_relocalize_answer(RelocalizeAnswer(Certainty.AMBIGUOUS, places, "why"))),
+        (decode_route_request, encode_route_request(request)),
+        (decode_route_answer, encode_route_answer(RouteAnswer(legs, "why"))),
+        (unpack_map_file, pack_map_file(MapFile("merged", "t", (NodePut(node),), {node.id: (0, here)}))),
+    ]  # fmt: skip
+
+
+def refused_or_read(decode: Decoder, data: bytes) -> None:
+    try:
+        decode(data)
+    except InvalidMessage as error:
+        assert str(error)
+        assert "\n" not in str(error)
+
+
+@given(garbage=st.binary(max_size=300))
+@example(garbage=b"")
+@example(garbage=b"\xc1")
+@example(garbage=b"\x90" * 200)
+@example(garbage=b"\x91" * 2000)
+@example(garbage=b"\x81" * 2000)
+@example(garbage=msgpack.packb({"v": 1, "b": msgpack.Timestamp(1, 1)}))
+@example(garbage=b"\x81\xa1v\xd7\xff" + b"\xff" * 8)
+@example(garbage=msgpack.packb({1: 1}))
+@example(garbage=b"\x82\xa1v\x01\xa1k\xa2\xff\xff")
+def test_garbage(some: SimpleNamespace, garbage: bytes) -> None:
+    for decode, _ in messages_once(some):
+        refused_or_read(decode, garbage)
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_good_messages_gone_bad(some: SimpleNamespace, data: st.DataObject) -> None:
+    decode, good = data.draw(st.sampled_from(messages_once(some)))
+    decode(good)
+    bad = bytearray(good)
+    for _ in range(data.draw(st.integers(1, 4))):
+        # Most bytes are landmarks, which may be anything: aim at the structure in front as often.
+        reach = data.draw(st.sampled_from([min(60, len(bad)), len(bad)]))
+        bad[data.draw(st.integers(0, reach - 1))] ^= data.draw(st.integers(1, 255))
+    refused_or_read(decode, bytes(bad))
+
+
+def test_every_truncation_is_refused(some: SimpleNamespace) -> None:
+    for decode, good in messages(some):
+        lengths = range(len(good)) if len(good) < 800 else np.linspace(0, len(good) - 1, 300).astype(int)
+        for length in lengths:
+            with pytest.raises(InvalidMessage):
+                decode(good[:length])
+
+
+def test_every_single_field_may_be_anything(some: SimpleNamespace) -> None:
+    """Each field in turn is replaced by a value of each other kind."""
+    anything = [
+        None,
+        True,
+        -1,
+        2**63,
+        1.5,
+        float("nan"),
+        "x",
+        "x" * 70000,
+        b"",
+        b"x",
+        [],
+        [[]],
+        [None] * 3,
+        {},
+    ]
+    for decode, good in messages(some):
+        if decode in (Mark.decode, unpack_map_file):
+            continue
+        fields = msgpack.unpackb(good)
+        for name in fields:
+            for value in anything:
+                refused_or_read(decode, msgpack.packb({**fields, name: value}))
+
+
+@pytest.mark.parametrize(
+    "bomb",
+    [
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdf\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+        b"\xdb\xff\xff\xff\xff",
+        b"\xc9\xff\xff\xff\xff\x01",
+        b"\x81\xa1v\xdd\xff\xff\xff\xff",
+        b"\x82\xa1v\x01\xa1b\xc6\x7f\xff\xff\xff",
+        b"MAPWEAVE\x01\x00\x00\x00" + b"\xff" * 8,
+    ],
+)
+def test_a_claim_of_gigabytes_allocates_nothing(some: SimpleNamespace, bomb: bytes) -> None:
+    tracemalloc.start()
+    for decode, _ in messages_once(some):
+        with pytest.raises(InvalidMessage):
+            decode(bomb)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1_000_000
+
+
+def test_too_long_is_refused_before_it_is_looked_at(some: SimpleNamespace) -> None:
+    for decode in (decode_change, decode_body, decode_view, Head.decode, Ack.decode, decode_record):
+        with pytest.raises(InvalidMessage, match="at most"):
+            decode(b"\x80" + b"\0" * 200_000)
+
+
+_once: list[tuple[Decoder, bytes]] = []
+
+
+def messages_once(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
+    """Encoded once for all examples."""
+    if not _once:
+        _once.extend(messages(some))
+    return _once

@@ -1,0 +1,169 @@
+"""The in-memory hub's faults, and the dispatcher's bounded queue."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hybridmap.errors import SettingsError
+from wire.bus import Reply, Request, Sample
+from wire.bus_settings import BusSettings
+from wire.dispatch import Dispatcher
+from wire.memory import Faults, MemoryBus, MemoryHub
+
+
+def eventually(condition: Callable[[], object]) -> None:
+    end = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < end, "did not happen in time"
+        time.sleep(0.002)
+
+
+def run(faults: Faults, count: int = 300, seed: int = 1) -> list[int]:
+    """The numbers that arrive out of 0 .. count, and those that calming the hub sets free."""
+    hub = MemoryHub()
+    sender, receiver = MemoryBus(hub), MemoryBus(hub)
+    got: list[int] = []
+    receiver.subscribe("n", lambda sample: got.append(int(sample.payload)))
+    hub.disturb(faults, np.random.default_rng(seed))
+    for n in range(count):
+        sender.publish("n", str(n).encode())
+    hub.calm()
+    sender.publish("n", b"-1")
+    eventually(lambda: -1 in got)
+    sender.close()
+    receiver.close()
+    return got[:-1]
+
+
+def test_without_faults_all_arrives_in_order() -> None:
+    assert run(Faults()) == list(range(300))
+
+
+def test_dropped_messages_are_gone_and_the_others_in_order() -> None:
+    got = run(Faults(drop=0.3))
+    assert got == sorted(set(got))
+    assert 150 < len(got) < 270
+
+
+def test_doubled_messages_come_twice() -> None:
+    got = run(Faults(double=0.3))
+    assert got == sorted(got)
+    assert set(got) == set(range(300))
+    assert 330 < len(got) < 450
+
+
+def test_delayed_messages_come_later_but_come() -> None:
+    got = run(Faults(delay=0.3, longest_delay=5))
+    assert sorted(got) == list(range(300))
+    assert got != sorted(got)
+    assert max(abs(place - n) for place, n in enumerate(got)) <= 10
+
+
+def test_the_same_seed_makes_the_same_faults() -> None:
+    faults = Faults(0.2, 0.2, 0.2)
+    assert run(faults, seed=3) == run(faults, seed=3)
+    assert run(faults, seed=3) != run(faults, seed=4)
+
+
+def test_a_cut_bus_is_dead_to_the_others_and_they_to_it() -> None:
+    hub = MemoryHub()
+    one, two = MemoryBus(hub), MemoryBus(hub)
+    news: list[tuple[str, str, bool]] = []
+    one.announce("one")
+    two.announce("two")
+    one.watch("*", lambda key, alive: news.append(("one sees", key, alive)))
+    two.watch("*", lambda key, alive: news.append(("two sees", key, alive)))
+    eventually(lambda: len(news) == 4)
+    hub.cut(two)
+    eventually(lambda: len(news) == 7)
+    assert ("one sees", "two", False) in news
+    assert ("two sees", "one", False) in news
+    hub.restore(two)
+    eventually(lambda: len(news) == 10)
+    one.close()
+    two.close()
+
+
+def test_an_answer_from_a_bus_that_was_cut_meanwhile_is_lost() -> None:
+    hub = MemoryHub()
+    asker, server = MemoryBus(hub), MemoryBus(hub)
+    kept: list[Request] = []
+    server.serve("q", kept.append)
+    answers: list[list[Reply]] = []
+    thread = threading.Thread(target=lambda: answers.append(asker.ask("q", b"", 5)))
+    thread.start()
+    eventually(lambda: kept)
+    hub.cut(server)
+    kept[0].reply(b"into the void")
+    thread.join()
+    assert answers == [[]]
+    asker.close()
+    server.close()
+
+
+class _Question:
+    """A request that remembers what became of it."""
+
+    key, payload = "q", b""
+
+    def __init__(self) -> None:
+        self.refusal = ""
+
+    def reply(self, payload: bytes) -> None:
+        raise AssertionError("nobody replies here")
+
+    def refuse(self, reason: str) -> None:
+        self.refusal = reason
+
+
+def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    dispatcher = Dispatcher("test", limit=2)
+    release, started = threading.Event(), threading.Event()
+    seen: list[str] = []
+
+    def slow(_: Sample) -> None:
+        started.set()
+        release.wait(5)
+
+    dispatcher.message(slow, Sample("slow", b""), lambda: True)
+    started.wait(5)
+    with caplog.at_level(logging.WARNING):
+        for n in range(5):
+            dispatcher.message(lambda s: seen.append(s.key), Sample(f"m{n}", b""), lambda: True)
+        question = _Question()
+        dispatcher.question(lambda _: None, question, lambda: True)
+    dispatcher.presence(lambda key, alive: seen.append(f"{key} {alive}"), "token", True, lambda: True)
+    assert question.refusal == "too busy, ask again later"
+    assert (dispatcher.lost, dispatcher.refused) == (3, 1)
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * 3, (
+        "at 1 and 2 lost, and 1 refused"
+    )
+    release.set()
+    eventually(lambda: len(seen) == 3)
+    assert seen == ["m0", "m1", "token True"]
+    dispatcher.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"mode": "peer"}, "use client or router"),
+        ({"endpoints": ()}, "at least one endpoint"),
+        ({"endpoints": ("localhost:7447",)}, "endpoints look like"),
+        ({"mode": "router", "listen": ("tcp/x",)}, "endpoints look like"),
+        ({"retry_first": 2.0}, "retry_first"),
+        ({"lease": 0}, "lease"),
+        ({"router_queue": 17}, "router_queue"),
+    ],
+)
+def test_settings_that_cannot_work(settings: dict[str, object], reason: str) -> None:
+    with pytest.raises(SettingsError, match=reason):
+        BusSettings(**settings)  # type: ignore[arg-type]

@@ -1,0 +1,173 @@
+"""Small messages and answers to questions come back as they were."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import EdgeKind, MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from wire.log_messages import (
+    Ack,
+    Head,
+    LogAnswer,
+    LogRequest,
+    Mark,
+    Refusal,
+    decode_record,
+    encode_record,
+)
+from wire.messages import (
+    RouteRequest,
+    decode_relocalize_answer,
+    decode_route_answer,
+    decode_route_request,
+    decode_view,
+    encode_relocalize_answer,
+    encode_route_answer,
+    encode_route_request,
+    encode_view,
+)
+
+HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.125), 0.5, 0.25)
+sequences = st.integers(1, 2**53)
+scalars = st.one_of(
+    st.booleans(),
+    st.integers(-(2**53), 2**53),
+    st.floats(-1e300, 1e300),
+    st.text(st.characters(codec="ascii", categories=["L", "N", "P", "Zs"]), max_size=40),
+)
+
+
+def test_small_messages() -> None:
+    for message in (
+        Mark(7, 2**64 - 1),
+        Head(2**63, 7, {"s0": 3, "s1": 7}),
+        Head(0, 0),
+        Ack(MapId("r0", 3), 5, 7, (Refusal(0, "the whole log"), Refusal(5, "of this"))),
+        LogRequest(3, 3),
+        LogAnswer(5, 3, 9, ((3, b"abc"), (5, b""), (9, b"x"))),
+        LogAnswer(5, 3, 2, ()),
+    ):
+        assert type(message).decode(message.encode()) == message
+
+
+@pytest.mark.parametrize(
+    ("decode", "data"),
+    [
+        (Mark.decode, b"\0" * 16),
+        (Mark.decode, b"\1" * 15),
+        (LogRequest.decode, LogRequest(5, 4).encode()),
+        (LogRequest.decode, LogRequest(0, 4).encode()),
+        (LogAnswer.decode, LogAnswer(1, 3, 9, ((4, b""), (4, b""))).encode()),
+        (LogAnswer.decode, LogAnswer(1, 3, 9, ((2, b""),)).encode()),
+        (LogAnswer.decode, LogAnswer(1, 3, 9, ((10, b""),)).encode()),
+        (LogAnswer.decode, LogAnswer(1, 3, 1, ()).encode()),
+        (LogAnswer.decode, LogAnswer(1, 1, 300, tuple((k, b"") for k in range(1, 259))).encode()),
+        (Head.decode, Head(1, -1).encode()),
+        (Head.decode, Head(1, 1, {"S!": 1}).encode()),
+        (Ack.decode, Ack(MapId("a/b", 1), 1, 1).encode()),
+    ],
+)
+def test_what_makes_no_sense_is_refused(decode: object, data: bytes) -> None:
+    assert callable(decode)
+    with pytest.raises(InvalidMessage):
+        decode(data)
+
+
+def test_only_the_newest_refusals_travel_and_none_is_too_long() -> None:
+    ack = Ack(MapId("r0", 1), 1, 99, tuple(Refusal(k, "r" * 999) for k in range(1, 99)))
+    back = Ack.decode(ack.encode())
+    assert [refusal.sequence for refusal in back.refusals] == list(range(83, 99))
+    assert {len(refusal.reason) for refusal in back.refusals} == {300}
+
+
+@given(st.dictionaries(st.from_regex(r"[a-z_]{1,32}", fullmatch=True), scalars, max_size=20))
+def test_records(values: dict[str, bool | int | float | str]) -> None:
+    back = decode_record(encode_record(values))
+    assert back == values
+    assert [type(value) for value in back.values()] == [type(value) for value in values.values()]
+
+
+@pytest.mark.parametrize(
+    "values", [{"x": "a\nb"}, {"x": float("nan")}, {"x" * 33: 1}, {"x": 2**70}, {"x": b""}]
+)
+def test_records_that_cannot_be_sent(values: dict[str, object]) -> None:
+    with pytest.raises(InvalidValue):
+        encode_record(values)  # type: ignore[arg-type]
+
+
+def test_a_view(some: SimpleNamespace) -> None:
+    landmarks = some.node(120).landmarks
+    encoded = encode_view(View(landmarks.pixels, landmarks.codes, some.camera))
+    assert len(encoded) < 120 * 20 + 80
+    back = decode_view(encoded)
+    assert back.camera == some.camera
+    assert np.array_equal(back.codes, landmarks.codes)
+    assert np.abs(back.pixels - landmarks.pixels).max() <= 1 / 128
+    assert encode_view(back) == encoded
+
+
+def test_a_view_that_cannot_be_sent(some: SimpleNamespace) -> None:
+    landmarks = some.node(3).landmarks
+    for pixels, codes in (
+        (landmarks.pixels[:2], landmarks.codes),
+        (landmarks.pixels, landmarks.codes.astype(np.int64)),
+        (np.full((3, 2), np.nan, np.float32), landmarks.codes),
+        (np.zeros((2001, 2), np.float32), np.zeros((2001, 16), np.uint8)),
+    ):
+        with pytest.raises(InvalidValue):
+            encode_view(View(pixels, codes, some.camera))
+
+
+def test_a_relocalization() -> None:
+    places = (
+        Whereabouts(NodeId("r1", 3, 17), HERE, HERE, 0, 41, 0.75),
+        Whereabouts(NodeId("r2", 1, 4), HERE, None, -1, 12, 0.25),
+    )
+    encoded = encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, places, "41 landmarks agree"))
+    back = decode_relocalize_answer(encoded)
+    assert (back.certainty, back.reason) == (Certainty.FOUND, "41 landmarks agree")
+    for new, old in zip(back.candidates, places, strict=True):
+        assert (new.node, new.component, new.inliers) == (old.node, old.component, old.inliers)
+        assert new.probability == old.probability
+        assert new.node_from_robot.mean == HERE.mean
+        assert np.array_equal(new.node_from_robot.covariance, HERE.covariance)
+        assert (new.merged_from_robot is None) == (old.merged_from_robot is None)
+    assert encode_relocalize_answer(back) == encoded
+    nothing = RelocalizeAnswer(Certainty.UNKNOWN, (), "no node looks like it")
+    same = decode_relocalize_answer(encode_relocalize_answer(nothing))
+    assert (same.certainty, same.candidates, same.reason) == (Certainty.UNKNOWN, (), nothing.reason)
+
+
+def test_a_relocalization_that_cannot_be_sent() -> None:
+    wrong = Whereabouts(NodeId("r1", 3, 17), HERE, HERE, 0, 41, 1.5)
+    with pytest.raises(InvalidValue, match="probability"):
+        encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, (wrong,), ""))
+
+
+def test_a_route(some: SimpleNamespace) -> None:
+    request = RouteRequest(
+        NodeId("r0", 1, 2),
+        NodeId("r2", 1, 9),
+        ((NodeId("r0", 1, 2), NodeId("r1", 1, 1)),),
+        Pose2(0.1, 0.2, -3),
+    )
+    assert decode_route_request(encode_route_request(request)) == request
+    assert decode_route_request(encode_route_request(RouteRequest(request.start, request.goal))).blocked == ()
+    node = some.node(9)
+    encoded = encode_route_answer(
+        RouteAnswer((RouteLeg(node, HERE, None), RouteLeg(node, HERE, EdgeKind.MERGED)), "2 nodes")
+    )
+    back = decode_route_answer(encoded)
+    assert [(leg.node.id, leg.kind) for leg in back.legs] == [(node.id, None), (node.id, EdgeKind.MERGED)]
+    assert back.legs[1].previous_from_node.mean == HERE.mean
+    assert encode_route_answer(back) == encoded
+    nothing = decode_route_answer(encode_route_answer(RouteAnswer((), "no way")))
+    assert (nothing.legs, nothing.reason) == ((), "no way")
