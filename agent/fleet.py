@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import queue
 import threading
-from typing import Any
-
-import msgpack
+from dataclasses import dataclass
 
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question, WhereAmI
 from agent.pipeline import Status
-from hybridmap.errors import InvalidMessage, MapweaveError
+from hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
 from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
 from wire.bus import Bus, Request
 from wire.keys import Keys
+from wire.log_messages import decode_record, encode_record
 from wire.messages import (
     RouteRequest,
     decode_relocalize_answer,
@@ -29,7 +29,7 @@ def encode_mission(mission: Mission) -> bytes:
     """An operator's command as a message."""
     name = type(mission).__name__.lower()
     node = str(mission.node) if isinstance(mission, GoTo) else ""
-    return bytes(msgpack.packb({"version": 1, "mission": name, "node": node}))
+    return encode_record({"mission": name, "node": node})
 
 
 def decode_mission(payload: bytes) -> Mission:
@@ -38,11 +38,8 @@ def decode_mission(payload: bytes) -> Mission:
     Raises:
         InvalidMessage: it is none.
     """
-    try:
-        message = msgpack.unpackb(payload)
-        name, node = str(message["mission"]), str(message.get("node", ""))
-    except (ValueError, KeyError, TypeError, AttributeError, msgpack.UnpackException) as error:
-        raise InvalidMessage(f"not a mission: {error}") from None
+    message = decode_record(payload)
+    name, node = str(message.get("mission", "")), str(message.get("node", ""))
     plain: dict[str, Mission] = {"idle": Idle(), "explore": Explore(), "carried": Carried()}
     if name in plain:
         return plain[name]
@@ -51,18 +48,73 @@ def decode_mission(payload: bytes) -> Mission:
     raise InvalidMessage(f"no mission {name!r}; known are idle, explore, carried and goto")
 
 
+@dataclass(frozen=True)
+class AgentReport:
+    """A status as others receive it.
+
+    Attributes:
+        status: what the agent says of itself.
+        stamp_ns: time of the observation that it speaks of.
+    """
+
+    status: Status
+    stamp_ns: int
+
+    @property
+    def fix_node(self) -> NodeId | None:
+        """The node that the robot knows itself by, if it navigates and knows."""
+        return self.status.fix_node
+
+
 def encode_status(status: Status, stamp_ns: int) -> bytes:
     """What the robot is doing, for people and for tests."""
-    pose = status.map_from_robot
-    message: dict[str, Any] = {
-        "version": 1, "stamp_ns": stamp_ns, "doing": status.doing, "detail": status.detail,
-        "nodes": status.nodes, "tracked": status.tracked, "finished": status.finished,
-        "map_from_robot": [pose.x, pose.y, pose.heading],
-        "fix_node": "" if status.fix_node is None else str(status.fix_node),
-        "node_from_robot": status.node_from_robot.vector.tolist(),
-        "legs": status.legs, "mission": status.mission,
-    }  # fmt: skip
-    return bytes(msgpack.packb(message))
+    pose, fix = status.map_from_robot, status.node_from_robot
+    return encode_record(
+        {
+            "stamp_ns": stamp_ns,
+            "doing": status.doing,
+            "detail": status.detail,
+            "nodes": status.nodes,
+            "tracked": status.tracked,
+            "finished": status.finished,
+            "x": pose.x,
+            "y": pose.y,
+            "heading": pose.heading,
+            "mission": status.mission,
+            "fix_node": "" if status.fix_node is None else str(status.fix_node),
+            "fix_x": fix.x,
+            "fix_y": fix.y,
+            "fix_heading": fix.heading,
+            "legs": status.legs,
+        }
+    )
+
+
+def decode_status(payload: bytes) -> AgentReport:
+    """Read a status.
+
+    Raises:
+        InvalidMessage: it is none.
+    """
+    values = decode_record(payload)
+    try:
+        status = Status(
+            doing=str(values["doing"]),
+            detail=str(values["detail"]),
+            nodes=int(values["nodes"]),
+            tracked=int(values["tracked"]),
+            map_from_robot=Pose2(float(values["x"]), float(values["y"]), float(values["heading"])),
+            finished=bool(values["finished"]),
+            mission=str(values["mission"]),
+            fix_node=NodeId.parse(str(values["fix_node"])) if values["fix_node"] else None,
+            node_from_robot=Pose2(
+                float(values["fix_x"]), float(values["fix_y"]), float(values["fix_heading"])
+            ),
+            legs=int(values["legs"]),
+        )
+        return AgentReport(status, int(values["stamp_ns"]))
+    except (KeyError, ValueError, InvalidValue) as error:
+        raise InvalidMessage(f"agent status: {error}") from None
 
 
 class FleetLink:
@@ -141,7 +193,7 @@ class FleetLink:
         if isinstance(question, WhereAmI):
             key, payload = self._keys.any_relocalize(), encode_view(question.view)
         else:
-            request = RouteRequest(question.start, question.goal, question.blocked)
+            request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
             key, payload = self._keys.any_route(), encode_route_request(request)
         replies = self._bus.ask(key, payload, self._timeout)
         error = NO_ANSWER if not replies else ""

@@ -82,12 +82,19 @@ class Floor:
         self._odds[own[:, 0], own[:, 1]] = -s.most
         np.clip(self._odds, -s.most, s.most, out=self._odds)
 
-    def drivable(self) -> NDArray[np.bool_]:
-        """Cells that are known to be free, with clearance for the footprint."""
+    def room(self) -> Array:
+        """For each cell the distance to the nearest thing seen, m."""
         occupied = (self._odds > 0.3).astype(np.uint8)
-        distance = cv2.distanceTransform(1 - occupied, cv2.DIST_L2, 5) * self._settings.cell
-        enough = self._description.radius + self._settings.clearance
-        return np.asarray((self._odds < -0.3) & (distance >= enough))
+        return np.asarray(cv2.distanceTransform(1 - occupied, cv2.DIST_L2, 5) * self._settings.cell)
+
+    def drivable(self, unknown: bool = False) -> NDArray[np.bool_]:
+        """Cells that are known to be free, with clearance for the footprint; or that may be free."""
+        free = self._odds < (0.3 if unknown else -0.3)
+        return np.asarray(free & (self.room() >= self._enough))
+
+    @property
+    def _enough(self) -> float:
+        return self._description.radius + self._settings.clearance
 
     def unknown_around(self, radius: float) -> Array:
         """For each cell the share of unknown cells within a radius (m): how much is to be seen from there."""
@@ -95,19 +102,48 @@ class Floor:
         side = 2 * round(radius / self._settings.cell) + 1
         return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
 
-    def ways(self, start: Array, reach: float) -> Ways:
+    def corners(self, start: Array, goal: Array, reach: float) -> list[Array]:
+        """Corners of the shortest way to a position, or as near to it as one can get; unknown floor is tried.
+
+        Args:
+            start: (2,) m in map.
+            goal: (2,) m in map.
+            reach: longest way, m.
+        """
+        ways = self.ways(start, reach, self.drivable(unknown=True))
+        if not len(ways.cells):
+            return []
+        nearest = int(np.linalg.norm(ways.positions - goal, axis=1).argmin())
+        return ways.path(ways.cells[nearest])
+
+    def clear(self, start: Array, goal: Array) -> bool:
+        """Whether the straight way between two positions ((2,) m in map) meets nothing that was seen."""
+        drivable = self.drivable(unknown=True)
+        count = int(np.linalg.norm(goal - start) / (0.5 * self._settings.cell)) + 1
+        points = start + np.linspace(0.0, 1.0, count + 1)[:, None] * (goal - start)
+        cells = self.cells(points)
+        good = drivable[cells[:, 0], cells[:, 1]]
+        if good.all() or not good.any():
+            return bool(good.all())
+        # Close to something already, the robot may still leave it, but come no closer.
+        first = int(good.argmax())
+        leaving = self.room()[cells[: first + 1, 0], cells[: first + 1, 1]]
+        return bool(good[first:].all() and (np.diff(leaving) > -1e-6).all())
+
+    def ways(self, start: Array, reach: float, drivable: NDArray[np.bool_] | None = None) -> Ways:
         """Shortest ways over drivable cells to everything within reach of a position.
 
         Args:
             start: (2,) m in map.
             reach: longest way, m.
+            drivable: where one may drive; by default where the floor is known to be free.
         """
-        drivable = self.drivable()
+        drivable = self.drivable() if drivable is None else drivable
         first = tuple(int(v) for v in self.cells(start))
         cost: dict[tuple[int, int], float] = {(first[0], first[1]): 0.0}
         before: dict[tuple[int, int], tuple[int, int]] = {}
         queue: list[tuple[float, tuple[int, int]]] = [(0.0, (first[0], first[1]))]
-        escape = self._description.radius + 2 * self._settings.cell
+        room = self.room()
         while queue:
             so_far, cell = heapq.heappop(queue)
             if so_far > cost[cell] or so_far > reach:
@@ -116,8 +152,8 @@ class Floor:
                 there = (cell[0] + dx, cell[1] + dy)
                 if not (0 <= there[0] < drivable.shape[0] and 0 <= there[1] < drivable.shape[1]):
                     continue
-                # Close to something already, the robot may still leave: near the start any free cell serves.
-                if not drivable[there] and (so_far > escape or self._odds[there] > -0.3):
+                # Close to something already, the robot may still leave it, but come no closer.
+                if not drivable[there] and (drivable[cell] or room[there] < max(room[cell], 0.05)):
                     continue
                 further = so_far + self._settings.cell * math.hypot(dx, dy)
                 if further < cost.get(there, math.inf):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from hybridmap.recognition import register
 from numpy.typing import NDArray
 
 from agent.ekf.mapping import FilterSettings, MappingFilter
@@ -19,6 +18,7 @@ from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.recognition import register
 
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
@@ -40,6 +40,7 @@ class MapperSettings:
         edge_floor: what an edge's posture is never better than, m and rad: tracks err alike for a while,
             which the filter, for which pixels err independently, does not know.
         edge_share: likewise as a share of the way and of the turn: wheels are never quite round.
+        depth_floor: what a depth is never better than: m, and share of the depth.
         depth_share: a landmark is kept if its depth's sigma is below this share of the depth.
         depths_per_height: assumed depth of an unknown feature as a multiple of the camera's height (the
             paper's "assumed common height").
@@ -47,6 +48,7 @@ class MapperSettings:
         strikes: a track that the filter refuses this often in a row is given up.
         loop_reach: nodes of the own map nearer than this are tried for a loop closure, m.
         loop_turn: and turned by less than this, rad.
+        loop_sigma: a loop closure known no better than this is left to the server, m.
         loop_tries: at most this many, nearest first.
     """
 
@@ -60,6 +62,7 @@ class MapperSettings:
     least_landmarks: int = 6
     edge_floor: tuple[float, float] = (0.002, 0.004)
     edge_share: tuple[float, float] = (0.005, 0.01)
+    depth_floor: tuple[float, float] = (0.01, 0.015)
     depth_share: float = 0.25
     depths_per_height: float = 8.0
     associate_px: float = 1.5
@@ -67,6 +70,7 @@ class MapperSettings:
     loop_reach: float = 1.2
     loop_turn: float = 0.7
     loop_tries: int = 4
+    loop_sigma: float = 0.12
 
 
 @dataclass(eq=False)
@@ -361,6 +365,8 @@ class Mapper:
                     sigmas[seat[track]] = np.sqrt(max(spread[row], 1e-12))
         with np.errstate(invalid="ignore"):
             good = np.flatnonzero((depths > 0.05) & (sigmas < s.depth_share * depths))[: s.most_landmarks]
+        # Tracks err alike for a while, which neither filter nor triangulation knows.
+        sigmas = np.hypot(sigmas, s.depth_floor[0] + s.depth_floor[1] * depths)
         landmarks = Landmarks(
             view.features.pixels[good].astype(np.float32), view.features.codes[good],
             depths[good].astype(np.float32), sigmas[good].astype(np.float32),
@@ -399,7 +405,7 @@ class Mapper:
             if self._last is not None and other.id == self._last.node.id:
                 continue
             found = register(other, node, None, self._rng)
-            if found is not None:
+            if found is not None and found.evidence["sigma_xy"] < s.loop_sigma:
                 edge = Edge(
                     self._number(),
                     other.id,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from hybridmap.node import NodeId
+from hybridmap.pose import Pose2
 from hybridmap.query import RelocalizeAnswer, RouteAnswer, View
 
 
@@ -47,14 +48,16 @@ class WhichWay:
 
     Attributes:
         number: of the question; the answer repeats it.
-        start: node where the robot is.
+        start: node that the robot knows itself by.
         goal: node where it wants to be.
+        start_from_robot: where it is exactly.
         blocked: pairs of nodes between which it could not drive.
     """
 
     number: int
     start: NodeId
     goal: NodeId
+    start_from_robot: Pose2 = field(default_factory=Pose2)
     blocked: tuple[tuple[NodeId, NodeId], ...] = ()
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from hybridmap.recognition import recognise
 
+from agent.floor import Floor
 from agent.localizer import Localizer, LocalizerSettings
 from agent.mission import Answer, Question, WhereAmI, WhichWay
 from agent.observation import Command, Observation, RobotDescription
@@ -23,6 +23,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian, wrap_angle
 from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
+from hybridmap.recognition import recognise
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,11 @@ class NavigatorSettings:
         sight_reach: and the robot within this distance of it, m.
         look_every: ticks between two looks for the next nodes' landmarks.
         skip: nodes further along the route that are looked for as well.
+        sure: standard deviations up to which a lost robot believes a recognition, m and rad.
         plausible: a recognition this far from where the robot believes to be is not believed, m.
         blind: way without any landmark in sight before the robot stops and asks where it is, m.
         patience: seconds without getting on before an edge counts as blocked.
+        replan_every: ticks between two plans around obstacles.
         answer_patience: ticks that an answer may take before the question counts as lost.
     """
 
@@ -54,10 +57,12 @@ class NavigatorSettings:
     sight_reach: float = 1.4
     look_every: int = 4
     skip: int = 2
+    sure: tuple[float, float] = (0.06, 0.03)
     plausible: float = 0.5
     blind: float = 1.2
     patience: float = 5.0
     answer_patience: int = 100
+    replan_every: int = 15
 
 
 class Stage(StrEnum):
@@ -79,6 +84,12 @@ class Outcome(StrEnum):
 
 
 Behaviour = Generator[Command, None, None]
+
+
+def _ahead(target_from_robot: Pose2) -> bool:
+    """Whether a posture can be servoed to without a manoeuvre: ahead, and facing alike."""
+    there = target_from_robot.inverse()
+    return abs(target_from_robot.heading) < 0.5 and there.x > 0.1 and abs(there.y) < 0.6 * there.x
 
 
 @dataclass(eq=False)
@@ -108,6 +119,7 @@ class Navigator:
         fix: where the robot is, or None while lost.
         route: legs of the current route.
         leg: index of the leg that is driven to.
+        legs: how many the first route had.
     """
 
     def __init__(
@@ -127,6 +139,7 @@ class Navigator:
         self.fix: Fix | None = None
         self.route: tuple[RouteLeg, ...] = ()
         self.leg = 0
+        self.legs = 0
         self.goal = goal
         self._description = description
         self._lens = lens
@@ -142,6 +155,11 @@ class Navigator:
         self._next_question = 1
         self._blocked: list[tuple[NodeId, NodeId]] = []
         self._tick = 0
+        # What the rangers have seen since the start, in the wheels' frame: it has to last a few metres only.
+        self._floor = Floor(description)
+        self._odom_from_robot = Pose2()
+        self._detour: list[Array] = []
+        self._replan = 0
         self._behaviour = self._go()
 
     def step(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
@@ -150,6 +168,8 @@ class Navigator:
         self._tick += 1
         self._answers.update({a.number: a for a in answers})
         self._questions = []
+        self._odom_from_robot = self._odom_from_robot @ observation.odometry.motion()
+        self._floor.see(self._odom_from_robot, observation.proximity)
         self._keep_fix(observation)
         return next(self._behaviour), self._questions
 
@@ -167,6 +187,8 @@ class Navigator:
             assert self.fix is not None
             yield from self._get_route(self.fix.node)
             if not self.route:
+                # What was in the way may have gone; otherwise the robot would stand here for ever.
+                self._blocked.clear()
                 self.fix = None
                 yield from self._wait(2.0)
                 continue
@@ -198,7 +220,7 @@ class Navigator:
             return False
         view = features.view(self._description.camera)
         own = recall(self._own_map, view, self._rng)
-        if own is not None:
+        if own is not None and self._sure(own[1].node_from_robot):
             self._hold(own[0], Localizer(
                 self._description, self._lens, own[0], self._now.image, features, own[1],
                 self._settings.localizer,
@@ -213,24 +235,46 @@ class Navigator:
         if answer.content.certainty is not Certainty.FOUND:
             return False
         best = answer.content.candidates[0]
+        if not self._sure(best.node_from_robot):
+            self.detail = f"{answer.content.reason}, but not exactly enough"
+            return False
         # The robot has stood still while the answer was on its way.
         self.fix = Fix(best.node, best.node_from_robot)
         return True
 
+    def _sure(self, posture: PoseGaussian) -> bool:
+        """Whether a recognition is exact enough to drive by; else another look, elsewhere, costs little."""
+        s, sigma = self._settings, np.sqrt(np.diag(posture.covariance))
+        return bool(max(sigma[0], sigma[1]) <= s.sure[0] and sigma[2] <= s.sure[1])
+
     def _get_route(self, start: NodeId) -> Behaviour:
         self.stage, self.route, self.leg = Stage.ASKING, (), 0
-        answer = yield from self._ask(WhichWay(self._number(), start, self.goal, tuple(self._blocked)))
+        assert self.fix is not None
+        here = self.fix.node_from_robot.mean
+        answer = yield from self._ask(WhichWay(self._number(), start, self.goal, here, tuple(self._blocked)))
         if isinstance(answer.content, RouteAnswer):
             self.route = answer.content.legs
+            self.legs = self.legs or len(self.route)
             self.detail = answer.content.reason
         else:
             self.detail = answer.error or "no answer"
 
+    def _rebase(self, leg: RouteLeg) -> None:
+        """Express where the robot is in the frame of the route's first node."""
+        fix = self.fix
+        assert fix is not None
+        if fix.node != leg.node.id:
+            posture = leg.previous_from_node.inverse() @ fix.node_from_robot
+            self.fix = Fix(leg.node.id, posture, None, fix.blind)
+
     def _follow_route(self) -> Generator[Command, None, Outcome]:
         s = self._settings
         self.stage = Stage.DRIVING
-        self.leg = min(1, len(self.route) - 1)
-        reference = 0
+        reference, start = 0, self.fix.node
+        self._rebase(self.route[0])
+        # The route may begin at a node that the robot does not stand at: then that is the first to reach.
+        here = self.fix.node_from_robot.mean
+        self.leg = min(1 if math.hypot(here.x, here.y) < s.passed else 0, len(self.route) - 1)
         servoing, approaching = -1, False
         best, since_best = math.inf, 0.0
         while True:
@@ -263,11 +307,11 @@ class Navigator:
             since_best += self._description.tick
             parking = self.leg == last
             if since_best > (6 * s.patience if parking else s.patience):
-                if self.leg > 0:
-                    self._blocked.append((self.route[self.leg - 1].node.id, self.route[self.leg].node.id))
+                before = self.route[self.leg - 1].node.id if self.leg else start
+                self._blocked.append((before, self.route[self.leg].node.id))
                 return Outcome.LOST
             in_sight = fix.localizer is not None and fix.localizer.in_sight and reference == self.leg
-            if in_sight and (parking or abs(target_from_robot.heading) < 0.5):
+            if in_sight and (parking or _ahead(target_from_robot)):
                 if servoing != self.leg:
                     self._servo.start(target_from_robot, self.route[self.leg].node.points_in_robot)
                     servoing = self.leg
@@ -382,10 +426,23 @@ class Navigator:
     # Small things
 
     def _toward(self, target_from_robot: Pose2) -> Command:
-        """Turn toward a position, then drive straight to it."""
-        there = target_from_robot.inverse()
-        error = math.atan2(there.y, there.x)
+        """Turn toward a position, then drive straight to it; around what the rangers have seen in between."""
         s = self._settings
+        there = target_from_robot.inverse()
+        here = self._odom_from_robot
+        start, goal = np.array([here.x, here.y]), here.apply(np.array([there.x, there.y]))
+        while self._detour and np.linalg.norm(self._detour[0] - start) < 0.08:
+            self._detour.pop(0)
+        if self._tick >= self._replan or (self._detour and not self._floor.clear(start, self._detour[0])):
+            self._replan = self._tick + s.replan_every
+            reach = 2.0 * math.hypot(there.x, there.y) + 1.0
+            straight = self._floor.clear(start, goal)
+            self._detour = [] if straight else self._floor.corners(start, goal, reach)
+        if self._detour:
+            self.detail += ", around an obstacle"
+            corner = here.inverse().apply(self._detour[0])
+            there = Pose2(float(corner[0]), float(corner[1]))
+        error = math.atan2(there.y, there.x)
         speed = min(s.speed, 0.8 * math.hypot(there.x, there.y)) * max(0.0, 1.0 - abs(error) / 0.4)
         return Command(speed, float(np.clip(1.8 * error, -s.turn_rate, s.turn_rate)))
 

@@ -1,7 +1,7 @@
 r"""One robot's whole pipeline: observation in, command and map changes out. Read this first.
 
     image, odometry, proximity -> mapper (tracks, EKF, nodes) -> changes
-                               -> floor                        \ 
+                               -> floor                        \
     mission ------------------> explorer | passenger | navigator -> guard -> command
 
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
@@ -25,6 +25,8 @@ from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
+
+IDENTITY = Pose2()
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Status:
         mission: its name.
         fix_node: the node that the robot knows itself by while navigating.
         node_from_robot: posture in that node's frame.
-        legs: of the current route.
+        legs: nodes on the first route of the drive, beginning and goal included.
     """
 
     doing: str
@@ -64,7 +66,7 @@ class Status:
     finished: bool
     mission: str = "idle"
     fix_node: NodeId | None = None
-    node_from_robot: Pose2 = Pose2()
+    node_from_robot: Pose2 = IDENTITY
     legs: int = 0
 
 
@@ -167,4 +169,16 @@ class Pipeline:
         nodes = len(self.map.nodes)
         if not nodes and isinstance(self._mission, Explore | Carried):
             detail = f"no nodes yet: {detail or f'{self._mapper.tracked} features in view'}"
-        return Status(doing, detail, nodes, self._mapper.tracked, self._mapper.map_from_robot.mean, finished)
+        fix = self._navigator.fix if self._navigator is not None else None
+        return Status(
+            doing=doing,
+            detail=detail,
+            nodes=nodes,
+            tracked=self._mapper.tracked,
+            map_from_robot=self._mapper.map_from_robot.mean,
+            finished=finished,
+            mission=type(self._mission).__name__.lower(),
+            fix_node=None if fix is None else fix.node,
+            node_from_robot=IDENTITY if fix is None else fix.node_from_robot.mean,
+            legs=0 if self._navigator is None else self._navigator.legs,
+        )

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from hybridmap.recognition import Recognition, recognise
 
 from hybridmap.descriptor import decode
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node
 from hybridmap.query import View
+from hybridmap.recognition import Recognition, recognise
 
 
 @dataclass(frozen=True)

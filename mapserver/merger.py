@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId, Node, NodeId
-from hybridmap.recognition import RecognitionSettings
 from mapserver.placeindex import PlaceIndex
 from merge.candidates import CandidateSettings, Pair, choose_pairs
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap
 from merge.merging import MergeSettings, merge_maps
-from merge.verification import verify
+from merge.verification import VerificationSettings, verify
 
 
 @dataclass(frozen=True)
@@ -22,12 +21,12 @@ class MergerSettings:
 
     Attributes:
         candidates: which pairs are looked at; the place index must have the same.
-        recognition: when two nodes count as the same place.
+        verification: when two nodes are linked.
         merging: which links are believed.
     """
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
-    recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
     merging: MergeSettings = field(default_factory=MergeSettings)
 
 
@@ -135,7 +134,7 @@ class Merger:
             a, b = self.node(pair[0]), self.node(pair[1])
             if pair in self._verdicts or a is None or b is None:
                 continue
-            verdict = verify(a, b, self._settings.recognition)
+            verdict = verify(a, b, self._settings.verification)
             self._verdicts[pair] = verdict
             self.counters.verified += 1
             self.counters.recognised += isinstance(verdict, Link)

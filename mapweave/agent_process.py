@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
+from agent.replication import Replicator
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
@@ -16,7 +17,6 @@ from agent.fleet import FleetLink
 from agent.journal import Journal
 from agent.mission import Idle, Mission
 from agent.pipeline import Pipeline, PipelineSettings, Step
-from agent.replication import Replicator
 from agent.runner import Runner
 from wire.keys import Keys
 from wire.mapfile import MapFile, write_map_file
@@ -103,7 +103,7 @@ def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options:
         )
 
 
-class _progress:  # noqa: N801 - used as a function
+class _progress:
     """Progress of a run: with a bar where the end is known, else a line when something changes."""
 
     def __init__(self, console: Console, options: AgentOptions) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from hybridmap.node import Edge, EdgeKind, NodeId
 from hybridmap.pose import Array, Pose2
+from sim.floorplan import FloorPlan
 
 COLOURS = ("#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0", "#b8860b", "#555555")
 
@@ -64,6 +65,12 @@ class MapPicture:
     outline: Outline = field(default_factory=Outline)
     drive: Drive | None = None
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+def outline_of(plan: FloorPlan) -> Outline:
+    """The outline of a simulated building."""
+    rooms = tuple((r.name if not r.name.startswith("door") else "", r.corners) for r in plan.rooms)
+    return Outline(rooms, tuple(box.corners for box in (*plan.walls, *plan.furniture)))
 
 
 def draw_map(picture: MapPicture, path: Path) -> None:

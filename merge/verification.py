@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import zlib
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +13,23 @@ from hybridmap.recognition import Recognition, RecognitionSettings, examine_node
 from merge.links import Link, RefusedLink
 
 
-def verify(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Link | RefusedLink:
+@dataclass(frozen=True)
+class VerificationSettings:
+    """When two nodes are linked.
+
+    Attributes:
+        recognition: when they count as the same place.
+        most_sigma_xy: largest standard deviation of their relative position, m. A link that may be off by
+            half a metre joins nothing that a robot could drive.
+        most_sigma_heading: likewise of the heading, rad.
+    """
+
+    recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
+    most_sigma_xy: float = 0.16
+    most_sigma_heading: float = 0.05
+
+
+def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Link | RefusedLink:
     """Compare two nodes.
 
     The answer depends on the two nodes alone: they are put in the order of their ids, and the random draws
@@ -20,15 +38,21 @@ def verify(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Lin
     Args:
         a: one node.
         b: another one.
-        settings: when two nodes count as the same place.
+        settings: when they are linked.
 
     Returns:
         A link, or why there is none.
     """
+    s = settings or VerificationSettings()
     if b.id < a.id:
         a, b = b, a
     rng = np.random.default_rng(zlib.crc32(f"{a.id} {b.id}".encode()))
-    verdict = examine_nodes(a, b, settings, rng)
+    verdict = examine_nodes(a, b, s.recognition, rng)
     if isinstance(verdict, Recognition):
+        sigma_xy, sigma_heading = verdict.evidence["sigma_xy"], verdict.evidence["sigma_heading"]
+        if sigma_xy > s.most_sigma_xy or sigma_heading > s.most_sigma_heading:
+            degrees = math.degrees(sigma_heading)
+            reason = f"the same place, but known to {sigma_xy:.2f} m and {degrees:.1f} deg only"
+            return RefusedLink(a.id, b.id, reason)
         return Link(a.id, b.id, verdict.node_from_robot, verdict.pairs, verdict.evidence)
     return RefusedLink(a.id, b.id, verdict.reason)

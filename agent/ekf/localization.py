@@ -212,6 +212,11 @@ class LocalizationFilter:
         self._keep(ahead & self._anchorable(self._state.rays))
 
     @property
+    def state(self) -> NodeState:
+        """The whole state, a value: for figures and tests."""
+        return self._state
+
+    @property
     def pose(self) -> PoseGaussian:
         """`node_from_robot`."""
         return self._state.pose

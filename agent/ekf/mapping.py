@@ -211,6 +211,11 @@ class MappingFilter:
             self._step = self._step.kept(keep) if self._step is not None else None
 
     @property
+    def state(self) -> MovingState:
+        """The whole state, a value: for figures and tests."""
+        return self._state
+
+    @property
     def pose(self) -> PoseGaussian:
         """`anchor_from_robot`."""
         return self._state.pose

@@ -28,7 +28,7 @@ class TrackerSettings:
             of noise included, about 1 for a webcam) a point would slide along an edge, and is lost.
     """
 
-    window_px: int = 15
+    window_px: int = 11
     levels: int = 2
     backward_px: float = 0.8
     border_px: float = 4.0

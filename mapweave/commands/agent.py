@@ -25,7 +25,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--mission", choices=["idle", "explore"], default="explore", help="what to do at the start"
     )
-    parser.add_argument("--data", type=Path, default=Path("out/agent"), help="folder for the robot's map")
+    parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
     parser.add_argument("--epoch", type=int, help="number of the new map (default: from the clock)")
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
@@ -37,9 +37,9 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
-    from mapweave.agent_process import AgentOptions, run_agent
     from agent.drivers.remote import RemoteRobot
     from agent.mission import Explore, Idle
+    from mapweave.agent_process import AgentOptions, run_agent
 
     name = check_name(arguments.name)
     settings = settings_of(arguments)

@@ -1,0 +1,54 @@
+"""`mapweave demo`: everything at once, in simulation."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "demo",
+        help="three robots, one map, one lost robot found",
+        description="Start a map server, a simulator and several agents as processes. Each robot explores and "
+        "maps its part of an office; the server merges the maps; then one robot is kidnapped, asks where it is, "
+        "and drives to a node that another robot mapped. Exit status 0: it arrived; 2: it did not.",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="other seeds, other worlds (default: 0)")
+    parser.add_argument("--robots", type=int, default=3, help="how many (default: 3)")
+    parser.add_argument("--rooms", type=int, default=3, help="rooms along the corridor (default: 3)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/demo"), help="folder for map.png, report.json ..."
+    )
+    parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the demo and print what came of it."""
+    from rich.console import Console
+
+    from mapweave.demo.options import DemoOptions
+    from mapweave.demo.run import run_demo
+    from mapweave.demo.show import summary_table
+
+    options = DemoOptions(
+        seed=arguments.seed,
+        robots=arguments.robots,
+        rooms=arguments.rooms,
+        out=arguments.out,
+        quiet=arguments.json,
+    )
+    report = run_demo(options)
+    if arguments.json:
+        print(json.dumps(report.as_dict()))
+    else:
+        console = Console()
+        console.print(summary_table(report))
+        console.print(
+            f"in {arguments.out}: map.png, report.json, merged.mapweave, and a map file of each robot"
+        )
+    return 0 if report.goal.reached else 2
