@@ -2,7 +2,8 @@
 
 The loop only hands changes over. One thread does the rest, in this order: commit to the journal, publish
 best-effort, and let servers pull whatever got lost. What makes that lossless is not the publishing but the
-beacon, which tells servers how long the log is, and the log itself, which answers for any range.
+beacon, which tells servers how long the log is, and the log itself, which answers for any range. That goes
+for every map in the journal: one that was left for a fresh map before a server had it is still handed over.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from agent.journal import Draft, Journal
+from agent.log_state import LogState
 from hybridmap.change import ChangeBody
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from hybridmap.node import MapId, check_name
 from wire.bus import Bus, Request, Sample
 from wire.codec import wrap_body
 from wire.keys import Keys
-from wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark
+from wire.log_messages import MAX_ROWS, Ack, LogAnswer, LogRequest, Mark
 
 log = logging.getLogger(__name__)
 
@@ -31,12 +33,15 @@ class ReplicationSettings:
     """How changes are carried.
 
     Attributes:
-        beacon_interval: between two beacons, s.
+        beacon_interval: between two beacons of a map of which servers lack something, s.
+        settled_beacons: of so many beacons, an older map that is complete sends one; a server that is new
+            learns of it so.
         answer_bytes: a log answer ends after so many bytes, since a link may be slow.
         retry_interval: after a failed commit (disk full), s.
     """
 
     beacon_interval: float = 0.5
+    settled_beacons: int = 20
     answer_bytes: int = 1 << 20
     retry_interval: float = 1.0
 
@@ -46,9 +51,9 @@ class ReplicationStatus:
     """For the status line.
 
     Attributes:
-        newest: sequence number of the newest committed change.
+        newest: sequence number of the newest committed change of the map that is being made.
         waiting: changes that are not yet on the own disk.
-        unacknowledged: committed changes that are not on every required server's disk.
+        unacknowledged: committed changes, of all maps, that are not on every required server's disk.
         bytes_sent: of changes, published or pulled.
         since_ack: seconds since a server last acknowledged something; infinite if none has.
         refused: changes that a server has refused for good.
@@ -65,7 +70,7 @@ class ReplicationStatus:
 
 
 class Replicator:
-    """Replicates one map's log."""
+    """Replicates the logs of one agent; changes are added to one of them."""
 
     def __init__(
         self,
@@ -82,7 +87,7 @@ class Replicator:
             bus: the connection; may be down.
             keys: of the fleet.
             journal: where changes are committed.
-            map_id: which of the journal's maps; it must be open.
+            map_id: the map that is being made; it must be open.
             servers: which must have a change before it counts as acknowledged. Without any, one server that
                 has acknowledged will do.
             settings: how.
@@ -96,28 +101,26 @@ class Replicator:
         self._map = map_id
         self._servers = tuple(check_name(server) for server in servers)
         self._settings = settings or ReplicationSettings()
-        self._log_id = journal.log_id(map_id)
         self._changed = threading.Condition()
-        self._newest = journal.head(map_id)
-        self._acknowledged = journal.acknowledged(map_id)
+        self._current = LogState.of(journal, map_id)
+        self._logs = {one: LogState.of(journal, one) for one in journal.maps()} | {map_id: self._current}
         self._submitted = 0
         self._committed = 0
         self._bytes_sent = 0
         self._last_ack: float | None = None
-        self._refusals: dict[tuple[str, int], str] = {}
         self._disk_failure = ""
-        self._log_failure = ""
         # Only the thread touches these.
         self._pending: list[Draft] = []
         self._retry_at = 0.0
-        if self._servers:
-            journal.prune(map_id, self._servers)
+        self._beacons = 0
+        for one in self._logs:
+            journal.prune(one, self._servers)
         self._work: queue.SimpleQueue[list[Draft] | Sample | Request | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
         self._declared = [
             bus.subscribe(keys.acks(map_id.agent), self._work.put),
-            bus.serve(keys.log(map_id), self._work.put),
+            bus.serve(keys.logs(map_id.agent), self._work.put),
         ]
 
     def submit(self, bodies: Iterable[ChangeBody], stamp_ns: int) -> None:
@@ -141,11 +144,11 @@ class Replicator:
             return self._changed.wait_for(lambda: self._committed >= goal, timeout)
 
     def wait_acknowledged(self, timeout: float) -> bool:
-        """Wait until all that was submitted is on every required server's disk; False if time is over."""
+        """Wait until every map is on every required server's disk; False if the time is over first."""
         with self._changed:
             goal = self._submitted
             return self._changed.wait_for(
-                lambda: self._committed >= goal and self._settled() >= self._newest, timeout
+                lambda: self._committed >= goal and self._unacknowledged() == 0, timeout
             )
 
     def status(self) -> ReplicationStatus:
@@ -153,19 +156,19 @@ class Replicator:
         with self._changed:
             since = float("inf") if self._last_ack is None else time.monotonic() - self._last_ack
             return ReplicationStatus(
-                newest=self._newest,
+                newest=self._current.newest,
                 waiting=self._submitted - self._committed,
-                unacknowledged=max(0, self._newest - self._settled()),
+                unacknowledged=self._unacknowledged(),
                 bytes_sent=self._bytes_sent,
                 since_ack=since,
-                refused=len(self._refusals),
-                failure=self._disk_failure or self._log_failure,
+                refused=sum(len(one.refusals) for one in self._logs.values()),
+                failure=self._disk_failure or self._current.failure,
             )
 
     def refusals(self) -> dict[tuple[str, int], str]:
-        """What servers have refused for good: (server, sequence) to reason."""
+        """What servers have refused for good of the map that is being made: (server, sequence) to reason."""
         with self._changed:
-            return dict(self._refusals)
+            return dict(self._current.refusals)
 
     def close(self) -> None:
         """Commit what was submitted and stop. Twice is no error."""
@@ -174,10 +177,8 @@ class Replicator:
         self._work.put(None)
         self._thread.join()
 
-    def _settled(self) -> int:
-        if self._servers:
-            return min(self._acknowledged.get(server, 0) for server in self._servers)
-        return max(self._acknowledged.values(), default=0)
+    def _unacknowledged(self) -> int:
+        return sum(one.unsettled(self._servers) for one in self._logs.values())
 
     def _run(self) -> None:
         next_beacon = time.monotonic()
@@ -204,7 +205,7 @@ class Replicator:
             for question in questions:
                 self._answer(question)
             if now >= next_beacon:
-                self._send_beacon()
+                self._send_beacons()
                 next_beacon = now + self._settings.beacon_interval
         if self._pending:
             log.error("%s: %d changes never reached the disk", self._map, len(self._pending))
@@ -228,18 +229,23 @@ class Replicator:
             return
         encoded = [(first + k, wrap_body(first + k, d.stamp_ns, d.encoded)) for k, d in enumerate(drafts)]
         with self._changed:
-            self._newest = first + len(drafts) - 1
+            self._current.newest = first + len(drafts) - 1
             self._committed += len(drafts)
             self._bytes_sent += sum(len(change) for _, change in encoded)
             self._disk_failure = ""
             self._changed.notify_all()
         for sequence, change in encoded:
-            self._bus.publish(self._keys.change(self._map), change, Mark(sequence, self._log_id).encode())
+            self._bus.publish(self._keys.change(self._map), change, self._mark(sequence))
 
-    def _send_beacon(self) -> None:
-        with self._changed:
-            head = Head(self._log_id, self._newest, dict(self._acknowledged))
-        self._bus.publish(self._keys.head(self._map), head.encode())
+    def _mark(self, sequence: int) -> bytes:
+        return Mark(sequence, self._current.log_id).encode()
+
+    def _send_beacons(self) -> None:
+        everyone = self._beacons % self._settings.settled_beacons == 0
+        self._beacons += 1
+        for one in self._logs.values():
+            if everyone or one is self._current or one.unsettled(self._servers):
+                self._bus.publish(self._keys.head(one.map), one.head().encode())
 
     def _take_ack(self, sample: Sample) -> None:
         try:
@@ -248,39 +254,34 @@ class Replicator:
         except InvalidMessage as error:
             log.warning("%s", error)
             return
-        if ack.map != self._map or ack.log_id != self._log_id:
+        one = self._logs.get(ack.map)
+        if one is None or ack.log_id != one.log_id:
             return
         with self._changed:
-            for refusal in ack.refusals:
-                if (server, refusal.sequence) not in self._refusals:
-                    self._refusals[server, refusal.sequence] = refusal.reason
-                    log.warning("%s refuses %s %d: %s", server, self._map, refusal.sequence, refusal.reason)
-                if refusal.sequence == 0:
-                    self._log_failure = f"{server}: {refusal.reason}"
-            if ack.watermark > self._newest:
-                # This disk was put back to an older state. New changes would take numbers that the server
-                # has seen, and it would drop them as doubles.
-                self._log_failure = f"{server} has more of {self._map} than this disk: begin a fresh map"
-                log.error("%s", self._log_failure)
-                return
-            if ack.watermark <= self._acknowledged.get(server, 0):
-                return
+            news = one.take(server, ack)
+        for line in news:
+            log.warning("%s", line)
+        if not one.acknowledged.get(server, 0) < ack.watermark <= one.newest:
+            return
         try:
-            self._journal.acknowledge(server, self._map, ack.watermark)
+            self._journal.acknowledge(server, one.map, ack.watermark)
         except MapweaveError as error:
             # The server says it again, because the next beacon shows that it was not noted.
             log.warning("%s", error)
             return
         with self._changed:
-            self._acknowledged[server] = ack.watermark
+            one.acknowledged[server] = ack.watermark
             self._last_ack = time.monotonic()
             self._changed.notify_all()
 
     def _answer(self, question: Request) -> None:
         try:
             asked = LogRequest.decode(question.payload)
-            last = min(asked.last, asked.first + MAX_ROWS - 1, self._newest)
-            rows = self._journal.rows(self._map, asked.first, last)
+            one = self._logs.get(self._keys.parse_log(question.key))
+            if one is None:
+                raise InvalidMessage(f"{question.key}: no such log")
+            last = min(asked.last, asked.first + MAX_ROWS - 1, one.newest)
+            rows = self._journal.rows(one.map, asked.first, last)
         except MapweaveError as error:
             question.refuse(str(error))
             return
@@ -291,7 +292,7 @@ class Replicator:
                 # The last one that fits is how far the answer reaches.
                 rows, last = rows[:count], rows[count - 1][0]
                 break
-        answer = LogAnswer(self._log_id, asked.first, max(last, asked.first - 1), tuple(rows))
+        answer = LogAnswer(one.log_id, asked.first, max(last, asked.first - 1), tuple(rows))
         with self._changed:
             self._bytes_sent += sum(len(change) for _, change in rows)
         question.reply(answer.encode())

@@ -74,6 +74,10 @@ class Keys:
         """Where an agent answers for ranges of a map's log."""
         return self._of_map("log", map_id)
 
+    def logs(self, agent: str) -> str:
+        """Pattern: the logs of all maps of an agent."""
+        return f"{self.root}/agent/{check_name(agent)}/log/*"
+
     def agent_alive(self, map_id: MapId) -> str:
         """Under which an agent that makes this map is alive."""
         return self._of_map("alive", map_id)

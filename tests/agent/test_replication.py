@@ -240,7 +240,7 @@ def test_a_server_that_has_more_than_the_disk(
 ) -> None:
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(5)
-    with caplog.at_level(logging.ERROR):
+    with caplog.at_level(logging.WARNING):
         server.acknowledge(agent.log_id, 9)
         eventually(lambda: "begin a fresh map" in agent.replicator.status().failure)
     assert agent.journal.acknowledged(MAP) == {}
@@ -287,6 +287,33 @@ def test_the_log_answers_in_pieces(agent: Agent, server: HandServer) -> None:
         assert answer.covered == answer.changes[-1][0]
         collected += [sequence for sequence, _ in answer.changes]
     assert collected == list(range(1, 601))
+
+
+def test_a_map_that_was_left_is_still_handed_over(hub: MemoryHub, path: Path, server: HandServer) -> None:
+    agent = Agent(hub, path)
+    agent.replicator.submit(bodies(1, 3), 0)
+    agent.close()
+    old_id = agent.log_id
+    bus, journal = MemoryBus(hub), Journal(path, "r0")
+    fresh = journal.open_map(None)
+    server.heads.clear()
+    replicator = Replicator(bus, KEYS, journal, fresh, ("s0",), QUICK)
+    eventually(lambda: Head(old_id, 3) in server.heads[-3:])
+    assert replicator.status().unacknowledged == 3
+    assert [sequence for sequence, _ in server.ask(1, 9).changes] == [1, 2, 3]
+    server.acknowledge(old_id, 3)
+    assert replicator.wait_acknowledged(5)
+    server.heads.clear()
+    eventually(lambda: len(server.heads) > 12)
+    assert sum(head.log_id == old_id for head in server.heads) <= 2, "it is complete: rarely a beacon"
+    replicator.close()
+    bus.close()
+    journal.close()
+
+
+def test_no_log_answers_for_a_map_that_is_not_there(agent: Agent, server: HandServer) -> None:
+    (reply,) = server.bus.ask(KEYS.log(MapId("r0", 9)), LogRequest(1, 2).encode(), 5)
+    assert reply.error.endswith("agent/r0/log/9: no such log")
 
 
 def test_a_restarted_agent_goes_on_and_prunes_what_all_have(

@@ -206,6 +206,14 @@ def test_two_servers_answer_and_the_slow_one_does_not_hide_the_quick(fleet: Flee
     assert sorted(replies, key=lambda r: r.error) == [Reply(payload=b"one"), Reply(error="not today")]
 
 
+def test_one_service_for_a_pattern_knows_which_key_was_asked(fleet: Fleet) -> None:
+    asker, server = fleet.join(), fleet.join()
+    server.serve("agent/r0/log/*", lambda request: request.reply(request.key.encode()))
+    settle(asker, "agent/r0/log/1")
+    assert asker.ask("agent/r0/log/7", b"", 3.0) == [Reply(payload=b"agent/r0/log/7")]
+    assert asker.ask("agent/r1/log/7", b"", 3.0) == []
+
+
 def test_a_server_that_never_answers_does_not_hide_the_other(fleet: Fleet) -> None:
     asker, one, two = fleet.join(), fleet.join(), fleet.join()
     kept: list[Request] = []
