@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -15,6 +14,9 @@ from hybridmap.errors import NotConnected
 from wire.bus import Closing, Reply, Request, Sample
 from wire.dispatch import Dispatcher
 from wire.keyexpr import check_key, check_pattern, intersects, is_key
+from wire.memory_entities import Collector, Declared, MemoryRequest, Service, Subscription, Token, Watcher
+
+_D = TypeVar("_D", bound=Declared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,7 @@ class MemoryHub:
                 if not bus._cut and intersects(subscription.key, sample.key):
                     subscription.deliver(sample)
 
-    def _ask(self, asker: MemoryBus, key: str, payload: bytes, collector: _Collector) -> None:
+    def _ask(self, asker: MemoryBus, key: str, payload: bytes, collector: Collector) -> None:
         with self._lock:
             if asker._cut:
                 return
@@ -123,7 +125,7 @@ class MemoryHub:
                 for service in list(bus._services):
                     if not bus._cut and intersects(service.key, key):
                         asked = key if is_key(key) else service.key
-                        service.deliver(_MemoryRequest(asked, payload, bus, asker, collector))
+                        service.deliver(MemoryRequest(asked, payload, bus, asker, collector))
 
 
 class MemoryBus:
@@ -136,11 +138,11 @@ class MemoryBus:
         self._hub = hub
         self._cut = False
         self._closed = False
-        self._subscriptions: list[_Subscription] = []
-        self._services: list[_Service] = []
-        self._tokens: list[_Token] = []
-        self._watchers: list[_Watcher] = []
-        self._open_requests: set[_MemoryRequest] = set()
+        self._subscriptions: list[Subscription] = []
+        self._services: list[Service] = []
+        self._tokens: list[Token] = []
+        self._watchers: list[Watcher] = []
+        self._open_requests: set[MemoryRequest] = set()
         self._dispatcher = Dispatcher(f"memory-bus-{next(self._numbers)}")
         hub._join(self)
 
@@ -152,27 +154,27 @@ class MemoryBus:
 
     def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
         """Call the handler with each matching message."""
-        return self._add(self._subscriptions, _Subscription(self, check_pattern(pattern), handler))
+        return self._add(self._subscriptions, Subscription(self, check_pattern(pattern), handler))
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
         """Answer questions."""
-        return self._add(self._services, _Service(self, check_pattern(key), handler))
+        return self._add(self._services, Service(self, check_pattern(key), handler))
 
     def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
         check_pattern(key)
-        collector = _Collector()
+        collector = Collector()
         if not self._closed:
             self._hub._ask(self, key, bytes(payload), collector)
         return collector.wait(timeout)
 
     def announce(self, key: str) -> Closing:
         """Be alive under this key."""
-        return self._add(self._tokens, _Token(self, check_key(key)))
+        return self._add(self._tokens, Token(self, check_key(key)))
 
     def watch(self, pattern: str, handler: Callable[[str, bool], None]) -> Closing:
         """Call the handler with who is alive, now and at each change."""
-        return self._add(self._watchers, _Watcher(self, check_pattern(pattern), handler))
+        return self._add(self._watchers, Watcher(self, check_pattern(pattern), handler))
 
     def connected(self) -> bool:
         """True unless the hub has cut this bus or it is closed."""
@@ -200,9 +202,9 @@ class MemoryBus:
         self._hub._change(lambda: declared_of_kind.append(declared))
         return declared
 
-    def _remove(self, declared: _Declared) -> None:
+    def _remove(self, declared: Declared) -> None:
         def remove() -> None:
-            everything: tuple[list[_Declared], ...] = (
+            everything: tuple[list[Declared], ...] = (
                 self._subscriptions,  # type: ignore[assignment]
                 self._services,
                 self._tokens,
@@ -213,129 +215,3 @@ class MemoryBus:
                     kind.remove(declared)
 
         self._hub._change(remove)
-
-
-class _Declared:
-    """Something that a bus has on the hub until it is closed."""
-
-    def __init__(self, bus: MemoryBus, key: str) -> None:
-        self.bus = bus
-        self.key = key
-        self.open = True
-
-    def close(self) -> None:
-        self.open = False
-        self.bus._remove(self)
-
-    def wanted(self) -> bool:
-        return self.open
-
-
-_D = TypeVar("_D", bound=_Declared)
-
-
-class _Token(_Declared):
-    pass
-
-
-class _Subscription(_Declared):
-    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Sample], None]) -> None:
-        super().__init__(bus, key)
-        self._handler = handler
-
-    def deliver(self, sample: Sample) -> None:
-        self.bus._dispatcher.message(self._handler, sample, self.wanted)
-
-
-class _Service(_Declared):
-    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Request], None]) -> None:
-        super().__init__(bus, key)
-        self._handler = handler
-
-    def deliver(self, request: _MemoryRequest) -> None:
-        self.bus._dispatcher.question(self._handler, request, self.wanted)
-
-
-class _Watcher(_Declared):
-    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[str, bool], None]) -> None:
-        super().__init__(bus, key)
-        self._handler = handler
-        self._seen: set[str] = set()
-
-    def see(self, alive: set[str]) -> None:
-        """Tell what is different from what was told before."""
-        for key in sorted(self._seen - alive):
-            self.bus._dispatcher.presence(self._handler, key, False, self.wanted)
-        for key in sorted(alive - self._seen):
-            self.bus._dispatcher.presence(self._handler, key, True, self.wanted)
-        self._seen = alive
-
-
-class _MemoryRequest:
-    """A question on its way to one service."""
-
-    def __init__(
-        self, key: str, payload: bytes, server: MemoryBus, asker: MemoryBus, collector: _Collector
-    ) -> None:
-        self._key = key
-        self._payload = payload
-        self._server = server
-        self._asker = asker
-        self._collector = collector
-        self._answered = False
-        collector.expect()
-        server._open_requests.add(self)
-
-    @property
-    def key(self) -> str:
-        return self._key
-
-    @property
-    def payload(self) -> bytes:
-        return self._payload
-
-    def reply(self, payload: bytes) -> None:
-        self._finish(Reply(payload=bytes(payload)))
-
-    def refuse(self, reason: str) -> None:
-        self._finish(Reply(error=reason or "refused"))
-
-    def abandon(self) -> None:
-        """Nobody will answer: the server has closed."""
-        self._finish(None)
-
-    def _finish(self, reply: Reply | None) -> None:
-        with self._server._hub._lock:
-            if self._answered:
-                return
-            self._answered = True
-            self._server._open_requests.discard(self)
-            lost = self._server._cut or self._asker._cut
-        self._collector.add(None if lost else reply)
-
-
-class _Collector:
-    """Gathers the replies to one question until none is missing."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._missing = 0
-        self._replies: list[Reply] = []
-
-    def expect(self) -> None:
-        with self._changed:
-            self._missing += 1
-
-    def add(self, reply: Reply | None) -> None:
-        with self._changed:
-            self._missing -= 1
-            if reply is not None:
-                self._replies.append(reply)
-            self._changed.notify_all()
-
-    def wait(self, timeout: float) -> list[Reply]:
-        end = time.monotonic() + timeout
-        with self._changed:
-            while self._missing > 0 and (left := end - time.monotonic()) > 0:
-                self._changed.wait(left)
-            return list(self._replies)

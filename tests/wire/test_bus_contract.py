@@ -439,6 +439,7 @@ client = ZenohBus(BusSettings(endpoints=listen))
 client.subscribe("a", print)
 client.serve("b", print)
 router.subscribe("a", print)
+ZenohBus(BusSettings(endpoints=listen)).subscribe("a", print)
 assert client.wait_connected(5)
 router.publish("a", b"")
 """

@@ -1,0 +1,36 @@
+"""Closes at the interpreter's exit what its owner forgot to close."""
+
+from __future__ import annotations
+
+import threading
+
+from wire.bus import Closing
+
+THREAD = "close-at-exit"
+_lock = threading.Lock()
+_open: set[Closing] = set()
+
+
+def remember(one: Closing) -> None:
+    """Close this at the exit, unless it is closed or gone by then."""
+    with _lock:
+        if not any(thread.name == THREAD for thread in threading.enumerate()):
+            threading.Thread(target=_close_at_exit, name=THREAD, daemon=False).start()
+        _open.add(one)
+
+
+def forget(one: Closing) -> None:
+    """It was closed."""
+    _open.discard(one)
+
+
+def _close_at_exit() -> None:
+    """Wait for the main thread's end, then close.
+
+    An open Zenoh session keeps threads that the interpreter waits for before it calls anything registered
+    with atexit, so that would be too late. And this thread is no daemon, because the interpreter must not end
+    in the middle of closing.
+    """
+    threading.main_thread().join()
+    for one in list(_open):
+        one.close()

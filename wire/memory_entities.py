@@ -1,0 +1,153 @@
+"""What an in-memory bus declares on its hub, and the questions on their way."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from wire.bus import Reply, Request, Sample
+
+if TYPE_CHECKING:
+    from wire.memory import MemoryBus
+
+
+class Declared:
+    """Something that a bus has on the hub until it is closed."""
+
+    def __init__(self, bus: MemoryBus, key: str) -> None:
+        self.bus = bus
+        self.key = key
+        self.open = True
+
+    def close(self) -> None:
+        """Take it back. Twice is no error."""
+        self.open = False
+        self.bus._remove(self)
+
+    def wanted(self) -> bool:
+        """Whether the handler may still be called."""
+        return self.open
+
+
+class Token(Declared):
+    """Be alive under a key."""
+
+
+class Subscription(Declared):
+    """Messages to a handler."""
+
+    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Sample], None]) -> None:
+        super().__init__(bus, key)
+        self._handler = handler
+
+    def deliver(self, sample: Sample) -> None:
+        """A message has come."""
+        self.bus._dispatcher.message(self._handler, sample, self.wanted)
+
+
+class Service(Declared):
+    """Questions to a handler."""
+
+    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[Request], None]) -> None:
+        super().__init__(bus, key)
+        self._handler = handler
+
+    def deliver(self, request: MemoryRequest) -> None:
+        """A question has come."""
+        self.bus._dispatcher.question(self._handler, request, self.wanted)
+
+
+class Watcher(Declared):
+    """Who is alive, to a handler."""
+
+    def __init__(self, bus: MemoryBus, key: str, handler: Callable[[str, bool], None]) -> None:
+        super().__init__(bus, key)
+        self._handler = handler
+        self._seen: set[str] = set()
+
+    def see(self, alive: set[str]) -> None:
+        """Tell what is different from what was told before."""
+        for key in sorted(self._seen - alive):
+            self.bus._dispatcher.presence(self._handler, key, False, self.wanted)
+        for key in sorted(alive - self._seen):
+            self.bus._dispatcher.presence(self._handler, key, True, self.wanted)
+        self._seen = alive
+
+
+class MemoryRequest:
+    """A question on its way to one service."""
+
+    def __init__(
+        self, key: str, payload: bytes, server: MemoryBus, asker: MemoryBus, collector: Collector
+    ) -> None:
+        self._key = key
+        self._payload = payload
+        self._server = server
+        self._asker = asker
+        self._collector = collector
+        self._answered = False
+        collector.expect()
+        server._open_requests.add(self)
+
+    @property
+    def key(self) -> str:
+        """The key that was asked."""
+        return self._key
+
+    @property
+    def payload(self) -> bytes:
+        """What was asked."""
+        return self._payload
+
+    def reply(self, payload: bytes) -> None:
+        """Answer; a second answer is ignored."""
+        self._finish(Reply(payload=bytes(payload)))
+
+    def refuse(self, reason: str) -> None:
+        """Answer with an error; a second answer is ignored."""
+        self._finish(Reply(error=reason or "refused"))
+
+    def abandon(self) -> None:
+        """Nobody will answer: the server has closed."""
+        self._finish(None)
+
+    def _finish(self, reply: Reply | None) -> None:
+        with self._server._hub._lock:
+            if self._answered:
+                return
+            self._answered = True
+            self._server._open_requests.discard(self)
+            lost = self._server._cut or self._asker._cut
+        self._collector.add(None if lost else reply)
+
+
+class Collector:
+    """Gathers the replies to one question until none is missing."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._missing = 0
+        self._replies: list[Reply] = []
+
+    def expect(self) -> None:
+        """One more will answer."""
+        with self._changed:
+            self._missing += 1
+
+    def add(self, reply: Reply | None) -> None:
+        """One has answered, or never will."""
+        with self._changed:
+            self._missing -= 1
+            if reply is not None:
+                self._replies.append(reply)
+            self._changed.notify_all()
+
+    def wait(self, timeout: float) -> list[Reply]:
+        """The answers, as soon as none is missing or the time is over."""
+        end = time.monotonic() + timeout
+        with self._changed:
+            while self._missing > 0 and (left := end - time.monotonic()) > 0:
+                self._changed.wait(left)
+            return list(self._replies)

@@ -1,0 +1,27 @@
+"""The session settings: nothing is found by chance, everything is where the settings say."""
+
+from __future__ import annotations
+
+from wire.bus_settings import BusSettings
+
+
+def session_values(settings: BusSettings) -> dict[str, object]:
+    """Zenoh's configuration, by path."""
+    retry = {
+        "period_init_ms": round(settings.retry_first * 1e3),
+        "period_max_ms": round(settings.retry_longest * 1e3),
+        "period_increase_factor": 2,
+    }
+    return {
+        "mode": settings.mode,
+        "connect/endpoints": list(settings.endpoints) if settings.mode == "client" else [],
+        "listen/endpoints": list(settings.listen) if settings.mode == "router" else [],
+        "connect/retry": retry,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # There is nobody to scout for, so opening a router need not wait half a second for it.
+        "scouting/delay": 1,
+        "transport/link/tx/lease": round(settings.lease * 1e3),
+        "transport/link/tx/queue/size/data": settings.router_queue if settings.mode == "router" else 2,
+        "transport/shared_memory/enabled": False,
+    }

@@ -1,0 +1,186 @@
+"""What a bus declares in a Zenoh session, and the questions that come in."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import zenoh
+
+from wire.bus import Reply, Request, Sample
+from wire.dispatch import Dispatcher
+from wire.keyexpr import is_key
+
+log = logging.getLogger(__name__)
+
+REFUSED = b"refused: "
+"""Marks an error reply that a handler made; all others are Zenoh's own, like its "Timeout"."""
+
+
+@dataclass
+class Owner:
+    """What declared things share with their bus.
+
+    Attributes:
+        dispatcher: on which handlers run. Zenoh's own threads only enqueue there.
+        lock: of `declared`.
+        declared: in the order of declaration.
+        open_requests: questions that nobody has answered yet.
+    """
+
+    dispatcher: Dispatcher
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    declared: list[Declared] = field(default_factory=list)
+    open_requests: set[ZenohRequest] = field(default_factory=set)
+
+
+class Declared:
+    """Something declared on a bus; it is declared in Zenoh as soon as there is a session."""
+
+    def __init__(self, owner: Owner, key: str) -> None:
+        self.key = key
+        self._owner = owner
+        self._open = True
+        self._entity: Any = None
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Declare it in a session that is there now; called with the owner's lock held."""
+        self._entity = self._declare_in(session)
+
+    def _declare_in(self, session: zenoh.Session) -> Any:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Take it back. Twice is no error."""
+        with self._owner.lock:
+            self._open = False
+            if self in self._owner.declared:
+                self._owner.declared.remove(self)
+            entity, self._entity = self._entity, None
+        if entity is not None:
+            entity.undeclare()
+
+    def wanted(self) -> bool:
+        """Whether handlers may still be called."""
+        return self._open
+
+
+class Token(Declared):
+    """Be alive under a key."""
+
+    def _declare_in(self, session: zenoh.Session) -> Any:
+        return session.liveliness().declare_token(self.key)
+
+
+class Subscription(Declared):
+    """Messages to a handler."""
+
+    def __init__(self, owner: Owner, key: str, handler: Callable[[Sample], None]) -> None:
+        super().__init__(owner, key)
+        self._handler = handler
+
+    def _declare_in(self, session: zenoh.Session) -> Any:
+        return session.declare_subscriber(self.key, self._receive)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
+        message = Sample(str(sample.key_expr), sample.payload.to_bytes(), attachment)
+        self._owner.dispatcher.message(self._handler, message, self.wanted)
+
+
+class Service(Declared):
+    """Questions to a handler."""
+
+    def __init__(self, owner: Owner, key: str, handler: Callable[[Request], None]) -> None:
+        super().__init__(owner, key)
+        self._handler = handler
+
+    def _declare_in(self, session: zenoh.Session) -> Any:
+        return session.declare_queryable(self.key, self._receive)
+
+    def _receive(self, query: zenoh.Query) -> None:
+        asked = str(query.key_expr)
+        # A reply goes out on one key that the question's pattern matches: that of the service.
+        key = asked if is_key(asked) else self.key
+        self._owner.dispatcher.question(self._handler, ZenohRequest(self._owner, key, query), self.wanted)
+
+
+class Watcher(Declared):
+    """Who is alive, to a handler."""
+
+    def __init__(self, owner: Owner, key: str, handler: Callable[[str, bool], None]) -> None:
+        super().__init__(owner, key)
+        self._handler = handler
+        self._seen: set[str] = set()
+
+    def _declare_in(self, session: zenoh.Session) -> Any:
+        return session.liveliness().declare_subscriber(self.key, self._receive, history=True)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+        # History and news may both tell of the same token.
+        if alive != (key in self._seen):
+            (self._seen.add if alive else self._seen.discard)(key)
+            self._owner.dispatcher.presence(self._handler, key, alive, self.wanted)
+
+
+class ZenohRequest:
+    """A question. Its query must be dropped after the answer, or the asker waits for the time-out."""
+
+    def __init__(self, owner: Owner, key: str, query: zenoh.Query) -> None:
+        self._owner = owner
+        self._key = key
+        self._payload = query.payload.to_bytes() if query.payload is not None else b""
+        self._query = query
+        self._lock = threading.Lock()
+        self._answered = False
+        owner.open_requests.add(self)
+
+    @property
+    def key(self) -> str:
+        """The key that was asked."""
+        return self._key
+
+    @property
+    def payload(self) -> bytes:
+        """What was asked."""
+        return self._payload
+
+    def reply(self, payload: bytes) -> None:
+        """Answer; a second answer is ignored."""
+        self._finish(lambda: self._query.reply(self._key, payload))
+
+    def refuse(self, reason: str) -> None:
+        """Answer with an error; a second answer is ignored."""
+        self._finish(lambda: self._query.reply_err(REFUSED + (reason or "refused").encode()))
+
+    def abandon(self) -> None:
+        """Nobody will answer: the bus closes."""
+        self._finish(lambda: None)
+
+    def _finish(self, answer: Callable[[], None]) -> None:
+        with self._lock:
+            if self._answered:
+                return
+            self._answered = True
+        try:
+            answer()
+        except zenoh.ZError as error:
+            log.debug("an answer on %s found no way back: %s", self._key, error)
+        finally:
+            self._query.drop()  # type: ignore[no-untyped-call]
+            self._owner.open_requests.discard(self)
+
+
+def read_reply(reply: zenoh.Reply) -> Reply | None:
+    """What a server answered; None for what Zenoh says by itself."""
+    if reply.ok is not None:
+        return Reply(payload=reply.ok.payload.to_bytes())
+    payload = reply.err.payload.to_bytes() if reply.err is not None else b""
+    if not payload.startswith(REFUSED):
+        # Zenoh's own "Timeout": somebody has not answered, which the list shows by its length.
+        return None
+    return Reply(error=payload[len(REFUSED) :].decode(errors="replace"))
