@@ -206,6 +206,14 @@ def test_two_servers_answer_and_the_slow_one_does_not_hide_the_quick(fleet: Flee
     assert sorted(replies, key=lambda r: r.error) == [Reply(payload=b"one"), Reply(error="not today")]
 
 
+def test_two_servers_under_the_same_key_both_answer(fleet: Fleet) -> None:
+    asker, one, two = fleet.join(), fleet.join(), fleet.join()
+    one.serve("ask", lambda request: request.reply(b"one"))
+    two.serve("ask", lambda request: request.reply(b"two"))
+    settle(asker, "ask", servers=2)
+    assert sorted(reply.payload for reply in asker.ask("ask", b"", 3.0)) == [b"one", b"two"]
+
+
 def test_one_service_for_a_pattern_knows_which_key_was_asked(fleet: Fleet) -> None:
     asker, server = fleet.join(), fleet.join()
     server.serve("agent/r0/log/*", lambda request: request.reply(request.key.encode()))
