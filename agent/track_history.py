@@ -44,7 +44,7 @@ class TrackHistory:
         self._pixels.append(pixels.copy())
         if len(self._poses) > self._most:
             for column in (self._poses, self._ids, self._pixels):
-                del column[1::2]  # type: ignore[attr-defined]
+                del column[1::2]
 
     def sightings(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
         """All sightings of some tracks.

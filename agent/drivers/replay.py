@@ -132,7 +132,7 @@ def _natural_order(path: Path) -> tuple[list[int], str]:
 
 def _read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     if not path.exists():
-        return np.arange(count) * 0.1
+        return np.linspace(0.0, 0.1 * (count - 1), count)
     try:
         times = np.array([float(line) for line in path.read_text().split()])
     except (OSError, ValueError) as error:

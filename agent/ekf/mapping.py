@@ -38,6 +38,7 @@ class FilterSettings:
         pixel_sigma: standard deviation of a tracked pixel, px.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
         posture_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
+        slip_sigmas: a step that the image puts further than this from the wheels is taken for a slip.
         slip: sigma of (forward m, turn rad) of a step whose wheels the landmarks refute.
         prior_depth: depth at which a landmark is expected when nothing is known, m.
         prior_spread: sigma of the prior inverse depth, in units of 1 / prior_depth. 1.2 reaches from
@@ -55,6 +56,7 @@ class FilterSettings:
     pixel_sigma: float = 0.7
     wheel_floor: float = 1e-5
     posture_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slip_sigmas: float = 4.0
     slip: tuple[float, float] = (0.1, 0.2)
     prior_depth: float = 2.5
     prior_spread: float = 1.2
@@ -273,6 +275,10 @@ class MappingFilter:
     def _take(self, step: Step) -> None:
         self._step, self._state = step, step.state
 
+    def _residual(self, slots: NDArray[np.intp], slopes: Array) -> tuple[Array, Array]:
+        """(2N,) measured minus expected, and the inverse of its covariance."""
+        return (slopes - self._state.rays[slots, :2]).ravel(), inverse(self._spread(slots))
+
     def _spread(self, slots: NDArray[np.intp]) -> Array:
         """(2N, 2N) joint covariance of the innovations of some landmarks."""
         index = _measured(slots)
@@ -293,19 +299,23 @@ class MappingFilter:
         The image tells better than the wheels by how much the robot has turned, so the step is linearised
         again at what it then seems to have been. Without this each step leaves a second-order error of one
         sign, an expansion of the image that passes for a way forward (docs/decisions/ekf-parametrisation.md).
+        A wheel that has slipped further than its noise allows is believed so much less, in this step only.
         """
         index = _measured(slots)
-        residual = (slopes - self._state.rays[slots, :2]).ravel()
-        information = inverse(self._spread(slots))
+        residual, information = self._residual(slots, slopes)
         for _ in range(self.settings.relinearisations):
             if self._step is None:
                 break
-            likely, at = self._step.likely(index, information @ residual), self._step.at
-            if max(abs(likely.forward - at.forward), abs(likely.turn - at.turn)) < SAME_STEP:
+            errors = self._step.wheel_errors(index, information @ residual)
+            likely, at = self._step.likely(errors), self._step.at
+            beyond = float(np.linalg.norm(errors))
+            if beyond > self.settings.slip_sigmas:
+                self._take(self._step.again(at=likely, wheel_root=beyond * self._step.wheel_root))
+            elif max(abs(likely.forward - at.forward), abs(likely.turn - at.turn)) >= SAME_STEP:
+                self._take(self._step.again(at=likely))
+            else:
                 break
-            self._take(self._step.again(at=likely))
-            residual = (slopes - self._state.rays[slots, :2]).ravel()
-            information = inverse(self._spread(slots))
+            residual, information = self._residual(slots, slopes)
         self._state = self._state.corrected(index, residual, information)
         return float(residual @ information @ residual) / len(residual)
 

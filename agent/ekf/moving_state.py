@@ -149,14 +149,19 @@ class Step:
             self.before, self.measured, root, self.posture_variances, self.mount_forward, at or self.at
         )
 
-    def likely(self, index: NDArray[np.intp], pull: Array) -> Odometry:
-        """What the wheels most likely did, given measurements of some entries of the state after.
+    def wheel_errors(self, index: NDArray[np.intp], pull: Array) -> Array:
+        """(2,) what the two wheels most likely erred by, in sigmas, given measurements of the state after.
 
         Args:
-            index: (K,) which entries.
+            index: (K,) which entries of the state were measured.
             pull: (K,) inverse of the residuals' joint covariance, times the residuals.
         """
-        u = self.wheel_root @ (self.wheel_root.T @ (self.by_input[index].T @ pull))
+        errors: Array = self.wheel_root.T @ (self.by_input[index].T @ pull)
+        return errors
+
+    def likely(self, errors: Array) -> Odometry:
+        """What the robot most likely did if the wheels erred so, (2,) in sigmas."""
+        u = self.wheel_root @ errors
         return Odometry(self.measured.forward + float(u[0]), self.measured.turn + float(u[1]))
 
     def kept(self, mask: NDArray[np.bool_]) -> Step:

@@ -29,8 +29,8 @@ class SiftSettings:
         cells: the image is cut into cells x cells; each may give at most `crowding` times its even share.
         crowding: see cells.
         border_px: features nearer to the image's border are left out, they cannot be tracked.
-        least_texture: the image's mean squared gradient around a feature, in its weakest direction, (grey/px)^2.
-            On an edge it is that of noise alone: such a feature slides along the edge when it is tracked
+        least_texture: the image's mean squared gradient around a feature, in its weakest direction,
+            (grey/px)^2. On an edge it is that of noise alone: such a feature slides along the edge when it is tracked
             (aperture problem), unnoticed by a forward-backward check.
         least_roundness: the same in the weakest direction as a share of that in the strongest.
     """
@@ -77,7 +77,7 @@ class Sift:
         self._lens = lens
         self._settings = settings or SiftSettings()
         # More are asked for than kept, so that the spread has something to choose from.
-        self._detector = cv2.SIFT_create(
+        self._detector = cv2.SIFT.create(
             nfeatures=2 * self._settings.most, contrastThreshold=self._settings.contrast
         )
 

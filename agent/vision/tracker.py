@@ -69,8 +69,9 @@ class Tracker:
         """
         before, self._image = self._image, image
         if before is None or not len(self.ids) or before.shape != image.shape:
-            lost, self.ids, self.raw = self.ids, self.ids[:0], self.raw[:0]
-            return lost
+            everything = self.ids
+            self.clear()
+            return everything
         s = self._settings
         start = self.raw.astype(np.float32)[:, None]
         guess = start.copy()
@@ -96,7 +97,7 @@ class Tracker:
         kept &= np.linalg.norm(back - start[:, 0], axis=1) <= s.backward_px
         kept &= (there >= s.border_px).all(axis=1)
         kept &= (there[:, 0] < width - s.border_px) & (there[:, 1] < height - s.border_px)
-        lost = self.ids[~kept]
+        lost: NDArray[np.int64] = self.ids[~kept]
         self.ids, self.raw = self.ids[kept], there[kept].astype(np.float64)
         return lost
 

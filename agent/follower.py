@@ -1,0 +1,273 @@
+"""Following one route: servo to the nodes in sight, drive to those that are not, park at the last."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.detour import Detour
+from agent.fix import Fix
+from agent.localizer import Localizer, LocalizerSettings
+from agent.observation import Command, Observation, RobotDescription
+from agent.servo.blind import BlindDrive
+from agent.servo.proximity import ranger_points
+from agent.servo.supervisor import Servo
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, wrap_angle
+from hybridmap.query import RouteLeg
+from hybridmap.recognition import recognise
+
+
+@dataclass(frozen=True)
+class FollowerSettings:
+    """How a route is followed.
+
+    Attributes:
+        localizer: tracking and filtering of a node's landmarks.
+        passed: an intermediate node is passed within this distance, m.
+        sight_turn: a node's landmarks are looked for when the robot's heading is within this of it, rad.
+        sight_reach: and the robot within this distance of it, m.
+        look_every: ticks between two looks for the next nodes' landmarks.
+        skip: nodes further along the route that are looked for as well.
+        plausible: a recognition this far from where the robot believes to be is not believed, m.
+        blind: way without any landmark in sight after which the robot must find itself again, m.
+        patience: seconds without getting on before an edge counts as blocked.
+        parking_patience: likewise at the goal.
+        near: within this distance of the goal the last, blind turns are made if it is not in sight, m.
+    """
+
+    localizer: LocalizerSettings = field(default_factory=LocalizerSettings)
+    passed: float = 0.22
+    sight_turn: float = 0.6
+    sight_reach: float = 1.4
+    look_every: int = 4
+    skip: int = 2
+    plausible: float = 0.5
+    blind: float = 1.2
+    patience: float = 6.0
+    parking_patience: float = 30.0
+    near: float = 0.35
+
+
+class Progress(StrEnum):
+    """How far a follower is."""
+
+    DRIVING = "driving along the route"
+    PARKING = "parking at the goal"
+    ARRIVED = "parked at the goal"
+    UNSURE = "no landmark in sight for a while"
+    BLOCKED = "not getting on"
+
+
+class Follower:
+    """Drives one route.
+
+    All postures are relative to the *reference*, the leg whose node the robot's fix is on; the route's
+    relative postures lead from there to the target.
+
+    Attributes:
+        progress: how far it is.
+        detail: in words.
+        fix: where the robot is.
+        leg: index of the leg that is driven to.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        sift: Sift,
+        route: tuple[RouteLeg, ...],
+        fix: Fix,
+        detour: Detour,
+        settings: FollowerSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Start on a route.
+
+        Args:
+            description: of the robot.
+            lens: of its camera.
+            sift: finds features.
+            route: legs; the posture of the first is relative to the node of the fix.
+            fix: where the robot is.
+            detour: drives between nodes.
+            settings: how.
+            rng: for verification.
+        """
+        self.progress = Progress.DRIVING
+        self.detail = ""
+        self.fix = fix
+        self._description = description
+        self._lens = lens
+        self._sift = sift
+        self._route = route
+        self._detour = detour
+        self._settings = settings
+        self._rng = rng
+        self._servo = Servo(description)
+        self._blind_drive = BlindDrive(description)
+        self._start = fix.node
+        self._last = len(route) - 1
+        self._reference = 0
+        if fix.node != route[0].node.id:
+            posture = route[0].previous_from_node.inverse() @ fix.node_from_robot
+            self.fix = Fix(route[0].node.id, posture, None, fix.blind)
+        # The route may begin at a node that the robot does not stand at: then that is the first to reach.
+        self.leg = min(1 if self._off_reference() < settings.passed else 0, self._last)
+        self._tick = 0
+        self._best, self._waited = math.inf, 0.0
+        self._servoing = -1
+        self._approaching = False
+
+    @property
+    def blocked(self) -> tuple[NodeId, NodeId]:
+        """The pair of nodes between which the robot is, or is stuck."""
+        before = self._route[self.leg - 1].node.id if self.leg else self._start
+        return before, self._route[self.leg].node.id
+
+    def step(self, observation: Observation) -> Command:
+        """One tick; `progress` says whether it is the last one."""
+        s = self._settings
+        self._tick += 1
+        self.fix.follow(observation, self._description)
+        if self._tick % s.look_every == 0:
+            self._look_ahead(observation)
+        self._pass_nodes()
+        target = self._target()
+        distance = math.hypot(target.x, target.y)
+        node = self._route[self.leg].node.id
+        self.detail = f"{distance:.2f} m to node {node}, {self._last - self.leg} further"
+        parking = self.leg == self._last
+        self.progress = Progress.DRIVING
+        if self.fix.blind > s.blind and not (parking and distance < s.near):
+            self.progress = Progress.UNSURE
+            return Command()
+        if not self._getting_on(distance, s.parking_patience if parking else s.patience):
+            self.progress = Progress.BLOCKED
+            return Command()
+        return self._drive(target, distance, parking, observation)
+
+    # Driving
+
+    def _drive(self, target: Pose2, distance: float, parking: bool, observation: Observation) -> Command:
+        """Servo if the target's landmarks are in sight, else drive to its position, at the goal blindly."""
+        obstacles = ranger_points(observation.proximity, self._description)
+        localizer = self.fix.localizer
+        if localizer is not None and self._reference == self.leg and (parking or _ahead(target)):
+            points = self._route[self.leg].node.points_in_robot
+            if self._servoing != self.leg:
+                self._servo.start(target, points)
+                self._servoing = self.leg
+            step = self._servo.command(target, points, _mask(localizer, len(points)), obstacles)
+            if parking:
+                self.progress = Progress.PARKING
+                self.detail = f"{step.reason}, {distance * 1000:.0f} mm off"
+                if step.state == "arrived":
+                    self.progress = Progress.ARRIVED
+            if step.state != "stuck":
+                self._approaching = False
+                return step.command
+        self._servoing = -1
+        if not parking or distance > self._settings.near:
+            self._approaching = False
+            command = self._detour.toward(target.inverse())
+            if self._detour.around:
+                self.detail += ", around an obstacle"
+            return command
+        if not self._approaching:
+            self._blind_drive.start(target)
+            self._approaching = True
+        return self._blind_drive.command(target, obstacles).command
+
+    def _getting_on(self, distance: float, patience: float) -> bool:
+        if distance < self._best - 0.03:
+            self._best, self._waited = distance, 0.0
+        self._waited += self._description.tick
+        return self._waited <= patience
+
+    # Nodes ahead
+
+    def _pass_nodes(self) -> None:
+        """Go on to the next node where one is passed, or a later one is in sight already."""
+        before = self.leg
+        if self._reference > self.leg:
+            self.leg = self._reference
+        if self._reference == self.leg < self._last and self._off_reference() < 2 * self._settings.passed:
+            self.leg += 1
+        while self.leg < self._last:
+            target = self._target()
+            if math.hypot(target.x, target.y) >= self._settings.passed:
+                break
+            self.leg += 1
+        if self.leg != before:
+            self._best, self._waited = math.inf, 0.0
+
+    def _look_ahead(self, observation: Observation) -> None:
+        """Look for the landmarks of the nodes ahead, furthest first, and take the first that is found."""
+        s, image = self._settings, observation.image
+        wanted = self._wanted()
+        if image is None or not wanted:
+            return
+        features = self._sift.extract(image)
+        view = features.view(self._description.camera)
+        for index, expected in wanted:
+            node = self._route[index].node
+            found = recognise(node, view, None, self._rng)
+            if found is None:
+                continue
+            if found.node_from_robot.mean.distance(expected) > s.plausible + 0.2 * self.fix.blind:
+                continue
+            same = index == self._reference and self.fix.localizer is not None
+            if same and found.inliers <= len(self.fix.localizer.visible):  # type: ignore[union-attr]
+                continue
+            localizer = Localizer(self._description, self._lens, node, image, features, found, s.localizer)
+            self.fix, self._reference = Fix.of(localizer), index
+            return
+
+    def _wanted(self) -> list[tuple[int, Pose2]]:
+        """Legs whose landmarks may be in view, furthest first, with where the robot should be from each."""
+        s = self._settings
+        first = self._reference + 1 if self.fix.in_sight else 0
+        wanted = []
+        for index in range(min(self.leg + s.skip, self._last), first - 1, -1):
+            expected = self._from_reference(index) @ self.fix.node_from_robot.mean
+            near = math.hypot(expected.x, expected.y) < s.sight_reach
+            if near and abs(wrap_angle(expected.heading)) < s.sight_turn:
+                wanted.append((index, expected))
+        # At the goal more of its landmarks come into view: a fresh look makes the last millimetres better.
+        if self._reference == self._last and self.fix.in_sight and self._tick % (3 * s.look_every) == 0:
+            wanted.append((self._last, self.fix.node_from_robot.mean))
+        return wanted
+
+    def _target(self) -> Pose2:
+        """`target_from_robot`."""
+        return self._from_reference(self.leg) @ self.fix.node_from_robot.mean
+
+    def _from_reference(self, target: int) -> Pose2:
+        """`target_from_reference` along the route's relative postures."""
+        pose = Pose2()
+        for leg in self._route[min(self._reference, target) + 1 : max(self._reference, target) + 1]:
+            pose = pose @ leg.previous_from_node.mean
+        return pose.inverse() if target >= self._reference else pose
+
+    def _off_reference(self) -> float:
+        return math.hypot(self.fix.node_from_robot.mean.x, self.fix.node_from_robot.mean.y)
+
+
+def _ahead(target_from_robot: Pose2) -> bool:
+    """Whether a posture can be servoed to without a manoeuvre: ahead, and facing alike."""
+    there = target_from_robot.inverse()
+    return abs(target_from_robot.heading) < 0.5 and there.x > 0.1 and abs(there.y) < 0.6 * there.x
+
+
+def _mask(localizer: Localizer, count: int) -> NDArray[np.bool_]:
+    mask = np.zeros(count, np.bool_)
+    mask[localizer.visible] = True
+    return mask
