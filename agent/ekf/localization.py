@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from agent.ekf.anchored import rays_of_points, see
 from agent.ekf.gating import pixel_gate
 from agent.ekf.iterated import Measurement, iterated_update
+from agent.ekf.landmarks import NodeLandmarks
 from agent.ekf.motion import WheelNoise, move_posture
 from agent.ekf.node_state import NEAREST_SCALE, NodeState, turning
 from agent.ekf.report import UpdateReport
@@ -63,20 +63,6 @@ class LocalizationSettings:
     widest_sigma: float = 0.5
     widest_slope: float = 4.0
     nearest: float = 0.05
-
-
-class NodeLandmarks(NamedTuple):
-    """Landmarks in a node's robot frame, in columns.
-
-    Attributes:
-        ids: (n,).
-        points: (n, 3) m, in the node's robot frame; NaN where w <= 0, that may as well be at infinity.
-        covariances: (n, 3, 3) m^2, in the node's robot frame, to first order.
-    """
-
-    ids: Ids
-    points: Array
-    covariances: Array
 
 
 class LocalizationFilter:

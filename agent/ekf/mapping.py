@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.anchored import points_of_rays
 from agent.ekf.gating import believe, inverse, pixel_gate
+from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.motion import WheelNoise
 from agent.ekf.moving_state import MovingState, Step
 from agent.ekf.report import UpdateReport
@@ -68,24 +67,6 @@ class FilterSettings:
     converged_share: float = 0.05
     widest_slope: float = 4.0
     nearest: float = 0.05
-
-
-class LandmarkEstimates(NamedTuple):
-    """Landmarks as a filter knows them now, in columns.
-
-    Attributes:
-        ids: (N,) as the front end numbers them.
-        points_in_robot: (N, 3) m, in robot; NaN for landmarks that may as well be at infinity (w <= 0).
-        covariances_in_robot: (N, 3, 3) m^2, in robot, to first order; infinite where the point is NaN.
-        depths: (N,) m along the optical axis from the optical centre; infinite for w <= 0.
-        depth_sigmas: (N,) m, to first order; infinite for w <= 0.
-    """
-
-    ids: Ids
-    points_in_robot: Array
-    covariances_in_robot: Array
-    depths: Array
-    depth_sigmas: Array
 
 
 class MappingFilter:
@@ -247,16 +228,7 @@ class MappingFilter:
 
     def landmarks(self) -> LandmarkEstimates:
         """All landmarks as they are known now."""
-        state = self._state
-        w = state.rays[:, 2]
-        known = w > 0.0
-        depths = np.where(known, 1.0 / np.where(known, w, 1.0), np.inf)
-        blocks = state.blocks
-        sigmas = np.where(known, np.sqrt(blocks[:, 2, 2]) * depths**2, np.inf)
-        points, by_ray = points_of_rays(state.rays, self._camera.mount_forward, self._camera.mount_height)
-        covariances = by_ray @ blocks @ np.swapaxes(by_ray, 1, 2)
-        covariances[~known] = np.inf
-        return LandmarkEstimates(self.ids.copy(), points, covariances, depths, sigmas)
+        return LandmarkEstimates.of_rays(self.ids.copy(), self._state.rays, self._state.blocks, self._camera)
 
     def converged(self) -> NDArray[np.bool_]:
         """(n,) landmarks whose depth is known well enough, in metres."""

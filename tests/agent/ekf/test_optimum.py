@@ -1,0 +1,111 @@
+"""Both filters against an independent batch optimum, and against what they say of their own errors.
+
+The bounds leave room for chance over few runs; `python -m benchmarks.ekf` measures the figures.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from agent.ekf.mapping import FilterSettings, MappingFilter
+from benchmarks.ekf import error, filter_error, follow, landmark_nees
+from benchmarks.ekf_batch import batch_optimum
+from benchmarks.ekf_faults import spoil
+from benchmarks.ekf_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
+
+RUNS = 20
+INTERVAL = chi2.ppf([0.001, 0.999], 3 * RUNS) / RUNS
+"""Of an average NEES with 3 degrees of freedom; a right filter leaves it once in 500 seeds."""
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[tuple[MappingRun, MappingFilter]]:
+    """The paper's 50 s mapping run and its variations, filtered."""
+    drawn = [draw_run(np.random.default_rng([11, k]), SHAPES[k % len(SHAPES)]) for k in range(RUNS)]
+    return [(run, follow(run)) for run in drawn]
+
+
+def everything(run: MappingRun) -> np.ndarray:
+    return np.ones(len(run.points), np.bool_)
+
+
+def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+    ratios = []
+    for run, filter_ in runs[:6]:
+        posture, points = batch_optimum(run, filter_.settings.prior_depth, filter_.settings.prior_spread)
+        best = error(run, filter_.ids, posture, points[filter_.ids])
+        ratios.append(filter_error(run, filter_, everything(run)) / best)
+    assert np.median(ratios) < 1.06
+    assert max(ratios) < 1.25
+
+
+def test_posture_is_as_far_off_as_it_says(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+    """Average NEES in its interval; with each step linearised only where the wheels say, it is 8 to 10."""
+    nees = [filter_.pose.mahalanobis2(run.poses[-1]) for run, filter_ in runs]
+    low, high = INTERVAL
+    assert low < np.mean(nees) < high
+
+
+def test_landmarks_are_as_far_off_as_they_say(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+    low, high = INTERVAL
+    assert low < np.mean([landmark_nees(run, filter_) for run, filter_ in runs]) < high
+
+
+def test_spoiled_tracks_do_not_bend_the_map(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+    ratios = []
+    for k, (run, filter_) in enumerate(runs[:6]):
+        bad, spoiled = spoil(run, 0.3, np.random.default_rng([12, k]))
+        ratios.append(filter_error(bad, follow(bad), ~spoiled) / filter_error(run, filter_, ~spoiled))
+    assert np.median(ratios) < 1.15
+    assert max(ratios) < 2.0
+
+
+def test_spoiled_tracks_are_refused() -> None:
+    """A track that has jumped is refused from then on, and no good one with it."""
+    run = draw_run(np.random.default_rng(3), "line", 200)
+    pixels = run.pixels.copy()
+    pixels[100:, :9] += (12.0, -9.0)
+    filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))
+    filter_.add(np.arange(30), run.pixels[0])
+    believed = []
+    for odometry, seen in zip(run.odometry, pixels[1:], strict=True):
+        filter_.predict(odometry)
+        believed.append(filter_.update(np.arange(30), seen).accepted)
+    seen_after = np.isfinite(pixels[101:, :, 0])
+    after = np.array(believed)[100:]
+    assert not after[:, :9].any()
+    assert after[:, 9:].sum() > 0.99 * seen_after[:, 9:].sum()
+
+
+def test_covariance_is_symmetric_and_positive_after_each_run(
+    runs: list[tuple[MappingRun, MappingFilter]],
+) -> None:
+    for _, filter_ in runs:
+        assert_covariance(filter_.state.covariance)
+
+
+def assert_covariance(covariance: np.ndarray) -> None:
+    assert np.array_equal(covariance, covariance.T)
+    scale = np.sqrt(np.diag(covariance))
+    assert np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] > 0
+
+
+@pytest.mark.slow
+def test_covariance_stays_one_for_ten_thousand_steps() -> None:
+    """Symmetric to the last bit and positive, twenty times the paper's run."""
+    run = draw_run(np.random.default_rng(4), "arc", 335, landmarks=8)
+    filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))
+    ids = np.arange(8)
+    filter_.add(ids, run.pixels[0])
+    rng = np.random.default_rng(5)
+    forth = list(zip(run.odometry, run.poses[1:], strict=True))
+    back = [
+        (type(o)(-o.forward, -o.turn), pose)
+        for o, pose in zip(reversed(run.odometry), reversed(run.poses[:-1]), strict=True)
+    ]
+    exact = {id(pose): run.camera.project(pose.inverse().apply(run.points)) for pose in run.poses}
+    for _ in range(10_000 // 670 + 1):
+        for odometry, pose in forth + back:
+            filter_.predict(odometry)
+            filter_.update(ids, exact[id(pose)] + run.pixel_sigma * rng.normal(size=(8, 2)))
+        assert_covariance(filter_.state.covariance)

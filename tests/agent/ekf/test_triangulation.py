@@ -1,0 +1,88 @@
+"""Triangulation against truth, against scipy on one track, and where there is nothing to triangulate."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from agent.ekf.triangulation import triangulate
+from benchmarks.ekf_run import CAMERA, draw_run
+from hybridmap.camera import Camera
+from hybridmap.errors import InvalidValue
+from hybridmap.pose import Pose2
+
+AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.1)
+
+
+def a_run(camera: Camera = CAMERA, seed: int = 0, landmarks: int = 150):  # type: ignore[no-untyped-def]
+    run = draw_run(np.random.default_rng(seed), "weave", 99, landmarks, pixel_sigma=0.7, camera=camera)
+    return run, np.array([pose.vector for pose in run.poses])
+
+
+@pytest.mark.parametrize("camera", [CAMERA, AHEAD])
+def test_consistent_and_unbiased(camera: Camera) -> None:
+    run, poses = a_run(camera)
+    found = triangulate(poses, run.pixels, camera)
+    truth = run.poses[-1].inverse().apply(run.points)
+    off = (found.rays[:, 2] - 1 / (truth[:, 0] - camera.mount_forward)) / np.sqrt(
+        found.ray_covariances[:, 2, 2]
+    )
+    assert 0.7 < np.mean(off**2) < 1.4
+    assert abs(np.mean(off)) < 0.3
+    assert 0.97 < np.mean(found.chi2) < 1.03
+    np.testing.assert_allclose(found.points_in_robot[:, 0], found.depths + camera.mount_forward)
+
+
+def test_same_as_scipy_on_one_track() -> None:
+    run, poses = a_run(AHEAD, landmarks=8)
+    found = triangulate(poses, run.pixels, AHEAD, reference=poses[0])
+    for i in range(8):
+
+        def residual(point: np.ndarray, track: int = i) -> np.ndarray:
+            seen = np.stack([AHEAD.project(pose.inverse().apply(point)) for pose in run.poses])
+            off = (seen - run.pixels[:, track]) / 0.7
+            return off[np.isfinite(off)]
+
+        best = least_squares(residual, run.points[i], xtol=1e-12, ftol=1e-12)
+        np.testing.assert_allclose(found.points_in_robot[i], best.x, rtol=1e-4, atol=1e-5)
+
+
+def test_reference_frames_agree() -> None:
+    run, poses = a_run()
+    there = triangulate(poses, run.pixels, CAMERA, reference=poses[30]).points_in_robot
+    here = triangulate(poses, run.pixels, CAMERA).points_in_robot
+    moved = (run.poses[-1].inverse() @ run.poses[30]).apply(there)
+    np.testing.assert_allclose(moved, here, rtol=1e-3, atol=1e-3)
+
+
+def test_a_track_that_moves_shows_in_chi2() -> None:
+    run, poses = a_run()
+    pixels = run.pixels.copy()
+    pixels[40:, 3] += np.linspace(0, 30, len(poses) - 40)[:, None]
+    found = triangulate(poses, pixels, CAMERA)
+    assert found.chi2[3] > 4
+    assert (np.delete(found.chi2, 3) < 2).all()
+
+
+def test_pure_rotation_tells_no_depth() -> None:
+    poses = np.column_stack([np.zeros((30, 2)), np.linspace(-0.2, 0.2, 30)])
+    points = np.array([[3.0, 0.2, 0.4], [2.0, -0.3, 0.1]])
+    rng = np.random.default_rng(0)
+    seen = np.stack([CAMERA.project(Pose2.from_vector(p).inverse().apply(points)) for p in poses])
+    found = triangulate(poses, seen + 0.7 * rng.normal(size=seen.shape), CAMERA)
+    assert (found.depth_sigmas > 100).all()
+
+
+def test_tracks_seen_once_or_never_are_nan() -> None:
+    run, poses = a_run()
+    pixels = run.pixels.copy()
+    pixels[:, 0] = np.nan
+    pixels[1:, 1] = np.nan
+    found = triangulate(poses, pixels, CAMERA)
+    assert np.isnan(found.depths[:2]).all()
+    assert np.isfinite(found.depths[2:]).all()
+    assert found.seen[1] == 1
+
+
+def test_shapes_are_checked() -> None:
+    with pytest.raises(InvalidValue):
+        triangulate(np.zeros((3, 3)), np.zeros((4, 5, 2)), CAMERA)
