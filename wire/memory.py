@@ -142,6 +142,7 @@ class MemoryBus:
         self._services: list[Service] = []
         self._tokens: list[Token] = []
         self._watchers: list[Watcher] = []
+        self._open_questions: set[Collector] = set()
         self._open_requests: set[MemoryRequest] = set()
         self._dispatcher = Dispatcher(f"memory-bus-{next(self._numbers)}")
         hub._join(self)
@@ -164,9 +165,13 @@ class MemoryBus:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
         check_pattern(key)
         collector = Collector()
+        self._open_questions.add(collector)
         if not self._closed:
             self._hub._ask(self, key, bytes(payload), collector)
-        return collector.wait(timeout)
+        try:
+            return collector.wait(timeout)
+        finally:
+            self._open_questions.discard(collector)
 
     def announce(self, key: str) -> Closing:
         """Be alive under this key."""
@@ -193,6 +198,8 @@ class MemoryBus:
         self._dispatcher.close()
         with self._hub._lock:
             abandoned = list(self._open_requests)
+        for question in list(self._open_questions):
+            question.end()
         for request in abandoned:
             request.abandon()
 

@@ -144,6 +144,12 @@ class Collector:
                 self._replies.append(reply)
             self._changed.notify_all()
 
+    def end(self) -> None:
+        """Nobody waits for more."""
+        with self._changed:
+            self._missing = 0
+            self._changed.notify_all()
+
     def wait(self, timeout: float) -> list[Reply]:
         """The answers, as soon as none is missing or the time is over."""
         end = time.monotonic() + timeout

@@ -11,7 +11,8 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 import zenoh
@@ -45,6 +46,8 @@ class ZenohBus:
         self._settings = settings or BusSettings()
         self._closed = threading.Event()
         self._session: zenoh.Session | None = None
+        self._in_use = 0
+        self._in_use_changed = threading.Condition()
         self._connecting = threading.Thread(target=self._connect, name="zenoh-connect", daemon=True)
         if self._settings.mode == "router":
             self._session = _open_router(self._settings)
@@ -56,14 +59,14 @@ class ZenohBus:
     def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
         """Send best-effort. Without a connection the message is lost."""
         check_key(key)
-        session = self._session
-        if session is None:
-            return
-        try:
-            session.put(key, payload, attachment=attachment or None)
-        except zenoh.ZError:
-            # The session was closed between the look and the put: the same as no connection.
-            log.debug("put on %s after the session was closed", key)
+        with self._using_session() as session:
+            if session is None:
+                return
+            try:
+                session.put(key, payload, attachment=attachment or None)
+            except zenoh.ZError:
+                # The session was closed between the look and the put: the same as no connection.
+                log.debug("put on %s after the session was closed", key)
 
     def subscribe(self, pattern: str, handler: Callable[[Sample], None]) -> Closing:
         """Call the handler with each matching message."""
@@ -76,24 +79,24 @@ class ZenohBus:
     def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
         check_pattern(key)
-        session = self._session
-        if session is None:
-            return []
-        try:
-            # Every server is asked, and each answer comes as soon as it is there: the default consolidation
-            # holds a quick answer back until the slowest server's.
-            replies = list(
-                session.get(
-                    key,
-                    payload=payload,
-                    timeout=timeout,
-                    target=zenoh.QueryTarget.ALL,
-                    consolidation=zenoh.ConsolidationMode.NONE,
+        with self._using_session() as session:
+            if session is None:
+                return []
+            try:
+                # Every server is asked and every answer kept: the default consolidation holds a quick answer
+                # back until the slowest server's, and takes two answers on one key for one.
+                replies = list(
+                    session.get(
+                        key,
+                        payload=payload,
+                        timeout=timeout,
+                        target=zenoh.QueryTarget.ALL,
+                        consolidation=zenoh.ConsolidationMode.NONE,
+                    )
                 )
-            )
-        except zenoh.ZError as error:
-            log.debug("asking %s failed: %s", key, error)
-            return []
+            except zenoh.ZError as error:
+                log.debug("asking %s failed: %s", key, error)
+                return []
         return [reply for reply in map(read_reply, replies) if reply is not None]
 
     def announce(self, key: str) -> Closing:
@@ -140,7 +143,27 @@ class ZenohBus:
             one.close()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
+        with self._in_use_changed:
+            self._in_use_changed.wait_for(lambda: self._in_use == 0)
         exit_closing.forget(self)
+
+    @contextmanager
+    def _using_session(self) -> Iterator[zenoh.Session | None]:
+        """The session, if there is one; `close` waits until its users are done.
+
+        The interpreter kills a daemon thread that it finds inside Zenoh at its exit, and Rust answers that by
+        aborting the process.
+        """
+        with self._in_use_changed:
+            session = self._session
+            self._in_use += session is not None
+        try:
+            yield session
+        finally:
+            if session is not None:
+                with self._in_use_changed:
+                    self._in_use -= 1
+                    self._in_use_changed.notify_all()
 
     def _declare(self, declared: _D) -> _D:
         with self._owner.lock:

@@ -10,6 +10,7 @@ from typing import Any
 
 import zenoh
 
+from hybridmap.errors import NotConnected
 from wire.bus import Reply, Request, Sample
 from wire.dispatch import Dispatcher
 from wire.keyexpr import is_key
@@ -47,8 +48,26 @@ class Declared:
         self._entity: Any = None
 
     def declare(self, session: zenoh.Session) -> None:
-        """Declare it in a session that is there now; called with the owner's lock held."""
-        self._entity = self._declare_in(session)
+        """Declare it in a session that is there now; called with the owner's lock held.
+
+        Zenoh calls back on a Python thread, which inherits whether it is a daemon from the thread that
+        declares. A daemon would be killed inside Zenoh at the interpreter's exit, and Rust answers that by
+        aborting the process: so a thread that is none declares.
+        """
+        outcome: list[Any] = []
+
+        def declare() -> None:
+            try:
+                outcome.append(self._declare_in(session))
+            except zenoh.ZError as error:
+                outcome.append(error)
+
+        ordinary = threading.Thread(target=declare, name="zenoh-declare", daemon=False)
+        ordinary.start()
+        ordinary.join()
+        if isinstance(outcome[0], zenoh.ZError):
+            raise NotConnected(f"{self.key}: {outcome[0]}")
+        self._entity = outcome[0]
 
     def _declare_in(self, session: zenoh.Session) -> Any:
         raise NotImplementedError

@@ -371,6 +371,21 @@ def test_a_question_whose_server_closes_does_not_wait_for_the_time_out(fleet: Fl
     assert answer == [[]]
 
 
+def test_closing_a_bus_ends_its_own_questions(fleet: Fleet) -> None:
+    asker, server = fleet.join(), fleet.join()
+    kept: list[Request] = []
+    answer: list[list[Reply]] = []
+    server.serve("q", kept.append)
+    eventually(lambda: asker.ask("q", b"", 0.05) or kept)
+    held = len(kept)
+    thread = threading.Thread(target=lambda: answer.append(asker.ask("q", b"", 20.0)))
+    thread.start()
+    eventually(lambda: len(kept) > held)
+    asker.close()
+    thread.join(timeout=5)
+    assert answer == [[]]
+
+
 def test_without_a_connection_nothing_blocks_and_all_comes_back(fleet: Fleet) -> None:
     one, two = fleet.join(), fleet.join()
     got = subscribe(two, one, "a")
@@ -437,19 +452,35 @@ def test_zenoh_a_taken_port_is_one_clear_line() -> None:
         first.close()
 
 
-def test_zenoh_a_forgotten_bus_does_not_hang_the_exit() -> None:
+@pytest.mark.parametrize("declaring_thread_is_daemon", [False, True])
+@pytest.mark.parametrize("closes", [False, True])
+def test_zenoh_the_interpreter_exits_cleanly(declaring_thread_is_daemon: bool, closes: bool) -> None:
+    """Whether the bus is closed or forgotten, declared from a daemon thread or not, with a question open."""
     program = f"""
+import threading, time
 from wire.bus_settings import BusSettings
 from wire.zenoh_bus import ZenohBus
 listen = ("tcp/127.0.0.1:{free_port()}",)
 router = ZenohBus(BusSettings(mode="router", listen=listen))
 client = ZenohBus(BusSettings(endpoints=listen))
-client.subscribe("a", print)
-client.serve("b", print)
-router.subscribe("a", print)
-ZenohBus(BusSettings(endpoints=listen)).subscribe("a", print)
+kept = []
+def declare():
+    client.subscribe("a", lambda sample: None)
+    client.serve("b", kept.append)
+    router.subscribe("a", lambda sample: None)
+    ZenohBus(BusSettings(endpoints=listen)).subscribe("a", lambda sample: None)
 assert client.wait_connected(5)
-router.publish("a", b"")
+declaring = threading.Thread(target=declare, daemon={declaring_thread_is_daemon})
+declaring.start()
+declaring.join()
+assert [t for t in threading.enumerate() if "pyo3" in t.name and t.daemon] == []
+threading.Thread(target=lambda: router.ask("b", b"", 20), daemon=True).start()
+while not kept:
+    router.publish("a", b"")
+    time.sleep(0.001)
+if {closes}:
+    client.close()
+    router.close()
 """
     finished = subprocess.run([sys.executable, "-c", program], timeout=20, capture_output=True, text=True)
-    assert finished.returncode == 0, finished.stderr
+    assert (finished.returncode, finished.stderr) == (0, "")
