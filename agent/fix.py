@@ -9,7 +9,7 @@ from agent.observation import Observation, RobotDescription
 from hybridmap.node import NodeId
 from hybridmap.pose import PoseGaussian
 
-TURN_SHARE = 0.3
+TURN_SHARE = 0.15
 """m/rad; a turn without landmarks in sight makes the robot as unsure as this way does."""
 
 

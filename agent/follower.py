@@ -21,7 +21,7 @@ from agent.vision.sift import Sift
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import RouteLeg
-from hybridmap.recognition import recognise
+from hybridmap.recognition import RecognitionSettings, recognise
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,13 @@ class FollowerSettings:
         sight_reach: and the robot within this distance of it, m.
         look_every: ticks between two looks for the next nodes' landmarks.
         skip: nodes further along the route that are looked for as well.
-        plausible: a recognition this far from where the robot believes to be is not believed, m.
+        recognition: when a node ahead counts as recognised. Less is asked than of a lost robot, because the
+            posture must also be the expected one.
+        plausible: a recognition this far from where the robot believes to be is not believed, m; further
+            by as much again for each metre driven blind.
+        plausible_turn: likewise, rad.
         blind: way without any landmark in sight after which the robot must find itself again, m.
+        hidden: seconds at the goal without its landmarks in sight after which it is not there, s.
         patience: seconds without getting on before an edge counts as blocked.
         parking_patience: likewise at the goal.
         near: within this distance of the goal the last, blind turns are made if it is not in sight, m.
@@ -48,8 +53,15 @@ class FollowerSettings:
     sight_reach: float = 1.4
     look_every: int = 4
     skip: int = 2
-    plausible: float = 0.5
-    blind: float = 1.2
+    recognition: RecognitionSettings = field(
+        default_factory=lambda: RecognitionSettings(
+            least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0
+        )
+    )
+    plausible: float = 0.3
+    plausible_turn: float = 0.25
+    blind: float = 2.0
+    hidden: float = 2.0
     patience: float = 6.0
     parking_patience: float = 30.0
     near: float = 0.35
@@ -125,6 +137,7 @@ class Follower:
         self._best, self._waited = math.inf, 0.0
         self._servoing = -1
         self._approaching = False
+        self._hidden = 0.0
 
     @property
     def blocked(self) -> tuple[NodeId, NodeId]:
@@ -184,7 +197,11 @@ class Follower:
         if not self._approaching:
             self._blind_drive.start(target)
             self._approaching = True
-        return self._blind_drive.command(target, obstacles).command
+        step = self._blind_drive.command(target, obstacles)
+        self._hidden = self._hidden + self._description.tick if step.state == "arrived" else 0.0
+        if self._hidden > self._settings.hidden:
+            self.progress = Progress.UNSURE
+        return step.command
 
     def _getting_on(self, distance: float, patience: float) -> bool:
         if distance < self._best - 0.03:
@@ -219,10 +236,8 @@ class Follower:
         view = features.view(self._description.camera)
         for index, expected in wanted:
             node = self._route[index].node
-            found = recognise(node, view, None, self._rng)
-            if found is None:
-                continue
-            if found.node_from_robot.mean.distance(expected) > s.plausible + 0.2 * self.fix.blind:
+            found = recognise(node, view, s.recognition, self._rng)
+            if found is None or not self._plausible(found.node_from_robot.mean, expected):
                 continue
             same = index == self._reference and self.fix.localizer is not None
             if same and found.inliers <= len(self.fix.localizer.visible):  # type: ignore[union-attr]
@@ -230,6 +245,13 @@ class Follower:
             localizer = Localizer(self._description, self._lens, node, image, features, found, s.localizer)
             self.fix, self._reference = Fix.of(localizer), index
             return
+
+    def _plausible(self, found: Pose2, expected: Pose2) -> bool:
+        """Whether the robot may be there, by what it believes."""
+        s = self._settings
+        doubt = 1.0 + self.fix.blind
+        turned = abs(wrap_angle(found.heading - expected.heading))
+        return found.distance(expected) <= s.plausible * doubt and turned <= s.plausible_turn * doubt
 
     def _wanted(self) -> list[tuple[int, Pose2]]:
         """Legs whose landmarks may be in view, furthest first, with where the robot should be from each."""

@@ -34,7 +34,8 @@ class NavigatorSettings:
         look_turn: between two looks of a lost robot, rad.
         turn_rate: of that turn, rad/s.
         least_features: a view with fewer is not worth a question.
-        sure: standard deviations up to which a lost robot believes a recognition, m and rad.
+        sure: standard deviations up to which a lost robot believes a recognition at once, m and rad; the
+            longer it has looked around, the less it asks for: twice as much after a whole turn.
         answer_patience: ticks that an answer may take before the question counts as lost.
         pause: seconds before a lost robot without a route asks again.
     """
@@ -44,7 +45,7 @@ class NavigatorSettings:
     look_turn: float = 0.5
     turn_rate: float = 0.6
     least_features: int = 8
-    sure: tuple[float, float] = (0.06, 0.03)
+    sure: tuple[float, float] = (0.03, 0.018)
     answer_patience: int = 100
     pause: float = 2.0
 
@@ -100,6 +101,7 @@ class Navigator:
         self._next_question = 1
         self._blocked: list[tuple[NodeId, NodeId]] = []
         self._following = False
+        self._looked = 0.0
         self._behaviour = self._go()
 
     @property
@@ -138,11 +140,13 @@ class Navigator:
     def _look_around(self) -> Behaviour:
         """Look, ask, turn a little, until somebody knows the view."""
         self.stage, self.detail = Stage.LOST, "looking"
+        self._looked = 0.0
         while True:
             yield from self._wait(0.2)
             if (yield from self._relocalize()):
                 return
             yield from self._turn(self._settings.look_turn)
+            self._looked += self._settings.look_turn
 
     def _relocalize(self) -> Generator[Command, None, bool]:
         """Recognise the current view on the own map, else ask the fleet's; sets `fix` if it is known."""
@@ -222,7 +226,8 @@ class Navigator:
         """Whether a recognition is exact enough to drive by; else another look, elsewhere, costs little."""
         sigma = np.sqrt(np.diag(posture.covariance))
         position, heading = self._settings.sure
-        return bool(max(sigma[0], sigma[1]) <= position and sigma[2] <= heading)
+        leniency = 1.0 + self._looked / math.tau
+        return bool(max(sigma[:2]) <= position * leniency and sigma[2] <= heading * leniency)
 
     def _ask(self, question: Question) -> Generator[Command, None, Answer]:
         self._questions.append(question)

@@ -19,11 +19,13 @@ class RecallSettings:
 
     Attributes:
         tries: nodes that are verified, by descending votes.
+        least_inliers: landmarks that must agree: one node speaks alone here, and the map is small.
         votes: a node with fewer votes is not tried.
     """
 
     tries: int = 5
     votes: int = 6
+    least_inliers: int = 24
 
 
 def recall(
@@ -56,6 +58,8 @@ def recall(
         if votes[index] < settings.votes:
             break
         found = recognise(nodes[index], view, None, rng)
-        if found is not None and (best is None or found.inliers > best[1].inliers):
+        if found is None or found.inliers < settings.least_inliers:
+            continue
+        if best is None or found.inliers > best[1].inliers:
             best = (nodes[index], found)
     return best

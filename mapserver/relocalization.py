@@ -35,6 +35,8 @@ class RelocalizationSettings:
         gate: chi-square with 3 degrees of freedom within which two estimates agree.
         floor_xy: error between two estimates that no covariance tells of, m.
         floor_heading: the same, rad.
+        alone: landmarks that must agree if one node speaks alone. Two nodes that say the same, found each
+            by its own, are much better evidence than one: parts of unlike places look alike.
         comparable: support of a second place, as a share of the best one's, that makes it ambiguous.
     """
 
@@ -44,6 +46,7 @@ class RelocalizationSettings:
     floor_xy: float = 0.05
     floor_heading: float = 0.03
     comparable: float = 0.6
+    alone: int = 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +163,8 @@ class Relocalizer:
         best = places[0].best
         words = f"{best.recognition.inliers} landmarks of {best.node} agree"
         if len(rivals) == 1:
+            if len(places[0].sightings) == 1 and best.recognition.inliers < s.alone:
+                return _unknown(f"not sure: {words}, and no other node says the same")
             if len(places[0].sightings) > 1:
                 words += f", and {len(places[0].sightings) - 1} more nodes with them"
             return RelocalizeAnswer(Certainty.FOUND, candidates, words)
