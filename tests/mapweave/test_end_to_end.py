@@ -1,0 +1,120 @@
+"""The whole system as processes over Zenoh: server with router, simulator, two agents. Nothing is faked."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from agent.fleet import encode_mission
+from agent.mission import GoTo, Idle
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2
+from mapweave.demo.processes import Children, free_port
+from mapweave.demo.run import run_demo
+from mapweave.demo.options import DemoOptions
+from mapweave.demo.watch import Watch
+from mapweave.scoring import posture_error, score_map
+from sim.control import SimControl
+from wire.bus_settings import BusSettings
+from wire.keys import Keys
+from wire.mapfile import read_map_file, unpack_map_file
+from wire.zenoh_bus import ZenohBus
+
+EXPLORE = 60.0
+"""Simulated seconds of exploration."""
+
+
+def wait_for(condition, seconds, children, what):
+    """Poll; a child that has ended fails the test with its last words."""
+    end = time.monotonic() + seconds
+    while not condition():
+        children.check()
+        assert time.monotonic() < end, what
+        time.sleep(0.05)
+
+
+@pytest.mark.timeout(240)
+def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
+    """Map for a minute, then carry a robot to another place of its room: it must find itself and park."""
+    keys, endpoint = Keys("e2e"), f"tcp/127.0.0.1:{free_port()}"
+    bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
+    network = ["--fleet", "e2e", "--connect", endpoint]
+    try:
+        with Children(tmp_path / "logs") as children:
+            children.start(
+                "server",
+                ["server", "--fleet", "e2e", "--listen", endpoint, "--data", str(tmp_path / "server")],
+            )
+            wait_for(bus.connected, 30, children, "no router")
+            watch, control = Watch(bus, keys), SimControl(bus, "e2e")
+            children.start("sim", ["sim", "--robots", "2", "--seed", "11", *network])
+            for name in ("r0", "r1"):
+                children.start(
+                    name, ["agent", name, "--data", str(tmp_path), "--epoch", "1", "--lockstep", *network]
+                )
+            explored = lambda: min([a.stamp_ns for a in watch.agents().values()] or [0]) >= EXPLORE * 1e9  # noqa: E731
+            wait_for(lambda: len(watch.agents()) == 2 and explored(), 120, children, "nobody explores")
+            for name in ("r0", "r1"):
+                assert bus.ask(keys.mission(name), encode_mission(Idle()), 10)[0].payload == b"ok"
+            idle = lambda: {a.status.mission for a in watch.agents().values()} == {"idle"}  # noqa: E731
+            wait_for(idle, 20, children, "nobody stops")
+            mapped = sum(a.status.nodes for a in watch.agents().values())
+            settled = lambda: watch.server.settled and watch.server.nodes == mapped  # noqa: E731
+            wait_for(settled, 30, children, f"server has {watch.server.nodes} of {mapped} nodes")
+
+            merged = unpack_map_file(bus.ask(keys.server_map("s0"), b"", 10)[0].payload)
+            whole = HybridMap(merged.changes)
+            truth: dict[NodeId, Pose2] = {}
+            for node in whole.nodes.values():
+                truth[node.id] = control.truth_at(node.id.agent, [node.stamp_ns])[0]
+            score = score_map({n: (c, p.mean) for n, (c, p) in merged.postures.items()}, [], truth)
+            assert len(whole.nodes) >= 12
+            assert score.ate < 0.10
+            assert 500 < watch.server.payload_bytes / watch.server.node_puts < 4000
+
+            # The robot is turned around and carried a little; it is not told.
+            own = [n for n in whole.nodes.values() if n.id.agent == "r0" and len(n.landmarks) >= 30]
+            goal = own[0].id
+            place = truth[goal] @ Pose2(-0.1, 0.15, 2.0)
+            control.kidnap("r0", place)
+            assert bus.ask(keys.mission("r0"), encode_mission(GoTo(goal)), 10)[0].payload == b"ok"
+            parked = lambda: (
+                watch.agents()["r0"].status.mission == "goto" and watch.agents()["r0"].status.finished
+            )  # noqa: E731, E501
+            wait_for(parked, 90, children, f"not parked: {watch.agents()['r0'].status}")
+            distance, angle = posture_error(control.status().robots["r0"].world_from_robot, truth[goal])
+            assert distance < 0.05
+            assert np.degrees(angle) < 3.0
+            assert all(robot.collisions == 0 for robot in control.status().robots.values())
+
+            for name in ("r0", "r1", "sim", "server"):
+                children.end(name)
+            watch.close()
+        for name in ("r0", "r1"):
+            content = read_map_file(tmp_path / f"{name}.mapweave", "agent")
+            assert {n.agent for n in HybridMap(content.changes).nodes} == {name}
+    finally:
+        bus.close()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(420)
+def test_the_demo_of_another_seed(tmp_path):
+    """`mapweave demo` with a world that no other test uses, against what the README promises."""
+    report = run_demo(DemoOptions(seed=1234, out=tmp_path, quiet=True))
+    print(json.dumps(report.as_dict()))
+    assert report.components == 1
+    assert report.false_links == 0
+    assert report.merged_ate_m is not None
+    assert report.merged_ate_m <= 0.10
+    assert report.bytes_per_node <= 4000
+    assert report.relocalization.found
+    assert report.goal.reached
+    assert report.collisions == 0
+    assert report.wall_s < 360
+    for name in ("map.png", "report.json", "merged.mapweave", "r0.mapweave"):
+        assert (tmp_path / name).stat().st_size > 1000
