@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from hybridmap.node import MapId
-from mapserver.store import Applied, Entry
+from mapserver.entry import Applied, Entry
 from wire.log_messages import MAX_REFUSALS, MAX_ROWS, LogRequest, Refusal
 
 NEVER = float("inf")

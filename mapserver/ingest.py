@@ -16,13 +16,15 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from hybridmap.change import Change
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import MapId, check_name
 from mapserver.agent_log import NEVER, AgentLog, PullSettings
-from mapserver.store import Entry, Store
+from mapserver.entry import Entry
+from mapserver.ingest_counters import IngestCounters
+from mapserver.store import Store
 from wire.bus import Bus, Closing, Reply, Sample
 from wire.codec import MAX_CHANGE_BYTES
 from wire.keys import Keys
@@ -49,33 +51,6 @@ class IngestSettings:
     ask_timeout: float = 2.0
     pulls_at_once: int = 4
     retry_interval: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class IngestCounters:
-    """What has happened since the start.
-
-    Attributes:
-        messages: changes that were published to this server.
-        message_bytes: in these, as they came.
-        applied: changes that were new and taken.
-        doubled: published changes that were already there.
-        damaged: published changes that did not decode.
-        refused: changes that were refused for good.
-        pulls: pieces of logs that were asked for.
-        pulled: changes that came with them.
-        failures: commits that the disk did not take.
-    """
-
-    messages: int = 0
-    message_bytes: int = 0
-    applied: int = 0
-    doubled: int = 0
-    damaged: int = 0
-    refused: int = 0
-    pulls: int = 0
-    pulled: int = 0
-    failures: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,5 +296,4 @@ class Ingest:
         self._work.put(_Pulled(map_id, asked, replies))
 
     def _count(self, **more: int) -> None:
-        now = self._counters
-        self._counters = replace(now, **{name: getattr(now, name) + by for name, by in more.items()})
+        self._counters = self._counters.plus(**more)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import Edge, EdgeId, MapId, NodeId
+from mapserver.entry import Applied, Entry, Traffic
 from wire.codec import decode_body, element_of, encode_body, unwrap_body
 from wire.database import Database
 from wire.log_messages import Refusal
@@ -46,78 +46,6 @@ CREATE TABLE result (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID
 """
 
 READ_AT_ONCE = 256
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """A change as it came.
-
-    Attributes:
-        sequence: its place in the log.
-        message: the encoded change.
-        change: what it says, or the reason why it cannot be taken.
-    """
-
-    sequence: int
-    message: bytes
-    change: Change | str
-
-    @staticmethod
-    def read(map_id: MapId, sequence: int, message: bytes) -> Entry:
-        """Decode a message that claims this place in this map's log."""
-        try:
-            own_sequence, stamp_ns, encoded = unwrap_body(message)
-            body = decode_body(encoded)
-        except InvalidMessage as error:
-            return Entry(sequence, message, str(error))
-        if (element_of(body).map, own_sequence) != (map_id, sequence):
-            claim = f"{element_of(body).map} {own_sequence}"
-            return Entry(sequence, message, f"change: {claim} came as {map_id} {sequence}")
-        return Entry(sequence, message, Change(map_id, sequence, stamp_ns, body))
-
-
-@dataclass(frozen=True, slots=True)
-class Applied:
-    """What became of a batch.
-
-    Attributes:
-        changes: that are new, in order; they are on the disk.
-        refusals: that were refused now, in order; that is on the disk too.
-        watermark: every change up to this one is settled.
-    """
-
-    changes: tuple[Change, ...]
-    refusals: tuple[Refusal, ...]
-    watermark: int
-
-
-@dataclass(frozen=True, slots=True)
-class Traffic:
-    """What a map has cost on the wire, each change counted once.
-
-    Attributes:
-        nodes: distinct nodes that were put.
-        node_puts: messages that put a node.
-        node_bytes: in these.
-        edge_puts: messages that put an edge.
-        edge_bytes: in these.
-    """
-
-    nodes: int
-    node_puts: int
-    node_bytes: int
-    edge_puts: int
-    edge_bytes: int
-
-    @property
-    def payload_bytes(self) -> int:
-        """In all of these."""
-        return self.node_bytes + self.edge_bytes
-
-    @property
-    def bytes_per_node(self) -> float:
-        """Mean size of a message that puts a node; NaN without any."""
-        return self.node_bytes / self.node_puts if self.node_puts else float("nan")
 
 
 class Store:

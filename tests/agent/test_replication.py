@@ -198,6 +198,7 @@ def test_the_beacon_says_how_long_the_log_is_and_what_is_known(agent: Agent, ser
 def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer) -> None:
     agent = Agent(hub, path, ("s0", "s1"))
     agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(5)
     assert not agent.replicator.wait_acknowledged(0.05)
     assert agent.replicator.status().since_ack == float("inf")
     server.acknowledge(agent.log_id, 3)
@@ -217,6 +218,7 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
 def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer) -> None:
     agent = Agent(hub, path, ())
     agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(5)
     assert not agent.replicator.wait_acknowledged(0.05)
     server.acknowledge(agent.log_id, 3)
     assert agent.replicator.wait_acknowledged(5)

@@ -13,8 +13,9 @@ from hybridmap.change import Change, NodeRetired
 from hybridmap.errors import InvalidFile
 from hybridmap.node import MapId, NodeId
 from mapserver.agent_log import AgentLog, PullSettings
+from mapserver.entry import Applied, Entry
 from mapserver.ingest import Ingest, IngestSettings
-from mapserver.store import Applied, Entry, Store
+from mapserver.store import Store
 from wire.bus import Request, Sample
 from wire.codec import MAX_CHANGE_BYTES, encode_change
 from wire.keys import Keys

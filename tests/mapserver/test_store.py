@@ -17,7 +17,8 @@ from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from hybridmap.errors import InvalidFile, InvalidValue
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from mapserver.store import Entry, Store
+from mapserver.entry import Entry
+from mapserver.store import Store
 from wire.codec import encode_body, encode_change
 from wire.log_messages import Refusal
 

@@ -7,12 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from hybridmap.camera import Camera
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+
+# Examples run on machines that are busy with other things.
+settings.register_profile("mapweave", deadline=None)
+settings.load_profile("mapweave")
 
 names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
 numbers = st.integers(0, 2**53)

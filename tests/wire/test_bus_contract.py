@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -411,76 +409,3 @@ def test_without_a_connection_nothing_blocks_and_all_comes_back(fleet: Fleet) ->
     eventually(lambda: one.publish("a", b"back") or b"back" in [s.payload for s in got])
     eventually(lambda: news == [True, False, True])
     assert b"into the void" not in [s.payload for s in got]
-
-
-def test_zenoh_a_client_may_come_before_its_router() -> None:
-    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
-    begin = time.monotonic()
-    client = ZenohBus(BusSettings(endpoints=endpoints))
-    got: list[Sample] = []
-    client.subscribe("a", got.append)
-    client.publish("a", b"lost")
-    assert client.ask("a", b"", 1.0) == []
-    assert not client.wait_connected(0.05)
-    assert time.monotonic() - begin < 0.5
-    router = ZenohBus(BusSettings(mode="router", listen=endpoints))
-    try:
-        assert client.wait_connected(5)
-        eventually(lambda: router.publish("a", b"found") or got)
-        assert {s.payload for s in got} == {b"found"}
-    finally:
-        client.close()
-        router.close()
-
-
-def test_zenoh_a_client_that_never_connects_closes_at_once() -> None:
-    client = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
-    begin = time.monotonic()
-    client.close()
-    assert time.monotonic() - begin < 0.5
-
-
-def test_zenoh_a_taken_port_is_one_clear_line() -> None:
-    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
-    first = ZenohBus(BusSettings(mode="router", listen=endpoints))
-    try:
-        with pytest.raises(NotConnected, match="the port is taken; stop the other server") as error:
-            ZenohBus(BusSettings(mode="router", listen=endpoints))
-        assert "\n" not in str(error.value)
-        assert endpoints[0] in str(error.value)
-    finally:
-        first.close()
-
-
-@pytest.mark.parametrize("declaring_thread_is_daemon", [False, True])
-@pytest.mark.parametrize("closes", [False, True])
-def test_zenoh_the_interpreter_exits_cleanly(declaring_thread_is_daemon: bool, closes: bool) -> None:
-    """Whether the bus is closed or forgotten, declared from a daemon thread or not, with a question open."""
-    program = f"""
-import threading, time
-from wire.bus_settings import BusSettings
-from wire.zenoh_bus import ZenohBus
-listen = ("tcp/127.0.0.1:{free_port()}",)
-router = ZenohBus(BusSettings(mode="router", listen=listen))
-client = ZenohBus(BusSettings(endpoints=listen))
-kept = []
-def declare():
-    client.subscribe("a", lambda sample: None)
-    client.serve("b", kept.append)
-    router.subscribe("a", lambda sample: None)
-    ZenohBus(BusSettings(endpoints=listen)).subscribe("a", lambda sample: None)
-assert client.wait_connected(5)
-declaring = threading.Thread(target=declare, daemon={declaring_thread_is_daemon})
-declaring.start()
-declaring.join()
-assert [t for t in threading.enumerate() if "pyo3" in t.name and t.daemon] == []
-threading.Thread(target=lambda: router.ask("b", b"", 20), daemon=True).start()
-while not kept:
-    router.publish("a", b"")
-    time.sleep(0.001)
-if {closes}:
-    client.close()
-    router.close()
-"""
-    finished = subprocess.run([sys.executable, "-c", program], timeout=20, capture_output=True, text=True)
-    assert (finished.returncode, finished.stderr) == (0, "")

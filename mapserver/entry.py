@@ -1,0 +1,83 @@
+"""What goes into the store, and what the store says of it: plain values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hybridmap.change import Change
+from hybridmap.errors import InvalidMessage
+from hybridmap.node import MapId
+from wire.codec import decode_body, element_of, unwrap_body
+from wire.log_messages import Refusal
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A change as it came.
+
+    Attributes:
+        sequence: its place in the log.
+        message: the encoded change.
+        change: what it says, or the reason why it cannot be taken.
+    """
+
+    sequence: int
+    message: bytes
+    change: Change | str
+
+    @staticmethod
+    def read(map_id: MapId, sequence: int, message: bytes) -> Entry:
+        """Decode a message that claims this place in this map's log."""
+        try:
+            own_sequence, stamp_ns, encoded = unwrap_body(message)
+            body = decode_body(encoded)
+        except InvalidMessage as error:
+            return Entry(sequence, message, str(error))
+        if (element_of(body).map, own_sequence) != (map_id, sequence):
+            claim = f"{element_of(body).map} {own_sequence}"
+            return Entry(sequence, message, f"change: {claim} came as {map_id} {sequence}")
+        return Entry(sequence, message, Change(map_id, sequence, stamp_ns, body))
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What became of a batch.
+
+    Attributes:
+        changes: that are new, in order; they are on the disk.
+        refusals: that were refused now, in order; that is on the disk too.
+        watermark: every change up to this one is settled.
+    """
+
+    changes: tuple[Change, ...]
+    refusals: tuple[Refusal, ...]
+    watermark: int
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """What a map has cost on the wire, each change counted once.
+
+    Attributes:
+        nodes: distinct nodes that were put.
+        node_puts: messages that put a node.
+        node_bytes: in these.
+        edge_puts: messages that put an edge.
+        edge_bytes: in these.
+    """
+
+    nodes: int
+    node_puts: int
+    node_bytes: int
+    edge_puts: int
+    edge_bytes: int
+
+    @property
+    def payload_bytes(self) -> int:
+        """In all of these."""
+        return self.node_bytes + self.edge_bytes
+
+    @property
+    def bytes_per_node(self) -> float:
+        """Mean size of a message that puts a node; NaN without any."""
+        return self.node_bytes / self.node_puts if self.node_puts else float("nan")
