@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from hybridmap.recognition import Recognition
 from numpy.typing import NDArray
 
 from agent.ekf.localization import LocalizationFilter, LocalizationSettings
@@ -15,6 +14,7 @@ from agent.vision.sift import Features
 from agent.vision.tracker import Tracker, TrackerSettings
 from hybridmap.node import Node
 from hybridmap.pose import Array, PoseGaussian
+from hybridmap.recognition import Recognition
 
 
 @dataclass(frozen=True)

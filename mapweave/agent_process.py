@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
-from agent.replication import Replicator
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
@@ -17,6 +16,7 @@ from agent.fleet import FleetLink
 from agent.journal import Journal
 from agent.mission import Idle, Mission
 from agent.pipeline import Pipeline, PipelineSettings, Step
+from agent.replication import Replicator
 from agent.runner import Runner
 from wire.keys import Keys
 from wire.mapfile import MapFile, write_map_file
@@ -30,7 +30,7 @@ class AgentOptions:
     Attributes:
         name: in the fleet.
         data: folder for its journal and its map file.
-        epoch: number of the new map; None takes the clock's milliseconds, which only grow.
+        epoch: number of the new map; None takes the clock's seconds, which only grow.
         mission: at the start.
         seed: of the random choices in exploration.
         lockstep: wait for answers between ticks.
@@ -68,7 +68,7 @@ def run_agent(
     options.data.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)
     journal = Journal(options.data / f"{options.name}.sqlite", options.name)
-    epoch = options.epoch if options.epoch is not None else time.time_ns() // 1_000_000
+    epoch = options.epoch if options.epoch is not None else int(time.time())
     map_id = journal.open_map(epoch)
     pipeline = Pipeline(map_id, robot.describe(), settings)
     pipeline.set_mission(options.mission)

@@ -70,10 +70,11 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
     accepted: NDArray[np.bool_] = np.ones(n, np.bool_)
     for _ in range(seen.most):
         sight = see(posture, rays[slots], mount_forward)
-        if (sight.scale <= NEAREST_SCALE).any():
+        first_sight = see(posture, state.first[slots], mount_forward)
+        if (np.minimum(sight.scale, first_sight.scale) <= NEAREST_SCALE).any():
             return None
-        by_posture = sight.by_posture[:, :2].reshape(2 * n, 3)
-        by_ray = sight.by_ray[:, :2]
+        by_posture = first_sight.by_posture[:, :2].reshape(2 * n, 3)
+        by_ray = first_sight.by_ray[:, :2]
         rows = by_posture @ state.covariance[:3]
         rows += (by_ray @ state.covariance[index].reshape(n, 3, -1)).reshape(2 * n, -1)
         columns = rows.T

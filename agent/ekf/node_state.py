@@ -23,18 +23,23 @@ class NodeState:
         posture: (3,) [x m, y m, heading rad], node_from_robot.
         rays: (n, 3) [a, b, w 1/m] at the node. The paper's two numbers a landmark, here a and w, are
             estimated; b is known as the map gives it, and only its uncertainty is considered.
+        first: (n, 3) the rays as they were first known. All Jacobians are taken there: at estimates that
+            change from image to image they would let the filter learn what no image tells (first-estimates
+            Jacobians, Huang, Mourikis and Roumeliotis 2010).
         covariance: (3 + 3n, 3 + 3n) of [posture, (a, b, w) of each landmark], additive errors.
     """
 
     posture: Array
     rays: Array
+    first: Array
     covariance: Array
 
     @staticmethod
     def of_prior(prior: PoseGaussian) -> NodeState:
         """A posture and no landmarks."""
         turn = turning(prior.mean)
-        return NodeState(prior.mean.vector, np.zeros((0, 3)), turn @ prior.covariance @ turn.T)
+        none = np.zeros((0, 3))
+        return NodeState(prior.mean.vector, none, none, turn @ prior.covariance @ turn.T)
 
     @property
     def pose(self) -> PoseGaussian:
@@ -67,7 +72,7 @@ class NodeState:
         posture, rays = self.stepped(step)
         covariance = self.covariance - root @ root.T
         covariance[4::3, 4::3] = self.covariance[4::3, 4::3]
-        return NodeState(posture, rays, covariance)
+        return NodeState(posture, rays, self.first, covariance)
 
     def grown(self, rays: Array, covariances: Array, by_posture: Array) -> NodeState:
         """The state with further landmarks.
@@ -88,12 +93,16 @@ class NodeState:
         own = grown[size:, size:].reshape(n, 3, n, 3)
         index = np.arange(n)
         own[index, :, index, :] += covariances
-        return NodeState(self.posture, np.concatenate([self.rays, rays]), grown)
+        return NodeState(
+            self.posture, np.concatenate([self.rays, rays]), np.concatenate([self.first, rays]), grown
+        )
 
     def kept(self, mask: NDArray[np.bool_]) -> NodeState:
         """The state with only some of its landmarks."""
         index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])
-        return NodeState(self.posture, self.rays[mask], self.covariance[np.ix_(index, index)])
+        return NodeState(
+            self.posture, self.rays[mask], self.first[mask], self.covariance[np.ix_(index, index)]
+        )
 
     def rebased(
         self, new_from_node: PoseGaussian, mount_forward: float
@@ -127,7 +136,9 @@ class NodeState:
         moved[3:, 3:] = (seen.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
         moved += by_edge @ edge @ by_edge.T
         mean = new_from_node.mean @ Pose2.from_vector(self.posture)
-        return NodeState(mean.vector, seen.rays, 0.5 * (moved + moved.T)), seen.scale > NEAREST_SCALE
+        # What was linearised in the old frame and what will be in the new agree only at one estimate.
+        state = NodeState(mean.vector, seen.rays, seen.rays, 0.5 * (moved + moved.T))
+        return state, seen.scale > NEAREST_SCALE
 
 
 def turning(pose: Pose2) -> Array:

@@ -30,8 +30,8 @@ class SiftSettings:
         crowding: see cells.
         border_px: features nearer to the image's border are left out, they cannot be tracked.
         least_texture: the image's mean squared gradient around a feature, in its weakest direction,
-            (grey/px)^2. On an edge it is that of noise alone: such a feature slides along the edge when it is tracked
-            (aperture problem), unnoticed by a forward-backward check.
+            (grey/px)^2. On an edge it is that of noise alone: such a feature slides along the edge when it
+            is tracked (aperture problem), unnoticed by a forward-backward check.
         least_roundness: the same in the weakest direction as a share of that in the strongest.
     """
 

@@ -1,0 +1,197 @@
+"""Views become nodes, and what joins them becomes edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.ekf.triangulation import triangulate
+from agent.tracking import Tracking
+from agent.view import View
+from hybridmap.camera import Camera
+from hybridmap.change import ChangeBody, EdgePut, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.recognition import register
+
+TURN_ONLY = 0.15
+"""m; between two views nearer than this the robot has turned on the spot rather than driven."""
+
+HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
+"""A posture relative to itself."""
+
+
+@dataclass(frozen=True)
+class CartographerSettings:
+    """How nodes and edges are made.
+
+    Attributes:
+        most_landmarks: landmarks that a node keeps.
+        least_landmarks: a view with fewer becomes no node.
+        depth_share: a landmark is kept if its depth's sigma is below this share of the depth.
+        depth_floor: what a depth is never better than: m, and share of the depth.
+        most_chi2: a triangulated track fits if its mean squared residual is below this; 1 is expected.
+        edge_floor: what an edge's posture is never better than, m and rad: tracks err alike for a while,
+            which the filter, for which pixels err independently, does not know.
+        edge_share: likewise as a share of the way and of the turn: wheels are never quite round.
+        loop_reach: nodes of the own map nearer than this are tried for a loop closure, m.
+        loop_turn: and turned by less than this, rad.
+        loop_tries: at most this many, nearest first.
+        loop_sigma: a loop closure known no better than this is left to the server, m.
+    """
+
+    most_landmarks: int = 150
+    least_landmarks: int = 6
+    depth_share: float = 0.25
+    depth_floor: tuple[float, float] = (0.01, 0.015)
+    most_chi2: float = 4.0
+    edge_floor: tuple[float, float] = (0.002, 0.004)
+    edge_share: tuple[float, float] = (0.005, 0.01)
+    loop_reach: float = 1.2
+    loop_turn: float = 0.7
+    loop_tries: int = 4
+    loop_sigma: float = 0.12
+
+
+@dataclass(eq=False)
+class Placed:
+    """A node that was made, the track of each of its landmarks, and where the current anchor stands from it."""
+
+    node: Node
+    tracks: NDArray[np.int64]
+    node_from_anchor: PoseGaussian = HERE
+
+
+class Cartographer:
+    """Makes the nodes and edges of one map.
+
+    Attributes:
+        map: what was made so far.
+        map_from_anchor: posture of the current anchor.
+    """
+
+    def __init__(self, map_id: MapId, camera: Camera, settings: CartographerSettings) -> None:
+        """Start an empty map whose frame is the first anchor's."""
+        self.map = HybridMap()
+        self.map_from_anchor = HERE
+        self._map_id = map_id
+        self._camera = camera
+        self._settings = settings
+        self._last: Placed | None = None
+        self._next_number = 1
+        self._rng = np.random.default_rng(0)
+
+    def place(self, anchor: View, leaves: list[View], tracking: Tracking) -> list[ChangeBody]:
+        """Make nodes of an episode's views, edges between them and to the episode before, and loop closures.
+
+        Args:
+            anchor: the view where the episode began.
+            leaves: views beside it.
+            tracking: what is known of the landmarks.
+
+        Returns:
+            The changes, already applied to `map`; none if the anchor shows too little.
+        """
+        changes: list[ChangeBody] = []
+        placed = self._node(anchor, tracking, changes)
+        if placed is not None:
+            if self._last is not None:
+                changes.append(EdgePut(self._edge(self._last, placed, self._last.node_from_anchor)))
+            changes += self._close_loops(placed.node)
+            self._last = placed
+            for leaf in leaves:
+                beside = self._node(leaf, tracking, changes)
+                if beside is not None:
+                    between = self._sober(leaf.anchor_from_view)
+                    changes.append(EdgePut(self._edge(placed, beside, between)))
+        for change in changes:
+            self.map.apply(change)
+        return changes
+
+    def move_anchor(self, moved: PoseGaussian) -> None:
+        """The next episode begins elsewhere: `old_anchor_from_new`, as the filter says."""
+        moved = self._sober(moved)
+        self.map_from_anchor = self.map_from_anchor @ moved
+        if self._last is not None:
+            self._last.node_from_anchor = self._last.node_from_anchor @ moved
+
+    def _number(self) -> NodeId:
+        number = NodeId(self._map_id.agent, self._map_id.epoch, self._next_number)
+        self._next_number += 1
+        return number
+
+    def _node(self, view: View, tracking: Tracking, changes: list[ChangeBody]) -> Placed | None:
+        landmarks, tracks = self._landmarks(view, tracking)
+        if len(landmarks) < self._settings.least_landmarks:
+            return None
+        posture = self.map_from_anchor @ view.anchor_from_view
+        node = Node(self._number(), view.stamp_ns, posture, self._camera, landmarks)
+        changes.append(NodePut(node))
+        return Placed(node, tracks)
+
+    def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:
+        """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""
+        s, camera = self._settings, self._camera
+        depths, sigmas = np.full(len(view.tracks), np.nan), np.full(len(view.tracks), np.nan)
+        poses, pixels = tracking.history.sightings(view.tracks)
+        if len(poses) >= 2 and len(view.tracks):
+            solved = triangulate(poses, pixels, camera, reference=view.anchor_from_view.mean.vector)
+            fits = solved.chi2 < s.most_chi2
+            depths[fits], sigmas[fits] = solved.depths[fits], solved.depth_sigmas[fits]
+        view_from_robot = view.anchor_from_view.mean.inverse() @ tracking.pose.mean
+        known = tracking.landmarks()
+        shared, row, seat = np.intersect1d(known.ids, view.tracks, return_indices=True)
+        if len(shared):
+            ahead = view_from_robot.apply(known.points_in_robot[row])[:, 0] - camera.mount_forward
+            axis = view_from_robot.rotation[0]
+            spread = np.einsum("i,nij,j->n", axis, known.covariances_in_robot[row][:, :2, :2], axis)
+            seen = ahead > 0.05
+            depths[seat[seen]] = ahead[seen]
+            sigmas[seat[seen]] = np.sqrt(np.maximum(spread[seen], 1e-12))
+        with np.errstate(invalid="ignore"):
+            good = np.flatnonzero((depths > 0.05) & (sigmas < s.depth_share * depths))[: s.most_landmarks]
+        # Tracks err alike for a while, which neither filter nor triangulation knows.
+        sigmas = np.hypot(sigmas, s.depth_floor[0] + s.depth_floor[1] * depths)
+        landmarks = Landmarks(
+            view.features.pixels[good].astype(np.float32), view.features.codes[good],
+            depths[good].astype(np.float32), sigmas[good].astype(np.float32),
+        )  # fmt: skip
+        return landmarks, view.tracks[good]
+
+    def _edge(self, a: Placed, b: Placed, a_from_b: PoseGaussian) -> Edge:
+        _, in_a, in_b = np.intersect1d(a.tracks, b.tracks, return_indices=True)
+        driven = float(np.hypot(a_from_b.mean.x, a_from_b.mean.y))
+        kind = EdgeKind.TURNED if driven < TURN_ONLY else EdgeKind.MAPPED
+        shared = np.stack([in_a, in_b], axis=1).astype(np.int64)
+        evidence = {"shared": float(len(shared))}
+        return Edge(self._number(), a.node.id, b.node.id, a_from_b, kind, shared, evidence)
+
+    def _sober(self, moved: PoseGaussian) -> PoseGaussian:
+        """A posture of the filter with the uncertainty that the filter cannot know."""
+        s = self._settings
+        way, turn = float(np.hypot(moved.mean.x, moved.mean.y)), abs(moved.mean.heading)
+        position = s.edge_floor[0] + s.edge_share[0] * way
+        heading = s.edge_floor[1] + s.edge_share[1] * turn
+        more = np.diag([position**2, position**2, heading**2])
+        return PoseGaussian(moved.mean, moved.covariance + more)
+
+    def _close_loops(self, node: Node) -> list[ChangeBody]:
+        """Recognise places of the own map (paper, section 5): each gives a new edge."""
+        s, near = self._settings, []
+        for other in self.map.nodes.values():
+            between = other.map_from_robot.mean.inverse() @ node.map_from_robot.mean
+            reach = float(np.hypot(between.x, between.y))
+            fresh = self._last is None or other.id != self._last.node.id
+            if fresh and reach < s.loop_reach and abs(between.heading) < s.loop_turn:
+                near.append((reach, other))
+        changes: list[ChangeBody] = []
+        for _, other in sorted(near, key=lambda pair: pair[0])[: s.loop_tries]:
+            found = register(other, node, None, self._rng)
+            if found is not None and found.evidence["sigma_xy"] < s.loop_sigma:
+                posture, pairs, evidence = found.node_from_robot, found.pairs, found.evidence
+                edge = Edge(self._number(), other.id, node.id, posture, EdgeKind.LOOP, pairs, evidence)
+                changes.append(EdgePut(edge))
+        return changes

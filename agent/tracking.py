@@ -1,0 +1,196 @@
+"""Tracks and the mapping filter together: what ties the robot's motion to what it sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.ekf.mapping import FilterSettings, LandmarkEstimates, MappingFilter
+from agent.observation import Observation, RobotDescription
+from agent.track_history import TrackHistory
+from agent.view import View, associate
+from agent.vision.lens import Lens
+from agent.vision.sift import Features
+from agent.vision.tracker import Tracker, TrackerSettings
+from hybridmap.pose import Array, PoseGaussian
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """How landmarks are followed.
+
+    Attributes:
+        tracker: of image points.
+        filter: the mapping EKF.
+        filtered: landmarks in the EKF; further tracks are triangulated against its trajectory.
+        least_filtered: with fewer landmarks in view the wheels are trusted alone.
+        least_spread: likewise if they cover less than this share of the image's width.
+        associate_px: a feature this near to a track is the same point.
+        strikes: a track that the filter refuses this often in a row is given up.
+        prior_spread: sigma of a new landmark's inverse depth, as a share of the expected one.
+    """
+
+    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    filtered: int = 36
+    least_filtered: int = 5
+    least_spread: float = 0.2
+    associate_px: float = 1.5
+    strikes: int = 3
+    prior_spread: float = 0.6
+
+
+class Tracking:
+    """Follows image points and filters an even choice of them.
+
+    Attributes:
+        history: where each track was seen from.
+    """
+
+    def __init__(self, description: RobotDescription, lens: Lens, settings: TrackingSettings) -> None:
+        """Start with nothing in view."""
+        self.history = TrackHistory()
+        self._camera = description.camera
+        self._settings = settings
+        self._tracker = Tracker(lens, settings.tracker)
+        self._filter = MappingFilter(
+            description.camera, description.axle, description.wheel_noise, settings.filter
+        )
+        self._strikes: dict[int, int] = {}
+        self._next_track = 1
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """(N,) tracks alive."""
+        return self._tracker.ids
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) px in the ideal image, where they are."""
+        return self._tracker.pixels
+
+    @property
+    def pose(self) -> PoseGaussian:
+        """`anchor_from_robot`."""
+        return self._filter.pose
+
+    @property
+    def converged_share(self) -> float:
+        """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
+        converged = self._filter.converged()
+        return float(converged.mean()) if len(converged) else 0.0
+
+    def landmarks(self) -> LandmarkEstimates:
+        """The filter's landmarks, in robot."""
+        return self._filter.landmarks()
+
+    def step(self, observation: Observation) -> None:
+        """Predict by the wheels, follow the tracks, correct by what they show."""
+        self._filter.predict(observation.odometry)
+        if observation.image is None:
+            return
+        self._tracker.track(observation.image, self._expected(observation))
+        # A landmark whose track is lost stays out: what it taught is in the posture already.
+        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
+        filtered = np.isin(self._tracker.ids, self._filter.ids)
+        pixels = self._tracker.pixels[filtered]
+        if self._trusted(pixels):
+            ids = self._tracker.ids[filtered]
+            self._judge(ids, self._filter.update(ids, pixels).accepted)
+        self.remember()
+
+    def remember(self, force: bool = False) -> None:
+        """Note from where the tracks are seen now, if the robot has moved or it is forced."""
+        self.history.record(self._filter.pose.mean, self._tracker.ids, self._tracker.pixels, force)
+
+    def take(self, observation: Observation, features: Features, anchor_from_view: PoseGaussian) -> View:
+        """Make a view of an image that was just tracked, and tell which of its features are tracks."""
+        tracks = associate(features, self._tracker.ids, self._tracker.raw, self._settings.associate_px)
+        return View(observation.stamp_ns, anchor_from_view, features, tracks)
+
+    def follow(self, view: View, expected_depth: float) -> None:
+        """Make tracks of a view's features that have none, and give the filter an even choice of them."""
+        new = view.tracks < 0
+        ids = np.arange(self._next_track, self._next_track + int(new.sum()), dtype=np.int64)
+        self._next_track += len(ids)
+        view.tracks[new] = ids
+        taken = self._tracker.pixels[np.isin(self._tracker.ids, self._filter.ids)]
+        self._tracker.add(ids, view.features.raw[new])
+        self._strikes = {int(track): 0 for track in self._tracker.ids}
+        room = self._settings.filtered - len(self._filter.ids)
+        if room > 0 and len(ids):
+            pixels = view.features.pixels[new]
+            chosen = even_choice(pixels, taken, room)
+            inverse_depths = np.full(len(chosen), 1.0 / expected_depth)
+            sigmas = self._settings.prior_spread * inverse_depths
+            self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
+        self.remember(force=True)
+
+    def reanchor(self) -> PoseGaussian:
+        """Begin anew from here; returns `old_anchor_from_new`."""
+        moved = self._filter.reanchor()
+        self.history.reanchor(moved.mean, self._tracker.ids)
+        return moved
+
+    def _expected(self, observation: Observation) -> Array:
+        """(N, 2) px where the tracks should be now: by the filter, else by the turn alone."""
+        before = self._tracker.pixels
+        bearing = np.tan(self._camera.bearings(before))
+        turn = np.tan(observation.odometry.turn)
+        expected = before.copy()
+        expected[:, 0] = self._camera.cx - self._camera.fx * (bearing - turn) / (1 + bearing * turn)
+        ids = self._filter.ids
+        if len(ids):
+            order = np.argsort(ids)
+            place = np.clip(np.searchsorted(ids[order], self._tracker.ids), 0, len(ids) - 1)
+            rows = self._filter.predict_pixels()[order[place]]
+            hit = (ids[order][place] == self._tracker.ids) & self._camera.contains(rows)
+            expected[hit] = rows[hit]
+        return expected
+
+    def _trusted(self, pixels: Array) -> bool:
+        """Whether landmarks are enough, and far enough apart, to correct the wheels.
+
+        A few points in one corner may all lie on the same edge, slide along it together and agree.
+        """
+        s = self._settings
+        spread = float(np.ptp(pixels[:, 0])) if len(pixels) else 0.0
+        return len(pixels) >= s.least_filtered and spread >= s.least_spread * self._camera.width
+
+    def _judge(self, ids: NDArray[np.int64], accepted: NDArray[np.bool_]) -> None:
+        """Give up tracks that the filter keeps refusing: they are on something that moves, or have slid."""
+        given_up = []
+        for track, good in zip(ids.tolist(), accepted.tolist(), strict=True):
+            strikes = 0 if good else self._strikes.get(track, 0) + 1
+            self._strikes[track] = strikes
+            if strikes >= self._settings.strikes:
+                given_up.append(track)
+        if given_up:
+            gone = np.array(given_up, np.int64)
+            self._filter.remove(gone)
+            self._tracker.keep(~np.isin(self._tracker.ids, gone))
+
+
+def even_choice(candidates: Array, taken: Array, most: int) -> NDArray[np.int64]:
+    """Choose pixels far from each other and from those taken, by farthest-point sampling.
+
+    Args:
+        candidates: (N, 2) px, strongest first.
+        taken: (M, 2) px.
+        most: how many to choose.
+
+    Returns:
+        (K,) indices of the candidates.
+    """
+    distance = np.full(len(candidates), np.inf)
+    if len(taken):
+        distance = np.linalg.norm(candidates[:, None] - taken[None], axis=2).min(axis=1)
+    chosen: list[int] = []
+    while len(chosen) < min(most, len(candidates)):
+        best = int(distance.argmax())
+        chosen.append(best)
+        distance = np.minimum(distance, np.linalg.norm(candidates - candidates[best], axis=1))
+        distance[best] = -1.0
+    return np.array(chosen, np.int64)

@@ -1,0 +1,50 @@
+"""Views: images that will become nodes once their landmarks are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.vision.sift import Features
+from hybridmap.pose import Array, PoseGaussian
+
+
+@dataclass(eq=False)
+class View:
+    """An image that will become a node.
+
+    Attributes:
+        stamp_ns: when it was taken.
+        anchor_from_view: posture relative to the anchor view; identity for the anchor itself.
+        features: its features.
+        tracks: (N,) id of the track of each feature, -1 where it has none.
+    """
+
+    stamp_ns: int
+    anchor_from_view: PoseGaussian
+    features: Features
+    tracks: NDArray[np.int64]
+
+
+def associate(features: Features, ids: NDArray[np.int64], raw: Array, within_px: float) -> NDArray[np.int64]:
+    """Tell which features are points that are tracked already: nearest to each other, and near.
+
+    Args:
+        features: of an image.
+        ids: (M,) of the tracks.
+        raw: (M, 2) px in the real image, where the tracks are in it.
+        within_px: how near.
+
+    Returns:
+        (N,) id of the track of each feature, -1 where it has none.
+    """
+    tracks = np.full(len(features), -1, np.int64)
+    if len(features) and len(ids):
+        distance = np.linalg.norm(features.raw[:, None] - raw[None], axis=2)
+        nearest = distance.argmin(axis=1)
+        mutual = distance.argmin(axis=0)[nearest] == np.arange(len(features))
+        same = mutual & (distance.min(axis=1) <= within_px)
+        tracks[same] = ids[nearest[same]]
+    return tracks
