@@ -40,9 +40,11 @@ def try_start(rng: np.random.Generator, steps: int = 100) -> Start:
     depths = rng.uniform(1.5, 5.0, count)
     pixels = np.column_stack([rng.uniform(20, 300, count), rng.uniform(20, 220, count)])
     points = CAMERA.back_project(pixels, depths)
-    sigmas = rng.uniform(0.01, 0.08, count) * depths
     mapped_pixels = pixels + _PIXEL * rng.normal(size=pixels.shape)
-    mapped_depths = depths + sigmas * rng.normal(size=count)
+    # A map's errors are of inverse depth, as parallax makes them; it tells them as sigmas of the depth.
+    share = rng.uniform(0.01, 0.08, count)
+    mapped_depths = depths / (1 + share * rng.normal(size=count))
+    sigmas = share * mapped_depths**2 / depths
     mapped = CAMERA.back_project(mapped_pixels, mapped_depths)
     ray = np.column_stack(
         [np.ones(count), (mapped[:, 1:] - (0.0, CAMERA.mount_height)) / mapped_depths[:, None]]

@@ -21,6 +21,8 @@ from hybridmap.errors import InvalidValue
 from hybridmap.planar_pose import PlanarPoseSettings, solve_planar_pose
 from hybridmap.pose import Array, Pose2, PoseGaussian
 
+__all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
+
 Ids = NDArray[np.int64]
 
 
@@ -136,19 +138,15 @@ class LocalizationFilter:
         seen = np.isfinite(pixels[rows]).all(axis=1)
         slots, rows = slots[seen], rows[seen]
         start = self._start(slots, pixels[rows])
-        ahead = see(start, self._state.rays[slots], mount).scale > NEAREST_SCALE
+        scales = [see(start, rays[slots], mount).scale for rays in (self._state.rays, self._state.first)]
+        ahead = np.minimum(*scales) > NEAREST_SCALE
         slots, rows = slots[ahead], rows[ahead]
         if not len(slots):
             return self._judge(UpdateReport.blind(ids, "no landmark of the node is in view"))
         slopes = (pixels[rows] - self._centre) / self._focal
-        measurement = Measurement(
-            slots,
-            slopes,
-            (s.pixel_sigma / self._focal) ** 2,
-            pixel_gate(s.gate_probability),
-            s.iterations,
-            s.linear_px / self._camera.fx,
-        )
+        variances, linear = (s.pixel_sigma / self._focal) ** 2, s.linear_px / self._camera.fx
+        gate = pixel_gate(s.gate_probability)
+        measurement = Measurement(slots, slopes, variances, gate, s.iterations, linear)
         fit = iterated_update(self._state, start, measurement, mount)
         if fit is None:
             return self._judge(UpdateReport.blind(ids, "the posture is too uncertain to be corrected"))

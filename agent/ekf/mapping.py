@@ -23,6 +23,8 @@ from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, PoseGaussian
 
+__all__ = ["FilterSettings", "LandmarkEstimates", "MappingFilter"]
+
 Ids = NDArray[np.int64]
 
 SAME_STEP = 1e-4
