@@ -58,7 +58,7 @@ class CartographerSettings:
 
 @dataclass(eq=False)
 class Placed:
-    """A node that was made, the track of each of its landmarks, and where the current anchor stands from it."""
+    """A node that was made, the track of each landmark, and where the current anchor stands from it."""
 
     node: Node
     tracks: NDArray[np.int64]

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.mapping import FilterSettings, LandmarkEstimates, MappingFilter
+from agent.ekf.landmarks import LandmarkEstimates
+from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.observation import Observation, RobotDescription
 from agent.track_history import TrackHistory
 from agent.view import View, associate

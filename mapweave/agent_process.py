@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -70,7 +70,7 @@ def run_agent(
     journal = Journal(options.data / f"{options.name}.sqlite", options.name)
     epoch = options.epoch if options.epoch is not None else int(time.time())
     map_id = journal.open_map(epoch)
-    pipeline = Pipeline(map_id, robot.describe(), settings)
+    pipeline = Pipeline(map_id, robot.describe(), replace(settings, seed=options.seed))
     pipeline.set_mission(options.mission)
     replicator = Replicator(bus, keys, journal, map_id, servers=(options.server,))
     fleet = FleetLink(bus, keys, map_id)

@@ -13,9 +13,9 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "demo",
         help="three robots, one map, one lost robot found",
-        description="Start a map server, a simulator and several agents as processes. Each robot explores and "
-        "maps its part of an office; the server merges the maps; then one robot is kidnapped, asks where it is, "
-        "and drives to a node that another robot mapped. Exit status 0: it arrived; 2: it did not.",
+        description="Start a map server, a simulator and several agents as processes. Each robot explores "
+        "and maps its part of an office; the server merges the maps; then one robot is kidnapped, asks where "
+        "it is, and drives to a node that another robot mapped. Exit status 0: it arrived; 2: it did not.",
     )
     parser.add_argument("--seed", type=int, default=0, help="other seeds, other worlds (default: 0)")
     parser.add_argument("--robots", type=int, default=3, help="how many (default: 3)")

@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             sx, sy, sh = row["sigma"]
             print(
                 f"  node {row['node']}: {x:+.3f} m ahead, {y:+.3f} m left, {math.degrees(heading):+.1f} deg "
-                f"(sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), {row['inliers']} landmarks agree, "
-                f"probability {row['probability']:.3f}"
+                f"(sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
+                f"{row['inliers']} landmarks agree, probability {row['probability']:.3f}"
             )
     return 0 if answer.certainty is Certainty.FOUND else 2

@@ -13,8 +13,8 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "sim",
         help="simulate robots in an office",
-        description="Simulate differential-drive robots with cameras in a PyBullet office, in lock-step: time "
-        "advances when every agent has sent its command. Robots are called r0, r1 ...",
+        description="Simulate differential-drive robots with cameras in a PyBullet office, in lock-step: "
+        "time advances when every agent has sent its command. Robots are called r0, r1 ...",
     )
     parser.add_argument("--robots", type=int, default=3, help="how many (default: 3)")
     parser.add_argument("--rooms", type=int, default=3, help="rooms along the corridor (default: 3)")

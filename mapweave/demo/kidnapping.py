@@ -1,4 +1,4 @@
-"""Whom to kidnap, where to put it down, and where it shall go. Truth is used to set the stage, not to help."""
+"""Whom to kidnap, where to put it down, where it shall go. Truth sets the stage; it does not help."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _goals(
     host: str,
     start: NodeId,
 ) -> list[NodeId]:
-    """Nodes of a third robot (with two robots: of either) in another room, or else anywhere outside this one."""
+    """Nodes of a third robot (of two: of either) in another room, or else anywhere outside this one."""
     third = [n for n in sorted(truth) if n.agent not in (robot, host)] or sorted(truth)
     here = {n for nodes in rooms[room].values() for n in nodes}
     good = [

@@ -92,7 +92,8 @@ class Report:
             ("collisions", str(self.collisions)),
             (
                 "time",
-                f"{self.sim_s:.0f} s simulated in {self.wall_s:.0f} s: {self.real_time_factor:.1f} x real time",
+                f"{self.sim_s:.0f} s simulated in {self.wall_s:.0f} s, "
+                f"{self.real_time_factor:.1f} x real time",
             ),
         ]
         return lines + [("note", note) for note in self.notes]

@@ -130,8 +130,8 @@ class Demo:
         for k, name in enumerate(self._robots):
             self._children.start(
                 name,
-                ["agent", name, "--data", str(out), "--epoch", "1", "--seed", str(seed * 16 + k), "--lockstep",
-                 "--mission", "explore", *network],
+                ["agent", name, "--data", str(out), "--epoch", "1", "--seed", str(seed * 16 + k),
+                 "--lockstep", "--mission", "explore", *network],
             )  # fmt: skip
         self._until(lambda: len(self._watch.agents()) == len(self._robots), 60.0, "an agent does not come up")
 
@@ -272,8 +272,8 @@ class Demo:
             n: score.world_from_merged @ p.mean for n, (c, p) in self._merged.postures.items() if c == 0
         }
         title = (
-            f"seed {self._options.seed}: {len(self._robots)} robots, {len(places)} nodes, {score.links} links "
-            f"({score.false_links} false), ATE {score.ate:.3f} m"
+            f"seed {self._options.seed}: {len(self._robots)} robots, {len(places)} nodes, "
+            f"{score.links} links ({score.false_links} false), ATE {score.ate:.3f} m"
         )
         picture = MapPicture(
             title, places, list(whole.edges.values()), outline_of(self._control.plan()), drive

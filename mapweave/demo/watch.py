@@ -85,7 +85,8 @@ class Watch:
         try:
             self.server = ServerReport(
                 int(values["nodes"]), int(values["maps"]), int(values["components"]), int(values["links"]),
-                bool(values["settled"]), int(values["bytes"]), int(values["node_puts"]), str(values["summary"]),
+                bool(values["settled"]), int(values["bytes"]), int(values["node_puts"]),
+                str(values["summary"]),
             )  # fmt: skip
         except (KeyError, ValueError) as error:
             raise InvalidMessage(f"server status: {error}") from None

@@ -13,9 +13,9 @@ from agent.mission import GoTo, Idle
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
+from mapweave.demo.options import DemoOptions
 from mapweave.demo.processes import Children, free_port
 from mapweave.demo.run import run_demo
-from mapweave.demo.options import DemoOptions
 from mapweave.demo.watch import Watch
 from mapweave.scoring import posture_error, score_map
 from sim.control import SimControl
@@ -56,14 +56,24 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
                 children.start(
                     name, ["agent", name, "--data", str(tmp_path), "--epoch", "1", "--lockstep", *network]
                 )
-            explored = lambda: min([a.stamp_ns for a in watch.agents().values()] or [0]) >= EXPLORE * 1e9  # noqa: E731
-            wait_for(lambda: len(watch.agents()) == 2 and explored(), 120, children, "nobody explores")
+
+            def explored():
+                stamps = [a.stamp_ns for a in watch.agents().values()]
+                return len(stamps) == 2 and min(stamps) >= EXPLORE * 1e9
+
+            wait_for(explored, 120, children, "nobody explores")
             for name in ("r0", "r1"):
                 assert bus.ask(keys.mission(name), encode_mission(Idle()), 10)[0].payload == b"ok"
-            idle = lambda: {a.status.mission for a in watch.agents().values()} == {"idle"}  # noqa: E731
+
+            def idle():
+                return {a.status.mission for a in watch.agents().values()} == {"idle"}
+
             wait_for(idle, 20, children, "nobody stops")
             mapped = sum(a.status.nodes for a in watch.agents().values())
-            settled = lambda: watch.server.settled and watch.server.nodes == mapped  # noqa: E731
+
+            def settled():
+                return watch.server.settled and watch.server.nodes == mapped
+
             wait_for(settled, 30, children, f"server has {watch.server.nodes} of {mapped} nodes")
 
             merged = unpack_map_file(bus.ask(keys.server_map("s0"), b"", 10)[0].payload)
@@ -82,9 +92,11 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
             place = truth[goal] @ Pose2(-0.1, 0.15, 2.0)
             control.kidnap("r0", place)
             assert bus.ask(keys.mission("r0"), encode_mission(GoTo(goal)), 10)[0].payload == b"ok"
-            parked = lambda: (
-                watch.agents()["r0"].status.mission == "goto" and watch.agents()["r0"].status.finished
-            )  # noqa: E731, E501
+
+            def parked():
+                status = watch.agents()["r0"].status
+                return status.mission == "goto" and status.finished
+
             wait_for(parked, 90, children, f"not parked: {watch.agents()['r0'].status}")
             distance, angle = posture_error(control.status().robots["r0"].world_from_robot, truth[goal])
             assert distance < 0.05
