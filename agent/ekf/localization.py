@@ -150,9 +150,11 @@ class LocalizationFilter:
         fit = iterated_update(self._state, start, measurement, mount)
         if fit is None:
             return self._judge(UpdateReport.blind(ids, "the posture is too uncertain to be corrected"))
-        self._state = fit.state
         accepted = np.zeros(len(ids), np.bool_)
-        accepted[rows[fit.accepted]] = True
+        # A few that agree among many that do not may as well be the wrong ones.
+        if fit.accepted.mean() >= s.least_agreeing_share:
+            self._state = fit.state
+            accepted[rows[fit.accepted]] = True
         innovations_px = np.full((len(ids), 2), np.nan)
         innovations_px[rows] = fit.innovations * self._focal
         kept = int(fit.accepted.sum())
@@ -249,6 +251,7 @@ class LocalizationFilter:
         refuted = self._bad >= s.patience
         if not (refuted or state.covariance[2, 2] > s.loose_heading**2):
             return state.posture
+        least = s.least_refound if refuted else s.least_fixed
         points, covariances = state.points(self._camera)
         fix = solve_planar_pose(
             points[slots],
@@ -256,9 +259,7 @@ class LocalizationFilter:
             self._camera,
             rng=self._rng,
             point_covariances=covariances[slots],
-            settings=PlanarPoseSettings(
-                pixel_sigma=s.pixel_sigma, least_inliers=s.least_refound if refuted else s.least_fixed
-            ),
+            settings=PlanarPoseSettings(pixel_sigma=s.pixel_sigma, least_inliers=least),
         )
         if fix is None:
             return state.posture

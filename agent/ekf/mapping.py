@@ -166,20 +166,23 @@ class MappingFilter:
             return UpdateReport.blind(ids, "no landmark of the filter is in view")
         slopes = (pixels[rows] - self._centre) / self._focal
         innovations = slopes - self._state.rays[slots, :2]
-        believed, _ = believe(innovations, self._spread(slots), self._gate)
+        believed, information = believe(innovations, self._spread(slots), self._gate)
         reason = self._doubt(int(believed.sum()), len(slots))
         if reason and self._step is not None:
             # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
-            step, believed_before = self._step, believed
+            step = self._step
             self._take(step.again(wheel_root=np.diag(self.settings.slip)))
-            believed, _ = believe(innovations, self._spread(slots), self._gate)
-            kept = int(believed.sum())
+            then_believed, then_information = believe(innovations, self._spread(slots), self._gate)
+            kept = int(then_believed.sum())
             if self._doubt(kept, len(slots)):
                 self._take(step)
-                believed = believed_before
             else:
+                believed, information = then_believed, then_information
                 reason = f"the wheels are refuted by {kept} of {len(slots)} landmarks"
-        nis = self._correct(slots[believed], slopes[believed]) if believed.any() else math.nan
+        if believed.sum() < self.settings.least_agreeing_share * len(slots):
+            # A few that agree among many that do not may as well be the wrong ones.
+            believed[:] = False
+        nis = self._correct(slots[believed], slopes[believed], information) if believed.any() else math.nan
         self._step = None
         accepted = np.zeros(len(ids), np.bool_)
         accepted[rows[believed]] = True
@@ -249,10 +252,6 @@ class MappingFilter:
     def _take(self, step: Step) -> None:
         self._step, self._state = step, step.state
 
-    def _residual(self, slots: NDArray[np.intp], slopes: Array) -> tuple[Array, Array]:
-        """(2N,) measured minus expected, and the inverse of its covariance."""
-        return (slopes - self._state.rays[slots, :2]).ravel(), inverse(self._spread(slots))
-
     def _spread(self, slots: NDArray[np.intp]) -> Array:
         """(2N, 2N) joint covariance of the innovations of some landmarks."""
         index = _measured(slots)
@@ -267,8 +266,8 @@ class MappingFilter:
         needed = max(min(s.least_agreeing, len(self.ids)), s.least_agreeing_share * seen)
         return "" if agreeing >= needed else f"{agreeing} of {seen} landmarks agree"
 
-    def _correct(self, slots: NDArray[np.intp], slopes: Array) -> float:
-        """Correct by believed measurements; returns their normalised innovation squared.
+    def _correct(self, slots: NDArray[np.intp], slopes: Array, information: Array) -> float:
+        """Correct by believed measurements, whose innovations have this information, and return their NIS.
 
         The image tells better than the wheels by how much the robot has turned, so the step is linearised
         again at what it then seems to have been. Without this each step leaves a second-order error of one
@@ -276,7 +275,7 @@ class MappingFilter:
         A wheel that has slipped further than its noise allows is believed so much less, in this step only.
         """
         index = _measured(slots)
-        residual, information = self._residual(slots, slopes)
+        residual = (slopes - self._state.rays[slots, :2]).ravel()
         for _ in range(self.settings.relinearisations):
             if self._step is None:
                 break
@@ -289,7 +288,8 @@ class MappingFilter:
                 self._take(self._step.again(at=likely))
             else:
                 break
-            residual, information = self._residual(slots, slopes)
+            residual = (slopes - self._state.rays[slots, :2]).ravel()
+            information = inverse(self._spread(slots))
         self._state = self._state.corrected(index, residual, information)
         return float(residual @ information @ residual) / len(residual)
 

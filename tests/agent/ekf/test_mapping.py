@@ -299,3 +299,17 @@ def test_a_single_landmark_in_view_is_used_without_pretending() -> None:
         assert not report.healthy
     assert filter_.pose.covariance.trace() > before
     assert filter_.pose.mahalanobis2(run.poses[140]) < 16.3
+
+
+def test_a_few_that_agree_among_many_that_do_not_are_not_believed() -> None:
+    run = a_run("line", steps=100)
+    filter_ = start(run)
+    drive(filter_, run)
+    filter_.predict(STILL)
+    before = filter_.state
+    pixels = filter_.predict_pixels(np.arange(30))
+    pixels[3:] = np.random.default_rng(0).uniform((0, 0), (320, 240), (27, 2))
+    report = filter_.update(np.arange(30), pixels)
+    assert not report.accepted.any()
+    assert report.reason.endswith("landmarks agree")
+    assert filter_.state is before
