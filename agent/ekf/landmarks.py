@@ -12,6 +12,7 @@ from hybridmap.camera import Camera
 from hybridmap.pose import Array
 
 Ids = NDArray[np.int64]
+"""Landmark ids as the front end numbers them."""
 
 
 class LandmarkEstimates(NamedTuple):

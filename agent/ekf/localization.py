@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agent.ekf.anchored import rays_of_points, see
 from agent.ekf.gating import pixel_gate
 from agent.ekf.iterated import Measurement, iterated_update
-from agent.ekf.landmarks import NodeLandmarks
+from agent.ekf.landmarks import Ids, NodeLandmarks
 from agent.ekf.motion import WheelNoise, move_posture
 from agent.ekf.node_state import NEAREST_SCALE, NodeState, turning
 from agent.ekf.report import UpdateReport
@@ -22,8 +22,6 @@ from hybridmap.planar_pose import PlanarPoseSettings, solve_planar_pose
 from hybridmap.pose import Array, Pose2, PoseGaussian
 
 __all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
-
-Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.ekf.gating import believe, inverse, pixel_gate
-from agent.ekf.landmarks import LandmarkEstimates
+from agent.ekf.landmarks import Ids, LandmarkEstimates
 from agent.ekf.motion import WheelNoise
 from agent.ekf.moving_state import MovingState, Step
 from agent.ekf.report import UpdateReport
@@ -24,8 +24,6 @@ from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, PoseGaussian
 
 __all__ = ["FilterSettings", "LandmarkEstimates", "MappingFilter"]
-
-Ids = NDArray[np.int64]
 
 SAME_STEP = 1e-4
 """m and rad; a step is not linearised again for less: its second-order part is then below 1e-5 px."""
