@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.node import Edge, NodeId
 from hybridmap.pose import Array, Pose2, wrap_angle
@@ -93,3 +95,17 @@ def is_false(link: Edge, truth: Mapping[NodeId, Pose2]) -> bool:
 def posture_error(estimated: Pose2, true: Pose2) -> tuple[float, float]:
     """Distance (m) and absolute angle (rad) between two postures."""
     return estimated.distance(true), abs(wrap_angle(estimated.heading - true.heading))
+
+
+def write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: Array) -> None:
+    """Write a planar trajectory as others' tools read it (TUM format: stamp, position, quaternion).
+
+    Args:
+        path: where.
+        stamps_ns: (N,).
+        poses: (N, 3) [x m, y m, heading rad].
+    """
+    zero = np.zeros(len(poses))
+    half = poses[:, 2] / 2
+    columns = [stamps_ns / 1e9, poses[:, 0], poses[:, 1], zero, zero, zero, np.sin(half), np.cos(half)]
+    np.savetxt(path, np.stack(columns, axis=1), fmt="%.6f")

@@ -24,7 +24,7 @@ from mapweave.demo.report import Report
 from mapweave.demo.show import Show
 from mapweave.demo.watch import Watch
 from mapweave.picture import Drive, MapPicture, draw_map, outline_of
-from mapweave.scoring import MapScore, posture_error, score_map
+from mapweave.scoring import MapScore, posture_error, score_map, write_tum
 from sim.control import SimControl
 from wire.bus_settings import BusSettings
 from wire.keys import Keys
@@ -231,6 +231,9 @@ class Demo:
         status = self._control.status()
         report.collisions = sum(robot.collisions for robot in status.robots.values())
         report.sim_s = round(status.stamp_ns / 1e9, 1)
+        for name in self._robots:
+            stamps, poses = self._control.trajectory(name)
+            write_tum(self._options.out / f"{name}.truth.tum", stamps, poses)
         drive = self._score_drive() if self._plot is not None else None
         self._draw(score, whole, drive)
 
@@ -335,7 +338,7 @@ def _bus(endpoint: str) -> Iterator[ZenohBus]:
 def _make_room(out: Path) -> None:
     """An empty output folder; only what an earlier demo made is removed."""
     out.mkdir(parents=True, exist_ok=True)
-    for pattern in ("*.sqlite*", "*.mapweave", "map.png", "report.json"):
+    for pattern in ("*.sqlite*", "*.mapweave", "*.tum", "map.png", "report.json"):
         for old in out.glob(pattern):
             old.unlink()
     for folder in ("server", "logs"):
