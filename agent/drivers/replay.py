@@ -19,6 +19,7 @@ import numpy as np
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError, InvalidValue
+from wire.packing import MAX_STAMP_NS
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 AXLE_PER_HEIGHT = 0.9
@@ -37,16 +38,18 @@ def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, f
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
         camera = Camera(
-            width=int(values["width"]), height=int(values["height"]), fx=float(values["fx"]),
+            width=_whole(values["width"]), height=_whole(values["height"]), fx=float(values["fx"]),
             fy=float(values["fy"]), cx=float(values["cx"]), cy=float(values["cy"]),
             mount_height=float(values["height_m"]), mount_forward=float(values.get("forward_m", 0.0)),
         )  # fmt: skip
         k1, k2, p1, p2, k3 = (float(k) for k in values.get("distortion", (0.0,) * 5))
+        if not all(math.isfinite(k) for k in (k1, k2, p1, p2, k3)):
+            raise DeviceError(f"{path}: the lens's coefficients must be finite")
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file; it must give the camera's intrinsics") from None
     except KeyError as missing:
         raise DeviceError(f"{path}: {missing.args[0]!r} is missing") from None
-    except (OSError, ValueError, TypeError, InvalidValue) as error:
+    except (OSError, ValueError, TypeError, OverflowError, InvalidValue) as error:
         raise DeviceError(f"{path}: {error}") from None
     return camera, (k1, k2, p1, p2, k3)
 
@@ -126,6 +129,13 @@ class Replay:
         """Nothing to let go of."""
 
 
+def _whole(value: Any) -> int:
+    if not isinstance(value, int):
+        # What fits nowhere is refused rather than rounded: half a frame or pixel is a mistake.
+        raise ValueError(f"{value!r} is no whole number")  # noqa: TRY004
+    return value
+
+
 def _natural_order(path: Path) -> tuple[list[int], str]:
     return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.name
 
@@ -139,6 +149,8 @@ def _read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]
         raise DeviceError(f"{path}: {error}") from None
     if len(times) != count or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise DeviceError(f"{path}: {len(times)} times for {count} images; they must be one each and ascend")
+    if not 0.0 <= times[0] <= times[-1] <= MAX_STAMP_NS / 1e9:
+        raise DeviceError(f"{path}: times are seconds since 1970 or since the start, not {times[0]:g}")
     return times
 
 
@@ -151,7 +163,7 @@ def _read_odometry(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float6
         raise DeviceError(f"{path}: no such file; without odometry nothing tells the map's scale") from None
     except KeyError as missing:
         raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, csv.Error) as error:
         raise DeviceError(f"{path}: {error}") from None
     if len(rows) != count or not all(math.isfinite(v) for row in rows for v in row):
         raise DeviceError(f"{path}: {len(rows)} rows for {count} images; there must be one finite row each")
@@ -171,9 +183,13 @@ def _read_split(path: Path, robot: str | None, count: int) -> range:
         raise DeviceError(f"{path}: no robot {robot!r}; there are {', '.join(sorted(robots)) or 'none'}")
     split = robots[robot]
     try:
-        frames = range(int(split["first"]), int(split["last"]) + 1, int(split.get("step", 1)))
+        first, last, step = (_whole(v) for v in (split["first"], split["last"], split.get("step", 1)))
     except (KeyError, ValueError, TypeError) as error:
         raise DeviceError(f"{path}: robot {robot!r}: {error}") from None
-    if not len(frames) or frames[0] < 0 or frames[-1] >= count:
-        raise DeviceError(f"{path}: robot {robot!r}: frames {frames} are not within the {count} images")
-    return frames
+    if step < 1:
+        raise DeviceError(f"{path}: robot {robot!r}: step {step} must be 1 or more")
+    if not 0 <= first <= last < count:
+        raise DeviceError(
+            f"{path}: robot {robot!r}: frames {first} to {last} are not within the {count} images"
+        )
+    return range(first, last + 1, step)
