@@ -141,6 +141,9 @@ class Pipeline:
         """
         command, changes, questions = Command(), list[ChangeBody](), list[Question]()
         match self._mission:
+            case Idle() if self._mapper.started:
+                # Whoever goes on mapping later needs to know what the wheels did meanwhile.
+                self._mapper.step(observation)
             case Explore() if self._explorer is not None:
                 self._mapper.step(observation)
                 self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
