@@ -20,8 +20,8 @@ class RouteSettings:
     Attributes:
         per_edge: each hop means one more recognition and one more approach.
         per_turn: a radian between the headings of two nodes.
-        per_undriven: a metre of an edge that was recognised but never driven: something may stand in
-            between, as a wall does that is seen through a door.
+        per_undriven: 1/m; an edge that was recognised but never driven costs more by its length times
+            this: something may stand in between, as a wall does where a room is seen through its door.
     """
 
     per_edge: float = 0.02
@@ -122,7 +122,8 @@ def edge_cost(edge: Edge, places: Mapping[NodeId, Pose2], one_frame: bool, setti
         relative = measured
     turn = abs(measured.heading) if edge.kind is EdgeKind.TURNED else abs(relative.heading)
     driven = edge.kind not in (EdgeKind.LOOP, EdgeKind.MERGED)
-    way = relative.distance(Pose2()) * (1.0 if driven else 1.0 + settings.per_undriven)
+    way = relative.distance(Pose2())
+    way *= 1.0 if driven else 1.0 + settings.per_undriven * way
     return way + settings.per_edge + settings.per_turn * turn
 
 

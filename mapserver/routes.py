@@ -7,9 +7,10 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeId, NodeId
+from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
 from hybridmap.route import Route, RouteSettings, find_route
@@ -25,11 +26,14 @@ class RouterSettings:
 
     Attributes:
         route: what a way costs.
+        near: nodes nearer than this to each other count as joined, whatever they show, m: less than what two
+            robots keep apart on the two sides of a wall.
         entry_reach: a robot may enter the map at nodes nearer than this, m.
         entry_cost: what a metre from the robot to its first node costs: nobody has driven it yet.
     """
 
     route: RouteSettings = field(default_factory=RouteSettings)
+    near: float = 0.5
     entry_reach: float = 1.5
     entry_cost: float = 3.0
 
@@ -43,6 +47,19 @@ class Router:
         self._postures = {node: place.merged_from_robot.mean for node, place in merged.postures.items()}
         self._merged = merged
         self._settings = settings or RouterSettings()
+        self._join_near()
+
+    def _join_near(self) -> None:
+        """Let routes change between nodes that stand in one place and look in different directions."""
+        for number, members in enumerate(self._merged.components):
+            nodes = sorted(members)
+            places = np.array([[self._postures[n].x, self._postures[n].y] for n in nodes])
+            for k, (i, j) in enumerate(sorted(cKDTree(places).query_pairs(self._settings.near))):
+                a, b = nodes[i], nodes[j]
+                if not self._union.graph.has_edge(a, b):
+                    between = PoseGaussian(self._postures[a].inverse() @ self._postures[b], np.zeros((3, 3)))
+                    edge = Edge(EdgeId("near", number, k), a, b, between, EdgeKind.LOOP)
+                    self._union.edges[edge.id] = edge
 
     def route(
         self,

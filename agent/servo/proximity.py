@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agent.observation import Command, RobotDescription
 from hybridmap.pose import Array
 
-_MARGIN = 0.03
+_MARGIN = 0.045
 """m, room that is kept between the footprint and what the rangers see."""
 
 _DECELERATION = 1.0
