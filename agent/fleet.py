@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question, WhereAmI
 from agent.pipeline import Status
@@ -13,7 +15,7 @@ from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from wire.bus import Bus, Request
 from wire.keys import Keys
-from wire.log_messages import decode_record, encode_record
+from wire.log_messages import Scalar, decode_record, encode_record
 from wire.messages import (
     RouteRequest,
     decode_relocalize_answer,
@@ -23,6 +25,11 @@ from wire.messages import (
 )
 
 NO_ANSWER = "no map server answered"
+
+MAX_WORDS = 500
+"""Characters of a status text."""
+
+T = TypeVar("T")
 
 
 def encode_mission(mission: Mission) -> bytes:
@@ -44,7 +51,10 @@ def decode_mission(payload: bytes) -> Mission:
     if name in plain:
         return plain[name]
     if name == "goto":
-        return GoTo(NodeId.parse(node))
+        try:
+            return GoTo(NodeId.parse(node))
+        except InvalidValue as error:
+            raise InvalidMessage(str(error)) from None
     raise InvalidMessage(f"no mission {name!r}; known are idle, explore, carried and goto")
 
 
@@ -72,22 +82,27 @@ def encode_status(status: Status, stamp_ns: int) -> bytes:
     return encode_record(
         {
             "stamp_ns": stamp_ns,
-            "doing": status.doing,
-            "detail": status.detail,
+            "doing": _one_line(status.doing),
+            "detail": _one_line(status.detail),
             "nodes": status.nodes,
             "tracked": status.tracked,
             "finished": status.finished,
-            "x": pose.x,
-            "y": pose.y,
-            "heading": pose.heading,
+            "x": float(pose.x),
+            "y": float(pose.y),
+            "heading": float(pose.heading),
             "mission": status.mission,
             "fix_node": "" if status.fix_node is None else str(status.fix_node),
-            "fix_x": fix.x,
-            "fix_y": fix.y,
-            "fix_heading": fix.heading,
+            "fix_x": float(fix.x),
+            "fix_y": float(fix.y),
+            "fix_heading": float(fix.heading),
             "legs": status.legs,
         }
     )
+
+
+def _one_line(text: str) -> str:
+    """Text as a record can hold it: a status may quote whatever a server or a driver has said."""
+    return "".join(c if c.isprintable() else " " for c in text)[:MAX_WORDS]
 
 
 def decode_status(payload: bytes) -> AgentReport:
@@ -99,22 +114,31 @@ def decode_status(payload: bytes) -> AgentReport:
     values = decode_record(payload)
     try:
         status = Status(
-            doing=str(values["doing"]),
-            detail=str(values["detail"]),
-            nodes=int(values["nodes"]),
-            tracked=int(values["tracked"]),
-            map_from_robot=Pose2(float(values["x"]), float(values["y"]), float(values["heading"])),
-            finished=bool(values["finished"]),
-            mission=str(values["mission"]),
-            fix_node=NodeId.parse(str(values["fix_node"])) if values["fix_node"] else None,
-            node_from_robot=Pose2(
-                float(values["fix_x"]), float(values["fix_y"]), float(values["fix_heading"])
-            ),
-            legs=int(values["legs"]),
+            doing=_typed(values, "doing", str),
+            detail=_typed(values, "detail", str),
+            nodes=_typed(values, "nodes", int),
+            tracked=_typed(values, "tracked", int),
+            map_from_robot=_posture(values, "x", "y", "heading"),
+            finished=_typed(values, "finished", bool),
+            mission=_typed(values, "mission", str),
+            fix_node=NodeId.parse(_typed(values, "fix_node", str)) if values["fix_node"] else None,
+            node_from_robot=_posture(values, "fix_x", "fix_y", "fix_heading"),
+            legs=_typed(values, "legs", int),
         )
-        return AgentReport(status, int(values["stamp_ns"]))
+        return AgentReport(status, _typed(values, "stamp_ns", int))
     except (KeyError, ValueError, InvalidValue) as error:
         raise InvalidMessage(f"agent status: {error}") from None
+
+
+def _typed(values: Mapping[str, Scalar], name: str, kind: type[T]) -> T:
+    value = values[name]
+    if type(value) is not kind:
+        raise ValueError(f"{name} must be {kind.__name__}, not {value!r}")
+    return value
+
+
+def _posture(values: Mapping[str, Scalar], x: str, y: str, heading: str) -> Pose2:
+    return Pose2(_typed(values, x, float), _typed(values, y, float), _typed(values, heading, float))
 
 
 class FleetLink:
@@ -190,11 +214,10 @@ class FleetLink:
             self._answered.put(self._answer(question))
 
     def _answer(self, question: Question) -> Answer:
-        if isinstance(question, WhereAmI):
-            key, payload = self._keys.any_relocalize(), encode_view(question.view)
-        else:
-            request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
-            key, payload = self._keys.any_route(), encode_route_request(request)
+        try:
+            key, payload = self._encoded(question)
+        except InvalidValue as unspeakable:
+            return Answer(question.number, None, str(unspeakable))
         replies = self._bus.ask(key, payload, self._timeout)
         error = NO_ANSWER if not replies else ""
         for reply in replies:
@@ -208,3 +231,10 @@ class FleetLink:
             except MapweaveError as refused:
                 error = str(refused)
         return Answer(question.number, None, error)
+
+    def _encoded(self, question: Question) -> tuple[str, bytes]:
+        """Whom to ask, and how; raises InvalidValue for what no message can hold."""
+        if isinstance(question, WhereAmI):
+            return self._keys.any_relocalize(), encode_view(question.view)
+        request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
+        return self._keys.any_route(), encode_route_request(request)

@@ -21,6 +21,10 @@ NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 """What an agent, server or fleet may be called: it becomes a chunk of a key expression."""
 
 
+NUMBER = re.compile(r"[0-9]{1,20}")
+"""Digits of other scripts, and superscripts, are none."""
+
+
 def check_name(name: str) -> str:
     """Return the name, or raise InvalidValue if it cannot stand in a key."""
     if not NAME.fullmatch(name):
@@ -63,7 +67,7 @@ class NodeId(NamedTuple):
             InvalidValue: the text is of another form.
         """
         parts = text.split(".")
-        if len(parts) != 3 or not parts[1].isdigit() or not parts[2].isdigit():
+        if len(parts) != 3 or not all(NUMBER.fullmatch(part) for part in parts[1:]):
             raise InvalidValue(f"{text!r} is no node id; they look like r0.1.17")
         return NodeId(check_name(parts[0]), int(parts[1]), int(parts[2]))
 

@@ -1,0 +1,325 @@
+"""The link to the fleet: missions, status, and questions that may stay without an answer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agent.fleet import (
+    MAX_WORDS,
+    NO_ANSWER,
+    AgentReport,
+    FleetLink,
+    decode_mission,
+    decode_status,
+    encode_mission,
+    encode_status,
+)
+from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question, WhereAmI, WhichWay
+from agent.pipeline import Status
+from hybridmap.camera import Camera
+from hybridmap.errors import InvalidMessage
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, View
+from wire.keys import Keys
+from wire.memory import MemoryBus, MemoryHub
+from wire.messages import (
+    MAX_BLOCKED,
+    decode_route_request,
+    decode_view,
+    encode_relocalize_answer,
+    encode_route_answer,
+)
+
+KEYS = Keys("fleet")
+MAP = MapId("r0", 1)
+HERE, THERE = NodeId("r0", 1, 3), NodeId("r1", 1, 9)
+VIEW = View(
+    np.array([[10.0, 20.0], [30.0, 40.0]], np.float32),
+    np.arange(32, dtype=np.uint8).reshape(2, 16),
+    Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3),
+)
+
+# Messages
+
+names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
+node_ids = st.builds(NodeId, names, st.integers(0, 2**53), st.integers(0, 2**40))
+missions = st.one_of(st.just(Idle()), st.just(Explore()), st.just(Carried()), st.builds(GoTo, node_ids))
+finite = st.floats(-1e6, 1e6)
+words = st.text(st.characters(categories=["L", "N", "P", "Zs"]).filter(str.isprintable), max_size=200)
+statuses = st.builds(
+    Status,
+    doing=words, detail=words, nodes=st.integers(0, 10**6), tracked=st.integers(0, 500),
+    map_from_robot=st.builds(Pose2, finite, finite, finite), finished=st.booleans(), mission=words,
+    fix_node=st.none() | node_ids, node_from_robot=st.builds(Pose2, finite, finite, finite),
+    legs=st.integers(0, 1000),
+)  # fmt: skip
+
+
+@given(missions)
+def test_missions_come_back_as_they_were(mission: Mission) -> None:
+    assert decode_mission(encode_mission(mission)) == mission
+
+
+@given(statuses, st.integers(0, 2**53))
+def test_statuses_come_back_as_they_were(status: Status, stamp_ns: int) -> None:
+    report = decode_status(encode_status(status, stamp_ns))
+    assert report == AgentReport(status, stamp_ns)
+    assert report.fix_node == status.fix_node
+
+
+odd_texts = ["goto", "r0.1.2", "r0.².1", "r0.1.٣", "r0.-1.2", "r0.1." + "9" * 900, "nan", "inf", "..", ""]
+scalars = st.one_of(
+    st.sampled_from(odd_texts), st.text(max_size=30), st.integers(-(2**63), 2**63 - 1), st.floats(),
+    st.booleans(), st.none(), st.binary(max_size=9),
+)  # fmt: skip
+
+
+@given(st.binary(max_size=200))
+def test_garbage_is_no_mission_and_no_status(data: bytes) -> None:
+    for decode in (decode_mission, decode_status):
+        with pytest.raises(InvalidMessage):
+            decode(data)
+
+
+@given(st.sampled_from(["goto", "idle", "GOTO", "fly", ""]) | scalars, scalars)
+def test_a_mission_is_read_or_refused(name: object, node: object) -> None:
+    data = msgpack.packb({"v": 1, "s": {"mission": name, "node": node}})
+    try:
+        mission = decode_mission(data)
+    except InvalidMessage:
+        return
+    assert decode_mission(encode_mission(mission)) == mission
+
+
+@given(statuses, st.data())
+def test_a_status_with_a_strange_field_is_read_or_refused(status: Status, data: st.DataObject) -> None:
+    fields = msgpack.unpackb(encode_status(status, 5))
+    name = data.draw(st.sampled_from(sorted(fields["s"])))
+    fields["s"][name] = data.draw(scalars)
+    try:
+        report = decode_status(msgpack.packb(fields))
+    except InvalidMessage:
+        return
+    numbers = [*report.status.map_from_robot.vector, *report.status.node_from_robot.vector]
+    assert np.isfinite(numbers).all()
+    assert decode_status(encode_status(report.status, report.stamp_ns)) == report
+
+
+@given(statuses, st.data())
+def test_a_status_without_a_field_is_refused(status: Status, data: st.DataObject) -> None:
+    fields = msgpack.unpackb(encode_status(status, 5))
+    name = data.draw(st.sampled_from(sorted(fields["s"])))
+    del fields["s"][name]
+    with pytest.raises(InvalidMessage, match=name):
+        decode_status(msgpack.packb(fields))
+
+
+@given(st.text(), st.integers(1, 400))
+def test_whatever_was_said_can_be_told(text: str, times: int) -> None:
+    """A status quotes servers and drivers: line breaks and long stories must not end the robot's loop."""
+    status = Status("looking", text * times, 0, 0, Pose2(), False)
+    said = decode_status(encode_status(status, 0)).status.detail
+    assert said.isprintable()
+    assert len(said) == min(len(text) * times, MAX_WORDS)
+    assert all(c == d for c, d in zip(text * times, said, strict=False) if c.isprintable())
+
+
+# The link
+
+
+def eventually(condition: Callable[[], object], seconds: float = 5.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "did not happen in time"
+        time.sleep(0.003)
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    return MemoryHub()
+
+
+@pytest.fixture
+def other(hub: MemoryHub) -> Iterator[MemoryBus]:
+    """The rest of the fleet."""
+    bus = MemoryBus(hub)
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def link(hub: MemoryHub) -> Iterator[FleetLink]:
+    bus = MemoryBus(hub)
+    link = FleetLink(bus, KEYS, MAP, answer_timeout=0.5)
+    yield link
+    link.close()
+    bus.close()
+
+
+def test_operators_commands_arrive_in_order_and_once(link: FleetLink, other: MemoryBus) -> None:
+    assert link.missions() == []
+    given: list[Mission] = [Explore(), GoTo(THERE), Idle()]
+    for mission in given:
+        (reply,) = other.ask(KEYS.mission("r0"), encode_mission(mission), 2.0)
+        assert (reply.payload, reply.error) == (b"ok", "")
+    assert link.missions() == given
+    assert link.missions() == []
+
+
+@pytest.mark.parametrize(
+    ("payload", "said"),
+    [
+        (b"garbage", "record"),
+        (msgpack.packb({"v": 1, "s": {"mission": "fly"}}), "no mission 'fly'; known are idle, explore"),
+        (msgpack.packb({"v": 1, "s": {"mission": "goto", "node": "kitchen"}}), "is no node id"),
+        (msgpack.packb({"v": 1, "s": {"mission": "goto", "node": "r0.².1"}}), "is no node id"),
+    ],
+)
+def test_what_is_no_command_is_refused_and_changes_nothing(
+    link: FleetLink, other: MemoryBus, payload: bytes, said: str
+) -> None:
+    (reply,) = other.ask(KEYS.mission("r0"), payload, 2.0)
+    assert said in reply.error
+    assert link.missions() == []
+    (reply,) = other.ask(KEYS.mission("r0"), encode_mission(Explore()), 2.0)
+    assert not reply.error, "and the next command is taken"
+
+
+def test_the_fleet_hears_what_the_robot_does(link: FleetLink, other: MemoryBus) -> None:
+    heard: list[AgentReport] = []
+    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(decode_status(sample.payload)))
+    status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False, "goto", THERE, Pose2(0.1, 0, 0), 4)
+    link.report(status, 123)
+    eventually(lambda: heard == [AgentReport(status, 123)])
+
+
+def test_the_agent_is_alive_until_it_goes(hub: MemoryHub, other: MemoryBus) -> None:
+    seen: list[tuple[str, bool]] = []
+    other.watch(KEYS.agents_alive(), lambda key, alive: seen.append((key, alive)))
+    bus = MemoryBus(hub)
+    link = FleetLink(bus, KEYS, MAP)
+    eventually(lambda: seen == [(KEYS.agent_alive(MAP), True)])
+    link.close()
+    eventually(lambda: seen[-1] == (KEYS.agent_alive(MAP), False))
+    assert other.ask(KEYS.mission("r0"), encode_mission(Idle()), 0.2) == []
+    bus.close()
+
+
+QUESTIONS: list[Question] = [WhereAmI(7, VIEW), WhichWay(7, HERE, THERE)]
+
+
+@pytest.mark.parametrize("question", QUESTIONS, ids=["where", "way"])
+def test_without_a_server_the_answer_says_so(link: FleetLink, question: Question) -> None:
+    link.ask(question)
+    (answer,) = link.answers(wait=True)
+    assert (answer.number, answer.content, answer.error) == (7, None, NO_ANSWER)
+    assert link.answers(wait=True) == (), "nothing is open: there is nothing to wait for"
+
+
+def test_the_servers_answers_come_with_their_numbers(link: FleetLink, other: MemoryBus) -> None:
+    asked: list[object] = []
+
+    def relocalize(request) -> None:
+        asked.append(decode_view(request.payload))
+        request.reply(encode_relocalize_answer(RelocalizeAnswer(Certainty.UNKNOWN, (), "never seen")))
+
+    def route(request) -> None:
+        asked.append(decode_route_request(request.payload))
+        request.reply(encode_route_answer(RouteAnswer((), "no way")))
+
+    other.serve(KEYS.relocalize("s0"), relocalize)
+    other.serve(KEYS.route("s0"), route)
+    link.ask(WhereAmI(1, VIEW))
+    link.ask(WhichWay(2, HERE, THERE, Pose2(0.25, -0.5, 1.0), ((HERE, THERE),)))
+    first, second = link.answers(wait=True)
+    assert isinstance(first.content, RelocalizeAnswer)
+    assert (first.number, first.content.certainty, first.content.reason) == (
+        1,
+        Certainty.UNKNOWN,
+        "never seen",
+    )
+    assert isinstance(second.content, RouteAnswer)
+    assert (second.number, second.content.reason, second.error) == (2, "no way", "")
+    view, request = asked
+    assert np.allclose(view.pixels, VIEW.pixels, atol=0.1)
+    assert np.array_equal(view.codes, VIEW.codes)
+    assert (request.start, request.goal, request.blocked) == (HERE, THERE, ((HERE, THERE),))
+    assert request.start_from_robot == Pose2(0.25, -0.5, 1.0)
+
+
+def test_a_robot_never_waits(link: FleetLink, other: MemoryBus) -> None:
+    release = threading.Event()
+
+    def slow(request) -> None:
+        release.wait(5)
+        request.reply(encode_route_answer(RouteAnswer((), "at last")))
+
+    other.serve(KEYS.route("s0"), slow)
+    begin = time.monotonic()
+    link.ask(WhichWay(1, HERE, THERE))
+    assert link.answers() == ()
+    assert time.monotonic() - begin < 0.2
+    release.set()
+    got: list[Answer] = []
+    eventually(lambda: got.extend(link.answers()) or got)
+    assert [answer.number for answer in got] == [1]
+
+
+def test_waiting_ends_when_the_time_is_over(link: FleetLink, other: MemoryBus) -> None:
+    release = threading.Event()
+    other.serve(KEYS.route("s0"), lambda request: release.wait(5))
+    begin = time.monotonic()
+    for number in (1, 2):
+        link.ask(WhichWay(number, HERE, THERE))
+    answers = link.answers(wait=True)
+    assert time.monotonic() - begin < 4.0
+    assert [(a.number, a.content) for a in answers] == [(1, None), (2, None)]
+    release.set()
+
+
+def test_a_server_that_refuses_is_quoted_and_another_one_is_heard(link: FleetLink, other: MemoryBus) -> None:
+    other.serve(KEYS.route("s0"), lambda request: request.refuse("no such node"))
+    link.ask(WhichWay(1, HERE, THERE))
+    (answer,) = link.answers(wait=True)
+    assert answer.content is None
+    assert "no such node" in answer.error
+    other.serve(KEYS.route("s1"), lambda request: request.reply(b"garbage"))
+    link.ask(WhichWay(2, HERE, THERE))
+    (answer,) = link.answers(wait=True)
+    assert answer.content is None
+    assert answer.error
+    other.serve(KEYS.route("s2"), lambda request: request.reply(encode_route_answer(RouteAnswer((), "yes"))))
+    link.ask(WhichWay(3, HERE, THERE))
+    (answer,) = link.answers(wait=True)
+    assert isinstance(answer.content, RouteAnswer)
+
+
+def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
+    link: FleetLink, other: MemoryBus
+) -> None:
+    """A robot that stood before very many closed doors must not lose its voice, nor stop a lock-step."""
+    other.serve(KEYS.route("s0"), lambda request: request.reply(encode_route_answer(RouteAnswer((), "yes"))))
+    link.ask(WhichWay(1, HERE, THERE, Pose2(), ((HERE, THERE),) * (MAX_BLOCKED + 1)))
+    link.ask(WhichWay(2, HERE, THERE))
+    got: list[Answer] = []
+    eventually(lambda: got.extend(link.answers()) or len(got) == 2)
+    assert got[0].content is None
+    assert "at most 256" in got[0].error
+    assert isinstance(got[1].content, RouteAnswer)
+
+
+def test_closing_twice_is_no_error(hub: MemoryHub) -> None:
+    bus = MemoryBus(hub)
+    link = FleetLink(bus, KEYS, MAP)
+    link.close()
+    link.close()
+    bus.close()
