@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import sys
 import tomllib
 import types
 import typing
@@ -102,8 +103,16 @@ def _convert(kind: Any, value: Any, where: str) -> Any:
     if origin is tuple:
         if not isinstance(value, list):
             raise SettingsError(f"{where}: must be a list")
-        return tuple(_convert(typing.get_args(kind)[0], v, where) for v in value)
+        kinds = typing.get_args(kind)
+        if kinds[-1] is Ellipsis:
+            kinds = (kinds[0],) * len(value)
+        if len(value) != len(kinds):
+            raise SettingsError(f"{where}: must be a list of {len(kinds)}")
+        return tuple(_convert(one, v, where) for one, v in zip(kinds, value, strict=True))
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        # A comparison with "not a number" is false; an integer of TOML may be larger than any float.
+        if not -sys.float_info.max <= value <= sys.float_info.max:
+            raise SettingsError(f"{where}: {value!r} is no float")
         return float(value)
     if kind in (int, str, bool) and isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value

@@ -1,0 +1,183 @@
+"""Settings: TOML over defaults, and one line for whatever is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hybridmap.errors import SettingsError
+from mapweave.settings import Settings, build, load_settings
+
+
+def load(tmp_path: Path, text: str | bytes) -> Settings:
+    path = tmp_path / "robot.toml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return load_settings(path)
+
+
+def refused(tmp_path: Path, text: str | bytes) -> str:
+    """The one line."""
+    with pytest.raises(SettingsError) as error:
+        load(tmp_path, text)
+    said = str(error.value)
+    assert "\n" not in said
+    assert said.startswith(str(tmp_path / "robot.toml"))
+    return said
+
+
+def test_without_a_file_all_is_default(tmp_path):
+    assert load_settings(None) == Settings() == load(tmp_path, "")
+
+
+def test_what_is_given_lies_over_the_defaults(tmp_path):
+    given_settings = load(
+        tmp_path,
+        """
+        [network]
+        endpoints = ["tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"]
+        [pipeline]
+        seed = 7
+        [pipeline.explorer]
+        drive = 1
+        [pipeline.mapper.tracking.tracker]
+        window_px = 15
+        """,
+    )
+    default = Settings()
+    pipeline = default.pipeline
+    tracking = pipeline.mapper.tracking
+    tracking = dataclasses.replace(tracking, tracker=dataclasses.replace(tracking.tracker, window_px=15))
+    expected = Settings(
+        dataclasses.replace(default.network, endpoints=("tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447")),
+        dataclasses.replace(
+            pipeline,
+            seed=7,
+            explorer=dataclasses.replace(pipeline.explorer, drive=1.0),
+            mapper=dataclasses.replace(pipeline.mapper, tracking=tracking),
+        ),
+    )
+    assert given_settings == expected
+    assert type(given_settings.pipeline.explorer.drive) is float
+
+
+def as_toml(values: dict[str, Any], name: str = "") -> str:
+    """Plain tables as TOML, written by hand."""
+    plain, tables = [], []
+    for key, value in values.items():
+        if isinstance(value, dict):
+            tables.append(as_toml(value, f"{name}.{key}" if name else key))
+        elif value is not None:
+            text = list(value) if isinstance(value, tuple) else value
+            plain.append(f"{key} = {str(text).lower() if isinstance(text, bool) else repr(text)}")
+    return "\n".join([f"[{name}]" if name else "", *plain, *tables])
+
+
+def test_every_setting_there_is_can_be_written_down(tmp_path):
+    """All defaults as a file give the defaults: no setting has a kind that a file cannot name."""
+    assert load(tmp_path, as_toml(dataclasses.asdict(Settings()))) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[netwrok]", "no setting 'netwrok'; did you mean 'network'?"),
+        ("[network]\nendpoint = []", "network: no setting 'endpoint'; did you mean 'endpoints'?"),
+        (
+            "[pipeline.explorer]\ntravel_sped = 1",
+            "pipeline: explorer: no setting 'travel_sped'; did you mean",
+        ),
+        ("[network]\nzzz = 1", "no setting 'zzz'; known are fleet, endpoints, server"),
+        ("network = 3", "network: must be a table"),
+        ("pipeline = []", "pipeline: must be a table"),
+        ("[network]\nfleet = 3", "network: fleet: 3 is no str"),
+        ("[network]\nendpoints = 'tcp/1.2.3.4:5'", "network: endpoints: must be a list"),
+        ("[network]\nendpoints = [7447]", "network: endpoints: 7447 is no str"),
+        ("[pipeline]\nseed = 1.5", "pipeline: seed: 1.5 is no int"),
+        ("[pipeline]\nseed = true", "pipeline: seed: True is no int"),
+        ("[pipeline.explorer]\ndrive = 'far'", "pipeline: explorer: drive: 'far' is no float"),
+        ("[pipeline.explorer]\ndrive = false", "pipeline: explorer: drive: False is no float"),
+        ("[pipeline.explorer]\ndrive = nan", "pipeline: explorer: drive: nan is no"),
+        (f"[pipeline.explorer]\ndrive = 1{'0' * 400}", "is no float"),
+        ("[pipeline.explorer]\ndrive = [1]", "pipeline: explorer: drive: [1] is no float"),
+        ("[pipeline.mapper.tracking.tracker]\nlevels = 2.0", "levels: 2.0 is no int"),
+        ("[pipeline.navigator]\nsure = [0.1]", "navigator: sure: must be a list of 2"),
+        ("[pipeline.navigator]\nsure = [0.1, 0.1, 0.1]", "navigator: sure: must be a list of 2"),
+        ("[pipeline.navigator]\nsure = [0.1, 'x']", "navigator: sure: 'x' is no float"),
+        ("[network", "robot.toml: "),
+        ("a = 1\na = 2", "robot.toml: "),
+        (b"\xff\xfe", "robot.toml: "),
+        ("when = 1979-05-27", "no setting 'when'"),
+        ("[pipeline]\nseed = 1979-05-27", "is no int"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(tmp_path, text, said):
+    assert said in refused(tmp_path, text)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(SettingsError, match=r"nothing\.toml: no such file$"):
+        load_settings(tmp_path / "nothing.toml")
+    with pytest.raises(SettingsError) as error:
+        load_settings(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Strict:
+    """Settings that refuse by themselves."""
+
+    share: float = 0.5
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"share {self.share} is not in 0..1")
+
+
+def test_what_a_part_refuses_is_said_with_its_place():
+    assert build(Strict, {"share": 1, "name": "x"}, "here") == Strict(1.0, "x")
+    with pytest.raises(SettingsError, match=r"^here: share 2\.0 is not in 0\.\.1$"):
+        build(Strict, {"share": 2}, "here")
+    with pytest.raises(SettingsError, match="here: name: 3 is no str"):
+        build(Strict, {"name": 3}, "here")
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+@given(st.data())
+def test_any_value_anywhere_is_taken_or_refused(data):
+    """A walk down the settings to any one of them, then anything as its value."""
+    cls, path = Settings, []
+    while dataclasses.is_dataclass(cls):
+        field = data.draw(st.sampled_from(dataclasses.fields(cls)))
+        path.append(field.name)
+        default = getattr(cls(), field.name)
+        cls = type(default)
+        if data.draw(st.integers(0, 9)) == 0:
+            break
+    value = data.draw(values)
+    table: Any = value
+    for name in reversed(path):
+        table = {name: table}
+    try:
+        made: Any = build(Settings, table, "file")
+    except SettingsError as error:
+        assert str(error).startswith("file: ")
+        assert "\n" not in str(error)
+        return
+    for name in path:
+        made = getattr(made, name)
+    assert type(made) is type(default)
+    if isinstance(default, tuple) and path[-1] != "endpoints":
+        assert len(made) == len(default)
