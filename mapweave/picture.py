@@ -102,9 +102,10 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.set_title(picture.title)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=6, frameon=False, fontsize=9)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=6, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    figure.savefig(path, format="png")
 
 
 def _draw_outline(axes: Any, outline: Outline) -> None:
@@ -138,8 +139,8 @@ def _draw_nodes(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> N
     for agent, colour in colours.items():
         own = np.array([p.vector for n, p in picture.postures.items() if n.agent == agent])
         axes.quiver(
-            own[:, 0], own[:, 1], np.cos(own[:, 2]), np.sin(own[:, 2]), color=colour, angles="xy",
-            scale=42, width=0.0022, headwidth=4, zorder=3,
+            own[:, 0], own[:, 1], np.cos(own[:, 2]), np.sin(own[:, 2]), color=colour,
+            angles=np.degrees(own[:, 2]), scale=42, width=0.0022, headwidth=4, zorder=3,
         )  # fmt: skip
         label = f"{agent}: {len(own)} nodes"
         axes.plot(own[:, 0], own[:, 1], "o", color=colour, markersize=4, zorder=3, label=label)
