@@ -42,6 +42,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:
         return 1
+    except OSError as error:
+        # A folder that is a file, a disk that is full: the system's words say it best.
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"mapweave: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

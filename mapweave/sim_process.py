@@ -15,12 +15,14 @@ def run_sim(bus: Bus, fleet: str, robots: int, rooms: int, seed: int, stop: thre
     """Serve simulated bodies r0, r1 ... until told to stop.
 
     Raises:
-        SettingsError: a number of robots or rooms that cannot work.
+        SettingsError: a number of robots or rooms, or a seed, that cannot work.
     """
     if not 1 <= robots <= 16:
         raise SettingsError(f"--robots {robots}: use 1 to 16")
     if not 3 <= rooms <= 12:
         raise SettingsError(f"--rooms {rooms}: use 3 to 12")
+    if seed < 0:
+        raise SettingsError(f"--seed {seed}: use 0 or more")
     world = make_office(seed, rooms)
     with Simulation(world, [f"r{k}" for k in range(robots)], seed) as simulation:
         bridge = SimBridge(simulation, bus, fleet)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import threading
 from pathlib import Path
 from typing import Any
 
+from agent.drivers.robot import Robot
 from hybridmap.node import check_name
 from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
 
@@ -48,6 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     bus, keys = connect(network)
     try:
         robot = RemoteRobot(bus, network.fleet, name)
+        # Who is told to stop while it waits for its body stops waiting.
+        threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
         options = AgentOptions(
             name=name,
             data=arguments.data,
@@ -61,3 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         bus.close()
     return 0
+
+
+def _close_on(stop: threading.Event, robot: Robot) -> None:
+    stop.wait()
+    robot.close()

@@ -25,6 +25,7 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
+    from hybridmap.node import check_name
     from mapserver.server import MapServer
     from wire.bus_settings import BusSettings
     from wire.keys import Keys
@@ -32,11 +33,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
+    name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
-        name = arguments.name or network.server
-        with MapServer(bus, Keys(network.fleet), arguments.data / f"{name}.sqlite", name) as server:
+        with MapServer(bus, keys, arguments.data / f"{name}.sqlite", name) as server:
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
             said = ""

@@ -25,10 +25,11 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve the simulated bodies until told to stop."""
-    from mapweave.sim_process import run_sim
-
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
+
+    from mapweave.sim_process import run_sim
+
     stop = stop_on_signals()
     bus, _ = connect(network)
     try:
