@@ -1,0 +1,121 @@
+"""`mapweave map show` on files that are written here."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridmap.change import ChangeBody, EdgePut, NodePut
+from hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.synthetic import room, take_map
+from mapweave.cli import main
+from wire.mapfile import MapFile, write_map_file
+
+TOUR = [Pose2(2.5, 2.0, h) for h in np.arange(0, 2 * math.pi, math.pi / 3)]
+
+
+def changes(agent: str) -> list[ChangeBody]:
+    """A look around in a room."""
+    rng = np.random.default_rng(0)
+    nodes, edges = take_map(room(0, 0, 5, 4, 700, rng), MapId(agent, 1), TOUR, rng)
+    return [*map(NodePut, nodes), *map(EdgePut, edges)]
+
+
+@pytest.fixture
+def agent_file(tmp_path: Path) -> Path:
+    """One robot's map."""
+    path = tmp_path / "r0.mapweave"
+    write_map_file(path, MapFile("agent", "r0.1", tuple(changes("r0"))))
+    return path
+
+
+@pytest.fixture
+def merged_file(tmp_path: Path) -> Path:
+    """Two robots' maps that are joined, and a node of nobody's component."""
+    bodies = [*changes("r0"), *changes("r1")]
+    nodes = [body.node for body in bodies if isinstance(body, NodePut)]
+    near = PoseGaussian.from_sigmas(Pose2(), 0.02, 0.02)
+    link = Edge(NodeId("s0", 1, 1), nodes[0].id, NodeId("r1", 1, 1), near, EdgeKind.MERGED)
+    postures = {n.id: (1 if n.id == NodeId("r1", 1, 11) else 0, n.map_from_robot) for n in nodes}
+    path = tmp_path / "merged.mapweave"
+    write_map_file(path, MapFile("merged", "two robots", (*bodies, EdgePut(link)), postures))
+    return path
+
+
+def summary(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[str, object]:
+    assert main(["map", "show", *map(str, arguments), "--json"]) == 0
+    out, err = capfd.readouterr()
+    assert err == ""
+    assert len(out.splitlines()) == 1
+    found: dict[str, object] = json.loads(out)
+    return found
+
+
+def test_the_summary_of_an_agents_map(agent_file, capfd):
+    bodies = changes("r0")
+    counts = [len(body.node.landmarks) for body in bodies if isinstance(body, NodePut)]
+    assert summary(capfd, agent_file) == {
+        "file": str(agent_file),
+        "kind": "agent",
+        "title": "r0.1",
+        "bytes": agent_file.stat().st_size,
+        "maps": ["r0.1"],
+        "nodes": len(TOUR),
+        "edges": {"turned": len(TOUR) - 1},
+        "links": 0,
+        "components": 1,
+        "landmarks_per_node_median": float(np.median(counts)),
+        "picture": str(agent_file.with_suffix(".png")),
+    }
+    image = cv2.imread(str(agent_file.with_suffix(".png")))
+    assert image is not None
+    assert image.std() > 5
+
+
+def test_the_summary_of_a_merged_map(merged_file, capfd, tmp_path):
+    found = summary(capfd, merged_file, "--out", tmp_path / "pictures" / "m.png")
+    assert found["kind"] == "merged"
+    assert found["maps"] == ["r0.1", "r1.1"]
+    assert found["nodes"] == 2 * len(TOUR)
+    assert found["edges"] == {"turned": 2 * (len(TOUR) - 1), "merged": 1}
+    assert (found["links"], found["components"]) == (1, 2)
+    assert (tmp_path / "pictures" / "m.png").stat().st_size > 5000
+
+
+def test_without_a_picture_none_is_drawn(agent_file, capfd):
+    assert "picture" not in summary(capfd, agent_file, "--no-picture")
+    assert not agent_file.with_suffix(".png").exists()
+
+
+def test_people_read_lines(agent_file, capfd):
+    assert main(["map", "show", str(agent_file), "--no-picture"]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capfd.readouterr().out.splitlines() if line)
+    assert lines["nodes"] == str(len(TOUR))
+    assert lines["edges"] == f"{len(TOUR) - 1} turned"
+    assert lines["maps"] == "r0.1"
+
+
+def test_a_map_of_nothing(tmp_path, capfd):
+    path = tmp_path / "empty.mapweave"
+    write_map_file(path, MapFile("agent", "nothing", ()))
+    found = summary(capfd, path)
+    assert (found["nodes"], found["edges"], found["components"]) == (0, {}, 0)
+    assert "picture" not in found
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+def test_a_truncated_file_is_refused(agent_file, capfd, share):
+    data = agent_file.read_bytes()
+    agent_file.write_bytes(data[: int(share * len(data))])
+    assert main(["map", "show", str(agent_file)]) == 1
+    out, err = capfd.readouterr()
+    assert out == ""
+    (line,) = err.splitlines()
+    assert line.startswith(f"mapweave: {agent_file}: is ")
+    assert not agent_file.with_suffix(".png").exists()
