@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
+import os
 
-# First: the package itself says how many threads BLAS gets, and numpy must not be there before.
-import mapweave  # noqa: F401
+# numpy reads it when it is imported, and cv2 imports numpy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import cv2
 
 cv2.setNumThreads(1)

@@ -76,7 +76,7 @@ def test_statuses_come_back_as_they_were(status: Status, stamp_ns: int) -> None:
     assert report.fix_node == status.fix_node
 
 
-odd_texts = ["goto", "r0.1.2", "r0.².1", "r0.1.٣", "r0.-1.2", "r0.1." + "9" * 900, "nan", "inf", "..", ""]
+odd_texts = ["goto", "r0.1.2", "r0.².1", "r0.1.٣", "r0.-1.2", "r0.1." + "9" * 400, "nan", "inf", "..", ""]
 scalars = st.one_of(
     st.sampled_from(odd_texts), st.text(max_size=30), st.integers(-(2**63), 2**63 - 1), st.floats(),
     st.booleans(), st.none(), st.binary(max_size=9),

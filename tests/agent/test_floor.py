@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from agent.floor import Floor, FloorSettings
 from agent.observation import RobotDescription
@@ -69,7 +70,7 @@ def exact_room(floor: Floor) -> np.ndarray:
 def around(floor: Floor, points: np.ndarray) -> np.ndarray:
     """(N,) m, exact distance from points to the nearest middle of an occupied cell."""
     things = np.array([floor.centre(tuple(c)) for c in np.argwhere(occupied(floor))])
-    return np.linalg.norm(points[:, None] - things[None], axis=2).min(axis=1)
+    return np.asarray(cKDTree(things).query(points)[0])
 
 
 def dense(start: np.ndarray, corners: list[np.ndarray]) -> np.ndarray:
