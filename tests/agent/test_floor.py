@@ -103,7 +103,9 @@ def test_rays_are_free_along_them_and_occupied_at_their_end(where, readings):
     for direction, reading in zip(way, proximity, strict=True):
         reach = reading + ROBOT.radius
         along = here + fine[fine < reach + 0.005, None] * direction
-        touched[tuple(floor.cells(along).T)] = True
+        # Also corners that a ray cuts between two of these points, 5 mm apart.
+        for nudge in ([0, 0], [0.003, 0.003], [0.003, -0.003], [-0.003, 0.003], [-0.003, -0.003]):
+            touched[tuple(floor.cells(along + nudge).T)] = True
         before = here + fine[fine < min(reach - 0.5 * CELL, ROBOT.ranger_reach), None] * direction
         cells, count = np.unique(floor.cells(before), axis=0, return_counts=True)
         crossed[tuple(cells[count * 0.005 > 1.1 * CELL].T)] = True
