@@ -21,6 +21,9 @@ class DetourSettings:
         turn_rate: rad/s.
         aligned: it drives at full speed when it faces its way, and not at all when off by this, rad.
         replan_every: ticks between two plans.
+        tight: with something ahead nearer than this to its edge the robot backs off first, m: beside a wall
+            that it almost touches, the guard lets it move nowhere but away.
+        back_off: speed of that, m/s.
         corner: a corner of the way is passed within this distance, m.
     """
 
@@ -29,6 +32,8 @@ class DetourSettings:
     aligned: float = 0.4
     replan_every: int = 15
     corner: float = 0.08
+    tight: float = 0.07
+    back_off: float = 0.08
 
 
 class Detour:
@@ -43,6 +48,8 @@ class Detour:
         self._floor = Floor(description)
         self._odom_from_robot = Pose2()
         self._corners: list[Array] = []
+        self._bearings = np.array(description.ranger_bearings)
+        self._proximity: Array = np.zeros(0)
         self._tick = 0
         self._replan_at = 0
 
@@ -56,6 +63,7 @@ class Detour:
         self._tick += 1
         self._odom_from_robot = self._odom_from_robot @ observation.odometry.motion()
         self._floor.see(self._odom_from_robot, observation.proximity)
+        self._proximity = observation.proximity
 
     def toward(self, robot_from_target: Pose2) -> Command:
         """Turn toward a position, then drive to it.
@@ -64,6 +72,8 @@ class Detour:
             robot_from_target: where it is; its heading does not matter.
         """
         s, here = self._settings, self._odom_from_robot
+        if self._cornered():
+            return Command(-s.back_off, 0.0)
         start = np.array([here.x, here.y])
         goal = here.apply(np.array([robot_from_target.x, robot_from_target.y]))
         while self._corners and np.linalg.norm(self._corners[0] - start) < s.corner:
@@ -78,3 +88,12 @@ class Detour:
         error = math.atan2(ahead[1], ahead[0])
         speed = min(s.speed, 0.8 * float(np.linalg.norm(ahead))) * max(0.0, 1.0 - abs(error) / s.aligned)
         return Command(speed, float(np.clip(1.8 * error, -s.turn_rate, s.turn_rate)))
+
+    def _cornered(self) -> bool:
+        """Whether something ahead is so near that the robot must back off, and nothing is behind."""
+        if len(self._proximity) != len(self._bearings) or not len(self._bearings):
+            return False
+        ahead = np.cos(self._bearings) > 0.3
+        behind = np.cos(self._bearings) < -0.3
+        tight = self._settings.tight
+        return bool(self._proximity[ahead].min() < tight and self._proximity[behind].min() > 2 * tight)

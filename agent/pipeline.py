@@ -9,6 +9,7 @@ It knows no network, no disk and no clock: live robots, recordings, simulation a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from agent.explorer import Explorer, ExplorerSettings
@@ -105,6 +106,8 @@ class Pipeline:
         self._explorer: Explorer | None = None
         self._passenger: Passenger | None = None
         self._navigator: Navigator | None = None
+        self._refusal = ""
+        self._direction = 1.0
 
     @property
     def map(self) -> HybridMap:
@@ -117,7 +120,15 @@ class Pipeline:
         return self._mission
 
     def set_mission(self, mission: Mission) -> None:
-        """Begin another mission. Exploration that was interrupted goes on where it was."""
+        """Begin another mission. Exploration that was interrupted goes on where it was.
+
+        A robot that has navigated does not map on: it may have been carried anywhere in between, and the
+        next edge would be false. It stands still and says so.
+        """
+        self._refusal = ""
+        if self._navigator is not None and isinstance(mission, Explore | Carried):
+            self._refusal = "it has navigated since it mapped: start the agent anew to map on, in a new map"
+            mission = Idle()
         self._mission = mission
         match mission:
             case Explore() if self._explorer is None:
@@ -154,10 +165,14 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers)
         safe, warning = guard(command, observation.proximity, self._description)
+        if observation.bumped and safe.forward * self._direction > 0:
+            safe, warning = Command(0.0, safe.turn), "stopped: the bumper is pressed"
+        elif not observation.bumped and safe.forward:
+            self._direction = math.copysign(1.0, safe.forward)
         return Step(safe, tuple(changes), tuple(questions), self._status(warning))
 
     def _status(self, warning: str) -> Status:
-        doing, detail, finished = "idle", "no mission", False
+        doing, detail, finished = "idle", self._refusal or "no mission", False
         match self._mission:
             case Explore() if self._explorer is not None:
                 doing, detail = str(self._explorer.phase), self._explorer.detail
