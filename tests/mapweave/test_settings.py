@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hybridmap.errors import SettingsError
-from mapweave.settings import Settings, build, load_settings
+from mapweave.settings import Settings, load_settings
+from wire.tables import build
 
 
 def load(tmp_path: Path, text: str | bytes) -> Settings:

@@ -1,0 +1,1 @@
+"""Trials: a scenario in the simulator, from the first tick to the verdict."""
