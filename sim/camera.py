@@ -1,0 +1,192 @@
+"""What a robot's camera is like: intrinsics, lens, shutter, noise; and a few that can be had by name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from hybridmap.camera import Camera
+from hybridmap.errors import InvalidValue
+
+Distortion = tuple[float, float, float, float, float]
+"""(k1, k2, p1, p2, k3), OpenCV's order."""
+
+WEBCAM = Camera(width=320, height=240, fx=277.0, fy=277.0, cx=159.5, cy=119.5, mount_height=0.3)
+"""60 degrees across, on a mast above the axle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """How brightness becomes grey levels.
+
+    The automatic works as in small cameras: while the picture's mean is within a band around the wanted grey
+    it does nothing, outside it moves the gain towards the wanted grey with a lag. Values saturate at 0 and 255.
+
+    Attributes:
+        automatic: whether the gain follows the light at all.
+        wanted: mean grey level that the automatic wants.
+        band: logarithm of the ratio of mean and wanted grey that it tolerates.
+        lag: time constant of the gain, s.
+        lowest: gain.
+        highest: gain; noise grows with it.
+        gain_error: standard deviation of one camera's sensitivity from another's, as a share.
+        vignetting: share of the light that is lost in the corners.
+        seconds: how long the shutter is open, s; what the picture is blurred by when the robot turns.
+    """
+
+    automatic: bool = True
+    wanted: float = 130.0
+    band: float = 0.5
+    lag: float = 0.4
+    lowest: float = 0.25
+    highest: float = 8.0
+    gain_error: float = 0.0
+    vignetting: float = 0.0
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no camera can do.
+
+        Raises:
+            InvalidValue: a number out of range.
+        """
+        within = {
+            "wanted": (1.0, 254.0), "band": (0.0, 10.0), "lag": (0.0, 60.0), "lowest": (1e-3, 1.0),
+            "highest": (1.0, 1e3), "gain_error": (0.0, 0.3), "vignetting": (0.0, 0.95), "seconds": (0.0, 0.1),
+        }  # fmt: skip
+        for name, (low, high) in within.items():
+            check_range(f"exposure: {name}", getattr(self, name), low, high)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSetup:
+    """A robot's camera.
+
+    Attributes:
+        intrinsics: of the ideal pinhole, and where it is mounted.
+        distortion: of the lens.
+        read_noise: standard deviation of every pixel at gain 1, grey levels.
+        shot_noise: standard deviation that a white pixel has in addition, grey levels; darker ones have less,
+            by the square root of their brightness.
+        exposure: brightness and shutter.
+        dropped: probability that a tick has no frame.
+    """
+
+    intrinsics: Camera = WEBCAM
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+    read_noise: float = 2.0
+    shot_noise: float = 0.0
+    exposure: Exposure = field(default_factory=Exposure)
+    dropped: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no camera can be.
+
+        Raises:
+            InvalidValue: a number out of range, or a lens that shows one point in two places.
+        """
+        check_range("camera: read_noise", self.read_noise, 0.0, 60.0)
+        check_range("camera: shot_noise", self.shot_noise, 0.0, 60.0)
+        check_range("camera: dropped", self.dropped, 0.0, 1.0)
+        for value in self.distortion:
+            check_range("camera: distortion", value, -10.0, 10.0)
+        if max(self.intrinsics.width, self.intrinsics.height) > 2048:
+            raise InvalidValue("camera: the simulator draws at most 2048 pixels across and down")
+        if not self._lens_is_single():
+            raise InvalidValue(
+                f"camera: with distortion {list(self.distortion)} the lens folds the image's corners over: "
+                "use smaller coefficients or a longer focal length"
+            )
+
+    def _lens_is_single(self) -> bool:
+        """Whether every pixel comes from one ray less than 80 degrees off the axis."""
+        c = self.intrinsics
+        columns, rows = np.linspace(0, c.width - 1, 33), np.linspace(0, c.height - 1, 25)
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
+        matrix = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
+        lens = np.array(self.distortion)
+        rays = undistorted(pixels, matrix, lens)
+        if not np.isfinite(rays).all() or np.hypot(*rays.T).max() > math.tan(math.radians(80)):
+            return False
+        points = np.column_stack([rays, np.ones(len(rays))])
+        again, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)
+        if np.abs(again.reshape(-1, 2) - pixels.reshape(-1, 2)).max() > 0.05:
+            return False
+        # From the axis to the farthest corner the picture must only grow.
+        farthest = float(np.hypot(*rays.T).max())
+        radii = np.linspace(0.0, farthest, 200)
+        k1, k2, _, _, k3 = self.distortion
+        grown = radii * (1 + k1 * radii**2 + k2 * radii**4 + k3 * radii**6)
+        return bool((np.diff(grown) > 0).all())
+
+
+def undistorted(pixels: np.ndarray, matrix: np.ndarray, lens: np.ndarray) -> np.ndarray:
+    """(N, 2) tangents of the rays that (N, 1, 2) px of the real image show.
+
+    OpenCV's fixed-point iteration diverges at the border of a wide lens, so Newton's method does it, on
+    the same model (Brown-Conrady, as in cv2.projectPoints).
+    """
+    focal, centre = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
+    wanted = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - centre) / focal
+    k1, k2, p1, p2, k3 = (float(k) for k in lens)
+    rays = wanted.copy()
+    for _ in range(30):
+        x, y = rays.T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)  # of radial, by r2
+        off_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - wanted[:, 0]
+        off_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - wanted[:, 1]
+        xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+        xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+        yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+        determinant = xx * yy - xy * xy
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.stack([yy * off_x - xy * off_y, xx * off_y - xy * off_x], axis=1) / determinant[:, None]
+        # Short steps: far out, Newton would jump over the fold of the polynomial.
+        rays -= np.clip(step, -0.2, 0.2)
+        if not np.isfinite(step).all() or np.abs(step).max() < 1e-13:
+            break
+    return rays
+
+
+def check_range(what: str, value: float, low: float, high: float) -> None:
+    """Refuse a number.
+
+    Raises:
+        InvalidValue: it is not finite or not between the limits.
+    """
+    if not (math.isfinite(value) and low <= value <= high):
+        raise InvalidValue(f"{what} is {value:g}, must be between {low:g} and {high:g}")
+
+
+CAMERAS: dict[str, CameraSetup] = {
+    "webcam": CameraSetup(),
+    "wide": CameraSetup(
+        Camera(width=320, height=240, fx=165.0, fy=165.0, cx=161.2, cy=118.4, mount_height=0.3),
+        distortion=(-0.28, 0.07, 0.0006, -0.0004, 0.0),
+        read_noise=2.5,
+        shot_noise=2.0,
+        exposure=Exposure(band=0.25, gain_error=0.05, vignetting=0.35),
+    ),
+    "phone": CameraSetup(
+        Camera(width=320, height=240, fx=262.0, fy=262.4, cx=158.1, cy=121.0, mount_height=0.3),
+        distortion=(0.08, -0.15, 0.0003, 0.0005, 0.02),
+        read_noise=1.2,
+        shot_noise=1.5,
+        exposure=Exposure(band=0.15, lag=0.25, gain_error=0.03, vignetting=0.15, seconds=0.012),
+    ),
+    "cheap": CameraSetup(
+        Camera(width=320, height=240, fx=250.0, fy=251.0, cx=155.0, cy=123.5, mount_height=0.3),
+        distortion=(-0.18, 0.05, 0.001, -0.0008, 0.0),
+        read_noise=4.5,
+        shot_noise=4.0,
+        exposure=Exposure(band=0.2, lag=0.8, gain_error=0.1, vignetting=0.3, seconds=0.02),
+        dropped=0.02,
+    ),
+}
+"""Cameras by name: `webcam` is ideal but for noise; `wide` sees 106 degrees across and bends what it sees;
+`phone` is sharp and quick but blurs a little in turns; `cheap` is noisy, slow to adapt, and drops frames."""

@@ -1,0 +1,138 @@
+"""What a simulated robot is like; made from the tables of a scenario file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from agent.observation import RobotDescription
+from hybridmap.errors import InvalidValue, SettingsError
+from hybridmap.node import check_name
+from hybridmap.pose import Pose2
+from sim.body import BodySettings
+from sim.camera import CAMERAS, CameraSetup, check_range
+from wire.tables import build
+
+MOST_ROBOTS = 16
+"""In one simulation."""
+
+
+@dataclass(frozen=True)
+class RobotSetup:
+    """One robot.
+
+    Attributes:
+        name: of the robot.
+        camera: what it sees with.
+        body: how its wheels and motors differ from the ideal.
+        start: where it starts, (x m, y m, heading rad) in world; chosen from the seed if not given.
+        rangers: number of proximity sensors, evenly around it.
+        ranger_reach: the rangers' maximum, m.
+        range_noise: standard deviation of a range, as a share of it.
+        max_forward: speed limit, m/s.
+        max_turn: rate limit, rad/s.
+    """
+
+    name: str
+    camera: CameraSetup = field(default_factory=CameraSetup)
+    body: BodySettings = field(default_factory=BodySettings)
+    start: tuple[float, float, float] | None = None
+    rangers: int = 16
+    ranger_reach: float = 3.0
+    range_noise: float = 0.01
+    max_forward: float = 0.3
+    max_turn: float = 0.8
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be built.
+
+        Raises:
+            InvalidValue: a name that cannot be one, or a number out of range.
+        """
+        check_name(self.name)
+        where = f"robot {self.name}"
+        check_range(f"{where}: rangers", self.rangers, 0, 256)
+        check_range(f"{where}: ranger_reach", self.ranger_reach, 0.1, 50.0)
+        check_range(f"{where}: range_noise", self.range_noise, 0.0, 0.5)
+        check_range(f"{where}: max_forward", self.max_forward, 0.01, 1.0)
+        check_range(f"{where}: max_turn", self.max_turn, 0.01, 3.0)
+        for value in self.start or ():
+            check_range(f"{where}: start", value, -1e4, 1e4)
+
+    @property
+    def pose(self) -> Pose2 | None:
+        """Where it starts, `world_from_robot`, if that is given."""
+        return None if self.start is None else Pose2(*self.start)
+
+    def describe(self) -> RobotDescription:
+        """What the robot's agent is told."""
+        return RobotDescription(
+            camera=self.camera.intrinsics,
+            distortion=self.camera.distortion,
+            ranger_bearings=tuple(k * math.tau / self.rangers for k in range(self.rangers)),
+            ranger_reach=self.ranger_reach if self.rangers else 0.0,
+            max_forward=self.max_forward,
+            max_turn=self.max_turn,
+        )
+
+
+def robot_from_table(table: Mapping[str, Any], where: str = "robot") -> RobotSetup:
+    """Make a robot from a table of a scenario file.
+
+    Its `camera` is a name (`camera = "wide"`), or a table of what differs from the camera that its `like`
+    names (`camera = { like = "wide", read_noise = 4.0 }`), from the webcam if none is named.
+
+    Raises:
+        SettingsError: an unknown name, or a value of the wrong kind.
+        InvalidValue: a value out of range.
+    """
+    values = dict(table)
+    if "camera" in values:
+        values["camera"] = camera_from_table(values["camera"], f"{where}: camera")
+    return build(RobotSetup, values, where)
+
+
+def camera_from_table(value: Any, where: str = "camera") -> CameraSetup:
+    """Make a camera from its name, or from a table of what differs from a camera with a name.
+
+    Raises:
+        SettingsError: an unknown name, or a value of the wrong kind.
+        InvalidValue: a value out of range.
+    """
+    if isinstance(value, CameraSetup):
+        return value
+    changes = {"like": value} if isinstance(value, str) else value
+    if not isinstance(changes, Mapping):
+        raise SettingsError(f"{where}: must be a name ({', '.join(CAMERAS)}) or a table")
+    changes = dict(changes)
+    name = changes.pop("like", "webcam")
+    if not isinstance(name, str) or name not in CAMERAS:
+        raise SettingsError(f"{where}: no camera {name!r}; there are {', '.join(CAMERAS)}")
+    return build(CameraSetup, _changed(dataclasses.asdict(CAMERAS[name]), changes), where)
+
+
+def _changed(defaults: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The defaults with the changes in them, table by table."""
+    merged = dict(defaults)
+    for name, value in changes.items():
+        default = merged.get(name)
+        both = isinstance(default, Mapping) and isinstance(value, Mapping)
+        merged[name] = _changed(default, value) if both and default is not None else value
+    return merged
+
+
+def robot_setups(robots: Sequence[str | RobotSetup]) -> tuple[RobotSetup, ...]:
+    """Names alone become standard robots.
+
+    Raises:
+        InvalidValue: no robot, too many, or two of the same name.
+    """
+    setups = tuple(RobotSetup(robot) if isinstance(robot, str) else robot for robot in robots)
+    if not 1 <= len(setups) <= MOST_ROBOTS:
+        raise InvalidValue(f"{len(setups)} robots: the simulator carries 1 to {MOST_ROBOTS}")
+    if len({setup.name for setup in setups}) != len(setups):
+        raise InvalidValue("two robots have the same name")
+    return setups

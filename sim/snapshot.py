@@ -1,0 +1,33 @@
+"""The simulation at one moment, for film and live view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Pose2
+from sim.floorplan import Rectangle
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """What there is to see from above, and what the robots saw last.
+
+    Attributes:
+        tick: ticks that are over.
+        stamp_ns: the simulation's time.
+        robots: `world_from_robot`, true, by name.
+        actors: people and boxes that move, with what they are as names.
+        furniture: of the floor plan as it is now.
+        images: (H, W) grey, by robot, as its camera gave it last; None if it gave none.
+    """
+
+    tick: int
+    stamp_ns: int
+    robots: Mapping[str, Pose2]
+    actors: tuple[Rectangle, ...]
+    furniture: tuple[Rectangle, ...]
+    images: Mapping[str, NDArray[np.uint8] | None]
