@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.node import Edge, NodeId
+from hybridmap.node import Edge, MapId, NodeId
 from hybridmap.pose import Array, Pose2, wrap_angle
+from sim.floorplan import Rectangle
 
 FALSE_LINK = 0.5
 """m; a link between maps that is off by more is false."""
 FALSE_LINK_TURN = math.radians(15.0)
 """rad; likewise."""
+SAME_PLACE = 1.0
+"""m; images that were taken closer to each other show the same place, if they look the same way."""
+SAME_PLACE_TURN = math.radians(30.0)
+"""rad; likewise: half of what an ordinary camera sees."""
 
 
 def align(estimated: Array, true: Array) -> Pose2:
@@ -49,6 +54,7 @@ class MapScore:
         links: links between maps.
         false_links: links that are off by more than 0.5 m or 15 degrees.
         world_from_merged: the alignment of the largest component.
+        world_from_component: the alignment of each component.
     """
 
     components: int
@@ -56,6 +62,7 @@ class MapScore:
     links: int
     false_links: int
     world_from_merged: Pose2
+    world_from_component: Mapping[int, Pose2]
 
 
 def score_map(
@@ -72,18 +79,18 @@ def score_map(
     for node, (component, _) in postures.items():
         if node in truth:
             members.setdefault(component, []).append(node)
-    squares, alignment, largest = [], Pose2(), 0
-    for nodes in members.values():
+    squares, alignments = [], {}
+    for component, nodes in members.items():
         estimated = np.array([[postures[n][1].x, postures[n][1].y] for n in nodes])
         true = np.array([[truth[n].x, truth[n].y] for n in nodes])
-        world_from_merged = align(estimated, true)
-        squares.append(((world_from_merged.apply(estimated) - true) ** 2).sum(axis=1))
-        if len(nodes) > largest:
-            largest, alignment = len(nodes), world_from_merged
+        alignments[component] = world_from_component = align(estimated, true)
+        squares.append(((world_from_component.apply(estimated) - true) ** 2).sum(axis=1))
     ate = float(np.sqrt(np.concatenate(squares).mean())) if squares else math.nan
     between = [e for e in links if e.a in truth and e.b in truth and e.a.map != e.b.map]
     false = sum(is_false(e, truth) for e in between)
-    return MapScore(len(members), ate, len(between), false, alignment)
+    largest = max(members, key=lambda c: len(members[c]), default=None)
+    world_from_merged = Pose2() if largest is None else alignments[largest]
+    return MapScore(len(members), ate, len(between), false, world_from_merged, alignments)
 
 
 def is_false(link: Edge, truth: Mapping[NodeId, Pose2]) -> bool:
@@ -92,13 +99,99 @@ def is_false(link: Edge, truth: Mapping[NodeId, Pose2]) -> bool:
     return distance > FALSE_LINK or turn > FALSE_LINK_TURN
 
 
+def link_recall(
+    links: Iterable[Edge], truth: Mapping[NodeId, Pose2], walls: Sequence[Rectangle]
+) -> float | None:
+    """The share of the shared places that are linked.
+
+    Two nodes show *the same place* if their images were truly taken within 1 m and 30 degrees of each other
+    and no wall stands between the two positions. A node has a *chance* for each other map that holds a node
+    of the same place. The chance is *taken* if a true link (see `is_false`) joins that other map to the node
+    itself or to a node of its own map that shows the same place. Recall is the share of the chances that are
+    taken. So a place that two maps share needs one link, not one for each pair of images, and neither a link
+    from another room nor a false one helps it. Furniture does not count as a wall.
+
+    Args:
+        links: edges between maps; others are ignored.
+        truth: `world_from_robot` when each node's image was taken.
+        walls: of the floor plan.
+
+    Returns:
+        The share, or None where no two maps share a place.
+    """
+    nodes: dict[MapId, list[NodeId]] = {}
+    for node in truth:
+        nodes.setdefault(node.map, []).append(node)
+    poses = {m: np.array([truth[n].vector for n in members]) for m, members in nodes.items()}
+    linked: dict[NodeId, set[MapId]] = {}
+    for link in links:
+        if link.a.map != link.b.map and link.a in truth and link.b in truth and not is_false(link, truth):
+            linked.setdefault(link.a, set()).add(link.b.map)
+            linked.setdefault(link.b, set()).add(link.a.map)
+    chances = taken = 0
+    for here, members in nodes.items():
+        neighbours = same_place(poses[here], poses[here], walls)
+        for there in nodes:
+            if there == here:
+                continue
+            has_chance = same_place(poses[here], poses[there], walls).any(axis=1)
+            has_link = np.array([there in linked.get(n, ()) for n in members])
+            chances += int(has_chance.sum())
+            taken += int((has_chance & (neighbours & has_link).any(axis=1)).sum())
+    return taken / chances if chances else None
+
+
+def same_place(a: Array, b: Array, walls: Sequence[Rectangle]) -> NDArray[np.bool_]:
+    """Which pairs of postures show the same place: within 1 m and 30 degrees, no wall in between.
+
+    Args:
+        a: (N, 3) [x m, y m, heading rad], in world.
+        b: (M, 3) likewise.
+        walls: of the floor plan.
+
+    Returns:
+        (N, M).
+    """
+    far = np.hypot(*(a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1))
+    turn = np.abs((a[:, None, 2] - b[None, :, 2] + math.pi) % math.tau - math.pi)
+    same: NDArray[np.bool_] = (far <= SAME_PLACE) & (turn <= SAME_PLACE_TURN)
+    i, j = np.nonzero(same)
+    same[i, j] = ~crossed(a[i, :2], b[j, :2], walls)
+    return same
+
+
+def crossed(starts: Array, ends: Array, solids: Iterable[Rectangle]) -> NDArray[np.bool_]:
+    """Which straight lines meet a solid, (N,), by clipping each line against the sides of each rectangle.
+
+    Args:
+        starts: (N, 2) m, in world.
+        ends: (N, 2) m, likewise.
+        solids: rectangles; a line that only touches one meets it.
+    """
+    met = np.zeros(len(starts), bool)
+    for solid in solids:
+        solid_from_world = Pose2(solid.x, solid.y, solid.heading).inverse()
+        start = solid_from_world.apply(starts)
+        along = solid_from_world.apply(ends) - start
+        half = np.array([solid.length / 2, solid.width / 2])
+        # Along an axis to which it is parallel, a line is between two sides always or never.
+        parallel = along == 0.0
+        step = np.where(parallel, 1.0, along)
+        first, last = np.sort(np.stack([(-half - start) / step, (half - start) / step]), axis=0)
+        between = np.abs(start) <= half
+        first = np.where(parallel, np.where(between, -np.inf, np.inf), first).max(axis=1)
+        last = np.where(parallel, np.where(between, np.inf, -np.inf), last).min(axis=1)
+        met |= np.maximum(first, 0.0) <= np.minimum(last, 1.0)
+    return met
+
+
 def posture_error(estimated: Pose2, true: Pose2) -> tuple[float, float]:
     """Distance (m) and absolute angle (rad) between two postures."""
     return estimated.distance(true), abs(wrap_angle(estimated.heading - true.heading))
 
 
 def write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: Array) -> None:
-    """Write a planar trajectory as others' tools read it (TUM format: stamp, position, quaternion).
+    """Write a planar trajectory as others' tools read it (TUM format: stamp s, position m, quaternion xyzw).
 
     Args:
         path: where.
