@@ -110,7 +110,7 @@ def _parse(name: str, kind: type, value: Any, where: str) -> Expectation:
     if kind is float:
         bound = _number(value, where)
         return Expectation(name, least=bound) if name in MORE_IS_BETTER else Expectation(name, most=bound)
-    if type(value) is not kind:
+    if not isinstance(value, bool | int | str) or type(value) is not kind:
         raise SettingsError(f"{where}: {value!r} is no {_called(kind)}")
     return Expectation(name, equal=value)
 

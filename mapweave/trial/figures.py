@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import types
 import typing
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -49,8 +48,8 @@ class RobotFigures:
 class Figures:
     """Everything that a trial measured; None where a figure does not apply. Never "not a number".
 
-    The *worst* of several robots or places is None as soon as one of them has no such figure: what did
-    not happen at all is no good result.
+    The *worst* of several lost robots is None as soon as one of them has no such figure: what did not happen
+    at all is no good result. A robot that never mapped does not count for the worst trajectory.
 
     Attributes:
         components: connected components of the merged map that hold nodes.
@@ -181,6 +180,5 @@ def as_text(value: float | str | None) -> str:
 
 def _kind(hint: Any) -> type:
     """The type behind `float | None`."""
-    if isinstance(hint, types.UnionType):
-        return next(k for k in typing.get_args(hint) if k is not type(None))
-    return typing.cast(type, hint)
+    known = [kind for kind in (typing.get_args(hint) or (hint,)) if kind is not type(None)]
+    return typing.cast(type, known[0])
