@@ -8,6 +8,7 @@ as long: docs/decisions/renderer.md.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Array
+from sim.scene import Scene, cross
 from sim.texture import Image, Texture
 from sim.world import PanelSet
 
@@ -25,12 +27,15 @@ NEAR = 0.03
 FAR = 60.0
 """Nothing farther than this is drawn, m."""
 
+CHUNK = 16
+"""So many panels are measured at once, nearest first; what is hidden by then is not measured at all."""
+
 CAMERA_FROM_ROBOT = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """(3, 3) turns robot vectors (x forward, y left, z up) into camera vectors (x right, y down, z forward)."""
 
 
 class Renderer:
-    """Draws one world for one kind of camera."""
+    """Draws for one camera. Not for two threads at once: it keeps its working memory."""
 
     def __init__(self, camera: Camera, background: int) -> None:
         """Prepare the pixel grid.
@@ -41,14 +46,29 @@ class Renderer:
         """
         self.camera = camera
         self._background = background
-        self._intrinsics = np.array(
-            [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
-        )
-        self._columns = np.arange(camera.width, dtype=np.float32)
-        self._rows = np.arange(camera.height, dtype=np.float64)
+        width, height = camera.width, camera.height
+        intrinsics = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+        self._intrinsics = intrinsics
+        self._from_pixels = np.linalg.inv(intrinsics)
+        self._columns = np.arange(width, dtype=np.float32)
+        self._rows = np.arange(height, dtype=np.float64)
         self._robot_from_camera = np.array([camera.mount_forward, 0.0, camera.mount_height])
+        # The borders of the picture as planes through the optical centre, (4, 3), inside positive.
+        right, low = width - 0.5, height - 0.5
+        borders = np.array([[1.0, 0.0, 0.5], [-1.0, 0.0, right], [0.0, 1.0, 0.5], [0.0, -1.0, low]])
+        borders = borders @ intrinsics
+        self._borders = borders / np.linalg.norm(borders, axis=1, keepdims=True)
+        self._image_corners = np.array(
+            [[-0.5, right, -0.5, right], [-0.5, -0.5, low, low], [1.0, 1.0, 1.0, 1.0]]
+        )
+        self._depth = np.zeros((height, width), np.float32)
+        self._inverse = np.zeros((height, width), np.float32)
+        self._mask = np.zeros((height, width), np.uint8)
+        self._inside = np.zeros((height, width), np.bool_)
 
-    def render(self, panels: PanelSet, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Image:
+    def render(
+        self, panels: PanelSet | Scene, rotation: NDArray[np.float64], position: NDArray[np.float64]
+    ) -> Image:
         """Draw.
 
         Args:
@@ -59,162 +79,234 @@ class Renderer:
         Returns:
             (H, W) grey.
         """
+        scene = panels if isinstance(panels, Scene) else Scene([panels])
         image = np.full((self.camera.height, self.camera.width), self._background, np.uint8)
-        drawn = self._in_view(panels, rotation, position)
-        if len(drawn.index) == 0:
-            return image
-        numbers, windows = self._visible(drawn)
-        for number, window in windows.items():
-            mask = numbers[window] == number
-            if mask.any():
-                texture = panels.textures[drawn.index[number]]
-                self._paint(image, window, mask, texture, drawn.forms[number])
+        self._depth.fill(0.0)
+        candidates = self._in_view(scene, rotation, position)
+        for start in range(0, len(candidates.index), CHUNK):
+            # What is known to be hidden now is hidden for good: depths only come nearer.
+            chosen = [
+                k
+                for k in range(start, min(start + CHUNK, len(candidates.index)))
+                if start == 0 or not self._hidden(candidates.windows[k], candidates.nearest[k])
+            ]
+            if chosen:
+                for drawn in self._measure(candidates, np.array(chosen)):
+                    self._draw(image, scene.textures[drawn.index], drawn)
         return image
 
-    def _in_view(self, panels: PanelSet, rotation: Array, position: Array) -> _Drawn:
-        """Panels that face the camera and meet the image, nearest first."""
+    def _in_view(self, scene: Scene, rotation: Array, position: Array) -> _Candidates:
+        """Panels that face the camera and may meet the image, nearest first."""
         camera_from_world = CAMERA_FROM_ROBOT @ rotation.T
         optical_centre = position + rotation @ self._robot_from_camera
-        to_pixels = self._intrinsics @ camera_from_world
-        # Columns of (p, q, 1) -> z * (u, v, 1), where a point of the panel is corner + p along + q down.
-        maps = np.stack(
-            [
-                panels.along @ to_pixels.T,
-                panels.down @ to_pixels.T,
-                (panels.corner - optical_centre) @ to_pixels.T,
-            ],
-            axis=-1,
-        )
-        corners = maps @ np.array([[0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0]])
-        x, y, z = corners[:, 0], corners[:, 1], corners[:, 2]
-        width, height = self.camera.width, self.camera.height
-        facing = np.linalg.det(maps) > 1e-9
-        outside = (
-            (z < NEAR).all(axis=1)
-            | (x < -0.5 * z).all(axis=1)
-            | (x > (width - 0.5) * z).all(axis=1)
-            | (y < -0.5 * z).all(axis=1)
-            | (y > (height - 0.5) * z).all(axis=1)
-        )
-        index = np.flatnonzero(facing & ~outside)
-        # Rows of the inverse give p / z, q / z and 1 / z as linear forms of (u, v, 1).
-        forms = np.linalg.inv(maps[index])
-        low, high = self._spans(forms)
-        nearest = self._nearest(forms, low, high)
-        order = np.argsort(-nearest, kind="stable")
-        filled = np.asarray((low <= high).any(axis=1))
-        order = order[filled[order]]
-        return _Drawn(index[order], forms[order], low[order], high[order], nearest[order])
-
-    def _spans(self, forms: Array) -> tuple[Array, Array]:
-        """First and last column of each panel in each row, (n, H) each; empty where first > last."""
-        p, q, w = forms[:, 0], forms[:, 1], forms[:, 2]
-        beyond = w - [0.0, 0.0, 1.0 / FAR]
-        before = np.array([0.0, 0.0, 1.0 / NEAR]) - w
-        halves = np.stack([p, w - p, q, w - q, beyond, before], axis=1)  # each must be >= 0 inside
-        slope = halves[..., 0, None]
-        rest = halves[..., 1, None] * self._rows + halves[..., 2, None]
-        level = np.abs(slope) < 1e-12
+        # First by the balls around them: most panels of a building are behind or beside the camera.
+        middles = (scene.middle - optical_centre) @ camera_from_world.T
+        inside = (middles @ self._borders.T > -scene.radius[:, None]).all(axis=1)
+        inside &= middles[:, 2] > NEAR - scene.radius
+        inside &= middles[:, 2] < FAR + scene.radius
+        index = np.flatnonzero(inside)
+        corner, normal = scene.corner[index] - optical_centre, scene.normal[index]
+        offsets = np.einsum("ij,ij->i", normal, corner)
+        front = offsets > 1e-12
+        index, corner, normal, offsets = index[front], corner[front], normal[front], offsets[front]
+        along, down = scene.along[index], scene.down[index]
+        # A point corner + p along + q down is seen at (u, v, 1) / w by to_pixels; Cramer's rule inverts
+        # that: p w, q w and w are linear forms of (u, v, 1), with w the inverse depth.
+        rows = np.stack([cross(down, corner), cross(corner, along), normal], axis=1)
+        forms = rows @ (camera_from_world.T @ self._from_pixels) / offsets[:, None, None]
+        ends = np.stack([corner, corner + along, corner + down, corner + along + down], axis=1)
+        seen = ends @ (self._intrinsics @ camera_from_world).T
+        x, y, z = seen[..., 0], seen[..., 1], seen[..., 2]
+        cut = (z < NEAR).any(axis=1) | (z > FAR).any(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            crossing = -rest / slope
-        low = np.where(slope > 0, crossing, -np.inf)
-        high = np.where(slope < 0, crossing, np.inf)
-        low = np.where(level, np.where(rest >= 0, -np.inf, np.inf), low).max(axis=1)
-        high = np.where(level, np.inf, high).min(axis=1)
-        return np.maximum(np.ceil(low), 0.0), np.minimum(np.floor(high), self.camera.width - 1.0)
-
-    def _nearest(self, forms: Array, low: Array, high: Array) -> Array:
-        """(n,) the largest inverse depth that each panel reaches in the image, 1/m."""
-        a, b, c = forms[:, 2].T[..., None]
-        at_rows = b * self._rows + c
-        filled = low <= high
-        with np.errstate(invalid="ignore"):
-            ends = np.maximum(a * low, a * high) + at_rows
-        nearest: Array = np.where(filled, ends, 0.0).max(axis=1, initial=0.0)
-        return nearest
-
-    def _visible(self, drawn: _Drawn) -> tuple[NDArray[np.int16], dict[int, tuple[slice, slice]]]:
-        """Which panel is in front at each pixel, and the window of each panel that may be."""
-        depth = np.zeros((self.camera.height, self.camera.width), np.float32)
-        numbers = np.full(depth.shape, -1, np.int16)
-        windows: dict[int, tuple[slice, slice]] = {}
-        for number in range(len(drawn.index)):
-            low, high = drawn.low[number], drawn.high[number]
-            rows = np.flatnonzero(low <= high)
-            span = slice(int(rows[0]), int(rows[-1]) + 1)
-            low, high = low[span].astype(np.float32), high[span].astype(np.float32)
-            across = slice(int(low[rows - rows[0]].min()), int(high[rows - rows[0]].max()) + 1)
-            window = (span, across)
-            behind = depth[window]
-            if behind.min() >= drawn.nearest[number]:
-                continue
-            a, b, c = drawn.forms[number, 2]
-            columns = self._columns[across]
-            inverse = (b * self._rows[span] + c).astype(np.float32)[:, None] + np.float32(a) * columns
-            mask = inverse > behind
-            mask &= columns >= low[:, None]
-            mask &= columns <= high[:, None]
-            np.copyto(behind, inverse, where=mask)
-            numbers[window][mask] = number
-            windows[number] = window
-        return numbers, windows
-
-    def _paint(
-        self,
-        image: Image,
-        window: tuple[slice, slice],
-        mask: NDArray[np.bool_],
-        texture: Texture,
-        forms: Array,
-    ) -> None:
-        """Draw one panel where it is in front, filtered for its size in the image."""
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        top, left = int(rows[0]), int(columns[0])
-        height, width = int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left
-        middle = int(rows[len(rows) // 2])
-        # A mean of pixels of one row lies on the panel, which is convex; the window's centre may not.
-        centre = np.array(
-            [window[1].start + np.flatnonzero(mask[middle]).mean(), window[0].start + middle, 1.0]
+            u, v = x / z, y / z
+        width, height = self.camera.width, self.camera.height
+        left, right = np.ceil(u.min(axis=1)), np.floor(u.max(axis=1))
+        top, low = np.ceil(v.min(axis=1)), np.floor(v.max(axis=1))
+        # The nearest point of the panel is a corner; that of its plane in the image, a corner of the image.
+        by_plane = (forms[:, 2] @ self._image_corners).max(axis=1)
+        with np.errstate(divide="ignore"):
+            by_corners = np.where(cut, np.inf, 1.0 / z.min(axis=1))
+        nearest = np.minimum(np.minimum(by_plane, by_corners) * (1 + 1e-6), 1.0 / NEAR)
+        left, top = np.where(cut, 0.0, np.maximum(left, 0.0)), np.where(cut, 0.0, np.maximum(top, 0.0))
+        right = np.where(cut, width - 1.0, np.minimum(right, width - 1.0))
+        low = np.where(cut, height - 1.0, np.minimum(low, height - 1.0))
+        visible = np.flatnonzero(
+            (left <= right) & (top <= low) & (z > NEAR).any(axis=1) & (nearest > 1 / FAR)
         )
+        order = visible[np.argsort(-nearest[visible], kind="stable")]
+        bounds = np.stack([top, low + 1, left, right + 1], axis=1)[order].astype(int).tolist()
+        windows = [(slice(b[0], b[1]), slice(b[2], b[3])) for b in bounds]
+        return _Candidates(index[order], forms[order], windows, nearest[order].tolist(), cut[order])
+
+    def _hidden(self, window: tuple[slice, slice], nearest: float) -> bool:
+        """Whether all of a window shows something nearer already."""
+        return bool(self._depth[window].min() >= nearest)
+
+    def _measure(self, candidates: _Candidates, chosen: NDArray[np.intp]) -> list[_Drawn]:
+        """Where exactly panels are in the image; those that meet no pixel are left out."""
+        forms = candidates.forms[chosen]
+        low, high = self._spans(forms, bool(candidates.cut[chosen].any()))
+        filled = low <= high
+        rows = filled.any(axis=1)
+        first = filled.argmax(axis=1).tolist()
+        last = (filled.shape[1] - filled[:, ::-1].argmax(axis=1)).tolist()
+        left = np.where(filled, low, np.inf).min(axis=1)
+        right = np.where(filled, high, -np.inf).max(axis=1)
+        # Where a panel fills its window no pixel has to be asked whether it is inside.
+        square = (np.where(filled, low == left[:, None], True) & (~filled | (high == right[:, None]))).all(
+            axis=1
+        )
+        indices = candidates.index[chosen].tolist()
+        drawn = []
+        for k in np.flatnonzero(rows).tolist():
+            span = slice(first[k], last[k])
+            window = (span, slice(int(left[k]), int(right[k]) + 1))
+            edges = None if square[k] else (low[k, span, None], high[k, span, None])
+            drawn.append(_Drawn(indices[k], forms[k], window, candidates.nearest[chosen[k]], edges))
+        return drawn
+
+    def _spans(self, forms: Array, cut: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """First and last column of each panel in each row, (n, H) each; empty where first > last.
+
+        Args:
+            forms: (n, 3, 3).
+            cut: whether a panel may come too near or go too far.
+        """
+        p, q, w = forms[:, 0], forms[:, 1], forms[:, 2]
+        halves = [p, w - p, q, w - q]  # each must be >= 0 inside
+        if cut:
+            halves += [w - [0.0, 0.0, 1.0 / FAR], np.array([0.0, 0.0, 1.0 / NEAR]) - w]
+        sides = np.stack(halves, axis=1)
+        slope = sides[..., 0]
+        # A level edge lets all of a row pass or nothing: its crossing is far out on one side.
+        level = np.abs(slope) < 1e-12
+        slope = np.where(level, 1e-12, slope)
+        crossing = (-sides[..., 1] / slope)[..., None] * self._rows + (-sides[..., 2] / slope)[..., None]
+        rising = (slope > 0)[..., None]
+        low = np.where(rising, crossing, 0.0).max(axis=1)
+        high = np.where(rising, self.camera.width - 1.0, crossing).min(axis=1)
+        low, high = np.ceil(np.maximum(low, 0.0)), np.floor(high)
+        # Beyond the image they shall still fit into short numbers.
+        width = float(self.camera.width)
+        return np.minimum(low, width).astype(np.float32), np.maximum(high, -1.0).astype(np.float32)
+
+    def _draw(self, image: Image, texture: Texture, drawn: _Drawn) -> None:
+        """Draw one panel where it is in front of all that was drawn before."""
+        window = drawn.window
+        behind = self._depth[window]
+        if behind.min() >= drawn.nearest:
+            return
+        rows, columns = window
+        size = (slice(0, rows.stop - rows.start), slice(0, columns.stop - columns.start))
+        a, b, c = drawn.forms[2].tolist()
+        down = (b * self._rows[rows] + c).astype(np.float32)[:, None]
+        across = self._columns[columns]
+        inverse, mask = self._inverse[size], self._mask[size]
+        won = mask.view(np.bool_)
+        np.add(down, np.float32(a) * across, out=inverse)
+        np.greater(inverse, behind, out=won)
+        if drawn.edges is not None:
+            inside = self._inside[size]
+            won &= np.greater_equal(across, drawn.edges[0], out=inside)
+            won &= np.less_equal(across, drawn.edges[1], out=inside)
+        left, top, width, height = cv2.boundingRect(mask)
+        if not width:
+            return
+        cv2.copyTo(inverse, mask, behind)
         mask = mask[top : top + height, left : left + width]
-        top, left = top + window[0].start, left + window[1].start
-        p, q, w = forms @ centre
-        across = np.hypot(*(forms[0, :2] - p / w * forms[2, :2])) / abs(w) * texture.width_px
-        down = np.hypot(*(forms[1, :2] - q / w * forms[2, :2])) / abs(w) * texture.height_px
-        source = texture.level(_halvings(across, texture.width_px), _halvings(down, texture.height_px))
-        to_texture = np.diag([source.shape[1], source.shape[0], 1.0])
-        to_texture[:2, 2] = -0.5  # pixel centres are whole numbers, OpenCV's convention
-        shift = np.array([[1.0, 0.0, left], [0.0, 1.0, top], [0.0, 0.0, 1.0]])
-        patch = cv2.warpPerspective(
+        # Between two pixels of one row the panel, which is convex, is met for sure; at the middle it may not.
+        row = mask[height // 2].nonzero()[0]
+        if not len(row):
+            row, centre_v = mask[0].nonzero()[0], top
+        else:
+            centre_v = top + height // 2
+        left, top, centre_v = left + columns.start, top + rows.start, centre_v + rows.start
+        centre_u = left + (int(row[0]) + int(row[-1])) / 2
+        patch = _warped(texture, drawn.forms, (centre_u, centre_v), (left, top, width, height))
+        cv2.copyTo(patch, mask, image[top : top + height, left : left + width])
+
+
+def _warped(
+    texture: Texture, forms: Array, centre: tuple[float, float], box: tuple[int, int, int, int]
+) -> Image:
+    """A texture as it is seen in a part of the image, filtered for its size there.
+
+    Args:
+        texture: of the panel.
+        forms: (3, 3) rows p / z, q / z, 1 / z as linear forms of (u, v, 1).
+        centre: (u, v) px, where its size is taken.
+        box: left, top, width and height of the part, px.
+    """
+    (pu, pv, p1), (qu, qv, q1), (wu, wv, w1) = forms.tolist()
+    u, v = centre
+    w = wu * u + wv * v + w1
+    p, q = (pu * u + pv * v + p1) / w, (qu * u + qv * v + q1) / w
+    across = math.hypot(pu - p * wu, pv - p * wv) / abs(w) * texture.width_px
+    down = math.hypot(qu - q * wu, qv - q * wv) / abs(w) * texture.height_px
+    source = texture.level(_halvings(across, texture.width_px), _halvings(down, texture.height_px))
+    left, top, width, height = box
+    p1, q1, w1 = p1 + pu * left + pv * top, q1 + qu * left + qv * top, w1 + wu * left + wv * top
+    high, wide = source.shape
+    # Pixel centres are whole numbers, OpenCV's convention: half a texel less.
+    to_texture = np.array(
+        [
+            [wide * pu - 0.5 * wu, wide * pv - 0.5 * wv, wide * p1 - 0.5 * w1],
+            [high * qu - 0.5 * wu, high * qv - 0.5 * wv, high * q1 - 0.5 * w1],
+            [wu, wv, w1],
+        ]
+    )
+    return np.asarray(
+        cv2.warpPerspective(
             source,
-            to_texture @ forms @ shift,
+            to_texture,
             (width, height),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
-        )
-        np.copyto(image[top : top + height, left : left + width], patch, where=mask)
+        ),
+        dtype=np.uint8,
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """Panels in view, nearest first.
+@dataclass(frozen=True, eq=False, slots=True)
+class _Candidates:
+    """Panels that may be in view, nearest first.
 
     Attributes:
-        index: (n,) in the panel set.
+        index: (n,) in the scene.
         forms: (n, 3, 3) rows p / z, q / z, 1 / z as linear forms of (u, v, 1).
-        low: (n, H) first column in each row.
-        high: (n, H) last column in each row.
-        nearest: (n,) largest inverse depth, 1/m.
+        windows: n, outside of which they are not.
+        nearest: n, inverse depth that they do not exceed in the image, 1/m.
+        cut: (n,) whether a part is too near or too far.
     """
 
     index: NDArray[np.intp]
     forms: Array
-    low: Array
-    high: Array
-    nearest: Array
+    windows: list[tuple[slice, slice]]
+    nearest: list[float]
+    cut: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Drawn:
+    """A panel that meets the image.
+
+    Attributes:
+        index: in the scene.
+        forms: (3, 3) rows p / z, q / z, 1 / z as linear forms of (u, v, 1).
+        window: rows and columns that it meets.
+        nearest: inverse depth that it does not exceed, 1/m.
+        edges: first and last column in each row of the window, (h, 1) each; None if it fills the window.
+    """
+
+    index: int
+    forms: Array
+    window: tuple[slice, slice]
+    nearest: float
+    edges: tuple[NDArray[np.float32], NDArray[np.float32]] | None
 
 
 def _halvings(texels_per_pixel: float, size_px: int) -> int:
     """How often to halve a texture so that about one texel falls on one pixel."""
-    wanted = round(float(np.log2(max(texels_per_pixel, 1.0))))
+    wanted = round(math.log2(max(texels_per_pixel, 1.0)))
     return min(wanted, size_px.bit_length() - 1)
