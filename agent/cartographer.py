@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.recognition import register
+from hybridmap.recognition import Recognition, register
 
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
@@ -58,11 +59,19 @@ class CartographerSettings:
 
 @dataclass(eq=False)
 class Placed:
-    """A node that was made, the track of each landmark, and where the current anchor stands from it."""
+    """A node that was made or recognised, and where the current anchor stands from it.
+
+    Attributes:
+        node: the node.
+        tracks: (N,) the track of each landmark, -1 for one that has none.
+        node_from_anchor: posture of the current anchor.
+        evidence: of its recognition; empty for a node that was just made.
+    """
 
     node: Node
     tracks: NDArray[np.int64]
     node_from_anchor: PoseGaussian = HERE
+    evidence: dict[str, float] = field(default_factory=dict)
 
 
 class Cartographer:
@@ -73,15 +82,30 @@ class Cartographer:
         map_from_anchor: posture of the current anchor.
     """
 
-    def __init__(self, map_id: MapId, camera: Camera, settings: CartographerSettings) -> None:
-        """Start an empty map whose frame is the first anchor's."""
-        self.map = HybridMap()
+    def __init__(
+        self,
+        map_id: MapId,
+        camera: Camera,
+        settings: CartographerSettings,
+        contents: Sequence[ChangeBody] = (),
+        next_number: int = 1,
+    ) -> None:
+        """Start an empty map whose frame is the first anchor's, or go on with one.
+
+        Args:
+            map_id: of the map.
+            camera: that takes the views.
+            settings: how.
+            contents: of a map that was begun.
+            next_number: the first that no node or edge has ever had.
+        """
+        self.map = HybridMap(contents)
         self.map_from_anchor = HERE
         self._map_id = map_id
         self._camera = camera
         self._settings = settings
         self._last: Placed | None = None
-        self._next_number = 1
+        self._next_number = next_number
         self._rng = np.random.default_rng(0)
 
     def place(self, anchor: View, leaves: list[View], tracking: Tracking) -> list[ChangeBody]:
@@ -110,6 +134,27 @@ class Cartographer:
         for change in changes:
             self.map.apply(change)
         return changes
+
+    def recognise(self, node: Node, view: View, recognition: Recognition) -> None:
+        """The next episode begins at a view that shows a node of this map, however the robot came there.
+
+        Args:
+            node: of the map.
+            view: the anchor view, whose features all have tracks.
+            recognition: of the node in the view's features.
+        """
+        tracks = np.full(len(node.landmarks), -1, np.int64)
+        tracks[recognition.pairs[:, 0]] = view.tracks[recognition.pairs[:, 1]]
+        self.map_from_anchor = node.map_from_robot @ recognition.node_from_robot
+        self._last = Placed(node, tracks, recognition.node_from_robot, recognition.evidence)
+
+    def lose(self, moved: PoseGaussian) -> None:
+        """Nobody knows any more where the robot is; `old_anchor_from_robot` is where it was thought to be.
+
+        A map without nodes may begin anywhere.
+        """
+        self.map_from_anchor = self.map_from_anchor @ moved if self.map.nodes else HERE
+        self._last = None
 
     def move_anchor(self, moved: PoseGaussian) -> None:
         """The next episode begins elsewhere: `old_anchor_from_new`, as the filter says."""
@@ -165,8 +210,10 @@ class Cartographer:
         _, in_a, in_b = np.intersect1d(a.tracks, b.tracks, return_indices=True)
         driven = float(np.hypot(a_from_b.mean.x, a_from_b.mean.y))
         kind = EdgeKind.TURNED if driven < TURN_ONLY else EdgeKind.MAPPED
+        if a.evidence:
+            kind = EdgeKind.LOOP
         shared = np.stack([in_a, in_b], axis=1).astype(np.int64)
-        evidence = {"shared": float(len(shared))}
+        evidence = a.evidence or {"shared": float(len(shared))}
         return Edge(self._number(), a.node.id, b.node.id, a_from_b, kind, shared, evidence)
 
     def _sober(self, moved: PoseGaussian) -> PoseGaussian:

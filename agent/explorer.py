@@ -12,6 +12,8 @@ import numpy as np
 from agent.floor import Floor
 from agent.mapper import Mapper
 from agent.observation import Command, Observation, RobotDescription
+from agent.places import next_place, seen_around
+from agent.room import room
 from agent.servo.image_drive import ImageDrive, ImageDriveSettings
 from hybridmap.change import ChangeBody
 from hybridmap.pose import Array, Pose2, wrap_angle
@@ -35,6 +37,8 @@ class ExplorerSettings:
         spacing: places are at least this far from each other, m.
         reach: the longest way to a next place, m.
         sight: what can be seen from a place is judged within this radius, m.
+        known_reach: nodes within this of a place show it, m.
+        known: a place around which nodes look into this share of all directions is not mapped again.
         patience: seconds without getting on before a way is given up.
     """
 
@@ -51,6 +55,8 @@ class ExplorerSettings:
     spacing: float = 1.7
     reach: float = 7.0
     sight: float = 1.6
+    known_reach: float = 0.7
+    known: float = 0.75
     patience: float = 4.0
 
 
@@ -60,6 +66,7 @@ class Phase(StrEnum):
     LOOKING = "waiting for a first image"
     DRIVING = "driving back and forth to map the view"
     TURNING = "turning to the next view"
+    SCANNING = "turning where the map shows everything already"
     TRAVELLING = "travelling to the next place"
     DONE = "no new place in reach: exploration is complete"
 
@@ -111,16 +118,25 @@ class Explorer:
         """Whether there is nothing left to explore."""
         return self.phase is Phase.DONE
 
+    def restart(self) -> None:
+        """Begin again from where the robot is now: it was lost, and knows its posture again."""
+        self.phase = Phase.LOOKING
+        self._behaviour = self._explore()
+
     # Behaviours
 
     def _explore(self) -> Iterator[Command]:
+        s = self._settings
         while not self._mapper.started:
             self._mapper.begin(self._now)
             if not self._mapper.started:
                 self.detail = "no image from the camera yet"
             yield Command()
         while True:
-            yield from self._look_around()
+            if seen_around(self._mapper.map, self._position, s.known_reach) >= s.known:
+                yield from self._scan()
+            else:
+                yield from self._look_around()
             self.places.append(self._position)
             path = self._next_place()
             if not path:
@@ -142,6 +158,18 @@ class Explorer:
             if turned > 2 * math.pi - 0.3:
                 yield from self._map_view()
                 return
+
+    def _scan(self) -> Iterator[Command]:
+        """Turn until the rangers have swept all around: the floor may be forgotten, the views are mapped."""
+        bearings = np.sort(np.array(self._description.ranger_bearings))
+        gaps = np.diff(bearings, append=bearings[:1] + math.tau)
+        turned = 0.0
+        while turned < (gaps.max() if len(gaps) else math.tau):
+            before = self._mapper.map_from_robot.mean.heading
+            yield from self._turn_to_next_view()
+            self.phase = Phase.SCANNING
+            turned += abs(wrap_angle(self._mapper.map_from_robot.mean.heading - before)) + 0.05
+            self._finish()
 
     def _map_view(self) -> Iterator[Command]:
         """Drive back and forth with the view's features in sight until their depths have converged."""
@@ -243,19 +271,8 @@ class Explorer:
 
     def _next_place(self) -> list[Array]:
         """Corners of the way to the place from which most is still to be seen; empty if there is none."""
-        s = self._settings
-        ways = self._floor.ways(self._position, s.reach)
-        if not len(ways.cells):
-            return []
-        positions = ways.positions
-        been = np.array(self.places + self._avoid).reshape(-1, 2)
-        away = np.linalg.norm(positions[:, None] - been[None], axis=2).min(axis=1)
-        unknown = self._floor.unknown_around(s.sight)[ways.cells[:, 0], ways.cells[:, 1]]
-        worth = unknown - 0.04 * ways.lengths
-        worth[(away < s.spacing) | (unknown < 0.02)] = -math.inf
-        if not np.isfinite(worth).any():
-            return []
-        return ways.path(ways.cells[int(worth.argmax())])
+        s, been = self._settings, np.array(self.places + self._avoid)
+        return next_place(self._floor, self._position, been, s.reach, s.sight, s.spacing)
 
     # Small things
 
@@ -275,16 +292,7 @@ class Explorer:
 
     def _room(self, direction: float) -> float:
         """How far the footprint may move in a direction (rad, 0 ahead), m, by the rangers."""
-        bearings, radius = np.array(self._description.ranger_bearings), self._description.radius
-        if not len(bearings) or len(self._now.proximity) != len(bearings):
-            return self._settings.drive
-        off = np.angle(np.exp(1j * (bearings - direction)))
-        reach = self._now.proximity + radius
-        lateral = np.abs(reach * np.sin(off))
-        in_way = (np.cos(off) > 0.3) & (lateral < radius + 0.06)
-        if not in_way.any():
-            return self._settings.drive
-        return float(max((reach * np.cos(off))[in_way].min() - radius - 0.12, 0.0))
+        return room(self._description, self._now.proximity, direction, self._settings.drive)
 
     def _ticks(self, most: float) -> range:
         """A bound on the length of a behaviour: nothing may last forever."""

@@ -8,11 +8,11 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hybridmap.change import Change, ChangeBody, EdgeRetired, NodeRetired
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from hybridmap.node import MapId, check_name
+from hybridmap.node import MapId, NodeId, check_name
 from wire.codec import decode_body, element_of, encode_body, wrap_body
 from wire.database import Database
 from wire.keys import check_epoch
@@ -35,6 +35,22 @@ CREATE TABLE ack (
 """
 
 READ_AT_ONCE = 256
+
+
+class Entry(NamedTuple):
+    """One change of a log, damaged or not.
+
+    Attributes:
+        sequence: its number in the log.
+        element: the node or edge that it is about.
+        put: whether it puts, or retires.
+        body: None if the disk has damaged it.
+    """
+
+    sequence: int
+    element: NodeId
+    put: bool
+    body: ChangeBody | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +214,16 @@ class Journal:
         for begin in range(1, head + 1, READ_AT_ONCE):
             for change in self.changes(map_id, begin, min(begin + READ_AT_ONCE - 1, head)):
                 yield change.body
+
+    def entries(self, map_id: MapId) -> Iterator[Entry]:
+        """Every change that is still there, in order; damaged ones without a body."""
+        query = "SELECT sequence, element, put, body, crc FROM change WHERE epoch = ? ORDER BY sequence"
+        for sequence, number, put, body, crc in self._read(query, self._epoch(map_id)):
+            try:
+                decoded = self._decode(sequence, body if zlib.crc32(body) == crc else None)
+            except InvalidFile:
+                decoded = None
+            yield Entry(sequence, NodeId(*map_id, number), bool(put), decoded)
 
     def acknowledge(self, server: str, map_id: MapId, watermark: int) -> None:
         """Remember that a server has every change up to the watermark; it never goes back.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,11 +12,12 @@ from agent.observation import Observation, RobotDescription
 from agent.tracking import Tracking, TrackingSettings
 from agent.view import View
 from agent.vision.lens import Lens
-from agent.vision.sift import Sift, SiftSettings
+from agent.vision.sift import Features, Sift, SiftSettings
 from hybridmap.change import ChangeBody, NodePut
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
+from hybridmap.node import MapId, Node
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.recognition import Recognition
 
 
 @dataclass(frozen=True)
@@ -47,16 +49,24 @@ class Mapper:
     """
 
     def __init__(
-        self, map_id: MapId, description: RobotDescription, settings: MapperSettings | None = None
+        self,
+        map_id: MapId,
+        description: RobotDescription,
+        settings: MapperSettings | None = None,
+        contents: Sequence[ChangeBody] = (),
+        next_number: int = 1,
     ) -> None:
-        """Start an empty map where the robot stands."""
+        """Start an empty map where the robot stands, or take up one that was begun; see Cartographer."""
         settings = settings or MapperSettings()
-        lens = Lens(description)
         self.typical_depth = settings.depths_per_height * max(description.camera.mount_height, 0.05)
-        self._camera = description.camera
-        self._sift = Sift(lens, settings.sift)
-        self._tracking = Tracking(description, lens, settings.tracking)
-        self._cartographer = Cartographer(map_id, description.camera, settings.cartographer)
+        self._description = description
+        self._settings = settings
+        self._lens = Lens(description)
+        self._sift = Sift(self._lens, settings.sift)
+        self._tracking = Tracking(description, self._lens, settings.tracking)
+        self._cartographer = Cartographer(
+            map_id, description.camera, settings.cartographer, contents, next_number
+        )
         self._anchor: View | None = None
         self._leaves: list[View] = []
 
@@ -71,6 +81,23 @@ class Mapper:
     def started(self) -> bool:
         """Whether there is an anchor view to map from."""
         return self._anchor is not None
+
+    @property
+    def astray(self) -> bool:
+        """Whether there is a map and the robot does not know where on it it is: it must recognise a place."""
+        return self._anchor is None and bool(self.map.nodes)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the last image shows nothing of what it should: no time to map."""
+        return self._tracking.doubtful
+
+    @property
+    def doubt(self) -> str:
+        """Why, in words."""
+        if self._tracking.strange:
+            return "the image shows something else than a moment ago"
+        return "the image shows nothing: is it dark, or the lens covered?" if self._tracking.blank else ""
 
     @property
     def anchor_from_robot(self) -> Pose2:
@@ -100,7 +127,7 @@ class Mapper:
     @property
     def bearings(self) -> Array:
         """(N,) rad, bearings of the tracks, positive to the left."""
-        return self._camera.bearings(self._tracking.pixels)
+        return self._description.camera.bearings(self._tracking.pixels)
 
     @property
     def converged_share(self) -> float:
@@ -112,12 +139,46 @@ class Mapper:
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
         self._tracking.step(observation)
+        if self._tracking.carried_off:
+            self.lose()
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
-        self._anchor = self._take(observation, HERE)
-        if self._anchor is not None:
-            self._tracking.follow(self._anchor, self.typical_depth)
+        anchor = self._take(observation, HERE)
+        if anchor is not None:
+            self._begin_at(anchor)
+
+    def lose(self) -> None:
+        """Nobody knows any more where the robot is. What was seen since the anchor view is dropped.
+
+        With nodes it is astray and must `resume`; without any it may `begin` anew.
+        """
+        self._cartographer.lose(self._tracking.pose)
+        self._tracking = Tracking(self._description, self._lens, self._settings.tracking)
+        self._anchor, self._leaves = None, []
+
+    def resume(
+        self, observation: Observation, features: Features, node: Node, recognition: Recognition
+    ) -> None:
+        """Go on from an image in which a node of the own map was recognised: it is the next anchor.
+
+        Args:
+            observation: with the image.
+            features: of that image.
+            node: of `map`.
+            recognition: of the node in the features.
+        """
+        self.lose()
+        self._tracking.step(observation)
+        anchor = self._tracking.take(observation, features, HERE)
+        self.typical_depth = float(np.median(node.landmarks.depths[node.landmarks.has_depth]))
+        self._begin_at(anchor)
+        self._cartographer.recognise(node, anchor, recognition)
+
+    def _begin_at(self, anchor: View) -> None:
+        self._tracking.reanchor()
+        self._anchor = anchor
+        self._tracking.follow(anchor, self.typical_depth)
 
     def leaf(self, observation: Observation) -> None:
         """Keep the current image as a node beside the anchor, for example at the far end of a drive."""

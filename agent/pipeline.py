@@ -2,6 +2,7 @@ r"""One robot's whole pipeline: observation in, command and map changes out. Rea
 
     image, odometry, proximity -> mapper (tracks, EKF, nodes) -> changes
                                -> floor                        \
+    lost on the own map ------> resumption (recall) -> mapper   |
     mission ------------------> explorer | passenger | navigator -> guard -> command
 
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
@@ -10,6 +11,7 @@ It knows no network, no disk and no clock: live robots, recordings, simulation a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from agent.explorer import Explorer, ExplorerSettings
@@ -19,6 +21,7 @@ from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Questio
 from agent.navigator import Navigator, NavigatorSettings
 from agent.observation import Command, Observation, RobotDescription
 from agent.passenger import Passenger, PassengerSettings
+from agent.resumption import Resumption, ResumptionSettings
 from agent.servo.proximity import guard
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
@@ -38,6 +41,7 @@ class PipelineSettings:
     explorer: ExplorerSettings = field(default_factory=ExplorerSettings)
     passenger: PassengerSettings = field(default_factory=PassengerSettings)
     navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
+    resumption: ResumptionSettings = field(default_factory=ResumptionSettings)
     floor: FloorSettings = field(default_factory=FloorSettings)
     seed: int = 0
 
@@ -57,6 +61,7 @@ class Status:
         fix_node: the node that the robot knows itself by while navigating.
         node_from_robot: posture in that node's frame.
         legs: nodes on the first route of the drive, beginning and goal included.
+        lost: whether it has given up to find itself on its own map: a fresh map must be begun.
     """
 
     doing: str
@@ -69,6 +74,7 @@ class Status:
     fix_node: NodeId | None = None
     node_from_robot: Pose2 = IDENTITY
     legs: int = 0
+    lost: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,21 +98,36 @@ class Pipeline:
     """The robot's mind."""
 
     def __init__(
-        self, map_id: MapId, description: RobotDescription, settings: PipelineSettings | None = None
+        self,
+        map_id: MapId,
+        description: RobotDescription,
+        settings: PipelineSettings | None = None,
+        contents: Sequence[ChangeBody] = (),
+        next_number: int = 1,
     ) -> None:
-        """Start with an empty map and nothing to do."""
+        """Start with nothing to do, and with an empty map or one that was begun.
+
+        With a map that was begun the robot may be anywhere: it maps on once it has recognised a place of it.
+
+        Args:
+            map_id: of the map.
+            description: the body.
+            settings: of the parts.
+            contents: of the map, as `Journal.resume` gives it.
+            next_number: the first that no node or edge of the map has ever had.
+        """
         self._settings = settings or PipelineSettings()
         self._description = description
         lens = Lens(description)
         self._lens = lens
         self._sift = Sift(lens, self._settings.mapper.sift)
-        self._mapper = Mapper(map_id, description, self._settings.mapper)
+        self._mapper = Mapper(map_id, description, self._settings.mapper, contents, next_number)
         self._floor = Floor(description, self._settings.floor)
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
         self._passenger: Passenger | None = None
         self._navigator: Navigator | None = None
-        self._refusal = ""
+        self._resumption: Resumption | None = None
         self._direction = 1.0
 
     @property
@@ -119,25 +140,30 @@ class Pipeline:
         """What the robot shall do."""
         return self._mission
 
+    @property
+    def lost(self) -> bool:
+        """Whether the robot shall map and has given up to find itself on its own map.
+
+        It stands still then. Whoever runs it may begin a fresh map, in a new pipeline; another `set_mission`
+        lets it try again.
+        """
+        return self._resumption is not None and self._resumption.lost
+
     def set_mission(self, mission: Mission) -> None:
         """Begin another mission. Exploration that was interrupted goes on where it was.
 
-        A robot that has navigated does not map on: it may have been carried anywhere in between, and the
-        next edge would be false. It stands still and says so.
+        A robot that has navigated may have been anywhere in between: to map on it must first recognise a
+        place of its own map.
         """
-        self._refusal = ""
-        if self._navigator is not None and isinstance(mission, Explore | Carried):
-            self._refusal = "it has navigated since it mapped: start the agent anew to map on, in a new map"
-            mission = Idle()
         self._mission = mission
+        self._resumption = None
         match mission:
             case Explore() if self._explorer is None:
-                self._explorer = Explorer(
-                    self._description, self._mapper, self._floor, self._settings.explorer, self._settings.seed
-                )
+                self._explorer = self._new_explorer()
             case Carried() if self._passenger is None:
                 self._passenger = Passenger(self._mapper, self._settings.passenger)
             case GoTo(goal):
+                self._lose()
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings.navigator,
                     self._settings.seed,
@@ -154,14 +180,11 @@ class Pipeline:
         match self._mission:
             case Idle() if self._mapper.started:
                 # Whoever goes on mapping later needs to know what the wheels did meanwhile.
-                self._mapper.step(observation)
-            case Explore() if self._explorer is not None:
-                self._mapper.step(observation)
-                self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
-                command, changes = self._explorer.step(observation)
-            case Carried() if self._passenger is not None:
-                self._mapper.step(observation)
-                changes = self._passenger.step(observation)
+                self._keep_up(observation)
+            case Explore() | Carried() if self._mapper.astray:
+                command = self._resume(observation)
+            case Explore() | Carried():
+                command, changes = self._map(observation)
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers)
         safe, warning = guard(command, observation.proximity, self._description)
@@ -171,9 +194,66 @@ class Pipeline:
             self._direction = math.copysign(1.0, safe.forward)
         return Step(safe, tuple(changes), tuple(questions), self._status(warning))
 
+    def _new_explorer(self) -> Explorer:
+        settings = self._settings
+        return Explorer(self._description, self._mapper, self._floor, settings.explorer, settings.seed)
+
+    def _keep_up(self, observation: Observation) -> None:
+        """Let the mapper see; it may find out that the robot was carried off."""
+        started = self._mapper.started
+        self._mapper.step(observation)
+        if started and not self._mapper.started:
+            self._lose()
+
+    def _map(self, observation: Observation) -> tuple[Command, list[ChangeBody]]:
+        self._keep_up(observation)
+        if self._mapper.doubtful or self._mapper.astray:
+            return Command(), []
+        if isinstance(self._mission, Carried):
+            assert self._passenger is not None
+            return Command(), self._passenger.step(observation)
+        assert self._explorer is not None
+        self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
+        return self._explorer.step(observation)
+
+    def _resume(self, observation: Observation) -> Command:
+        """Find the robot on its own map; then map on from there."""
+        if self._resumption is None:
+            drives, settings = isinstance(self._mission, Explore), self._settings
+            self._resumption = Resumption(
+                self._description, self._sift, self.map, drives, settings.resumption, settings.seed
+            )
+        command = self._resumption.step(observation)
+        found, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
+        if found is None:
+            return command
+        self._mapper.resume(observation, found.features, found.node, found.recognition)
+        map_from_odom = self._mapper.map_from_robot.mean @ odom_from_robot.inverse()
+        for odom_from_then, proximity in self._resumption.seen:
+            self._floor.see(map_from_odom @ odom_from_then, proximity)
+        self._resumption = None
+        return Command()
+
+    def _lose(self) -> None:
+        """Nobody knows any more where the robot is."""
+        self._mapper.lose()
+        if self.map.nodes:
+            if self._explorer is not None:
+                self._explorer.restart()
+            return
+        # The map may begin anywhere, and all that was found out on the way to it is void.
+        self._floor = Floor(self._description, self._settings.floor)
+        if self._explorer is not None:
+            self._explorer = self._new_explorer()
+
     def _status(self, warning: str) -> Status:
-        doing, detail, finished = "idle", self._refusal or "no mission", False
+        doing, detail, finished = "idle", "no mission", False
         match self._mission:
+            case Explore() | Carried() if self._resumption is not None:
+                doing = "lost" if self.lost else "looking for a place of its own map"
+                detail = self._resumption.detail
+            case Explore() | Carried() if self._mapper.doubtful:
+                doing, detail = "standing still", self._mapper.doubt
             case Explore() if self._explorer is not None:
                 doing, detail = str(self._explorer.phase), self._explorer.detail
                 finished = self._explorer.finished
@@ -199,4 +279,5 @@ class Pipeline:
             fix_node=None if fix is None else fix.node,
             node_from_robot=IDENTITY if fix is None else fix.node_from_robot.mean,
             legs=0 if self._navigator is None else self._navigator.legs,
+            lost=self.lost,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from hybridmap.descriptor import decode
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node
+from hybridmap.pose import PoseGaussian
 from hybridmap.query import View
 from hybridmap.recognition import Recognition, recognise
 
@@ -31,7 +33,17 @@ class RecallSettings:
 def recall(
     hybrid_map: HybridMap, view: View, rng: np.random.Generator, settings: RecallSettings | None = None
 ) -> tuple[Node, Recognition] | None:
-    """Find the node of a robot's own map that a view shows best (paper, section 5: the kidnapped robot).
+    """The node of a robot's own map that a view shows best, and how it was recognised; or None.
+
+    See `recall_all`.
+    """
+    return next(iter(recall_all(hybrid_map, view, rng, settings)), None)
+
+
+def recall_all(
+    hybrid_map: HybridMap, view: View, rng: np.random.Generator, settings: RecallSettings | None = None
+) -> list[tuple[Node, Recognition]]:
+    """Find the nodes of a robot's own map that a view shows (paper, section 5: the kidnapped robot).
 
     Every feature votes for the node that holds its nearest descriptor; the nodes with most votes are
     verified by geometry. One robot's map is small, so all descriptors are compared.
@@ -43,23 +55,35 @@ def recall(
         settings: how many to try.
 
     Returns:
-        The node with the most inliers and how it was recognised, or None.
+        The nodes and how each was recognised, most inliers first.
     """
     settings = settings or RecallSettings()
     nodes = [n for n in hybrid_map.nodes.values() if len(n.landmarks)]
     if not nodes or not len(view):
-        return None
+        return []
     known = np.concatenate([decode(n.landmarks.codes) for n in nodes])
     owner = np.repeat(np.arange(len(nodes)), [len(n.landmarks) for n in nodes])
     nearest = (decode(view.codes) @ known.T - 0.5 * (known**2).sum(axis=1)).argmax(axis=1)
     votes = np.bincount(owner[nearest], minlength=len(nodes))
-    best: tuple[Node, Recognition] | None = None
+    recalled: list[tuple[Node, Recognition]] = []
     for index in np.argsort(-votes, kind="stable")[: settings.tries]:
         if votes[index] < settings.votes:
             break
         found = recognise(nodes[index], view, None, rng)
-        if found is None or found.inliers < settings.least_inliers:
-            continue
-        if best is None or found.inliers > best[1].inliers:
-            best = (nodes[index], found)
-    return best
+        if found is not None and found.inliers >= settings.least_inliers:
+            recalled.append((nodes[index], found))
+    return sorted(recalled, key=lambda pair: -pair[1].inliers)
+
+
+def exact_enough(posture: PoseGaussian, sure: tuple[float, float], looked: float) -> bool:
+    """Whether a recognition is exact enough to go on from; else another look, elsewhere, costs little.
+
+    Args:
+        posture: `node_from_robot`.
+        sure: standard deviations that are good enough at once, m and rad.
+        looked: rad, how far the robot has turned to look around: the longer it has looked, the less it asks
+            for, twice as much after a whole turn.
+    """
+    sigma = np.sqrt(np.diag(posture.covariance))
+    leniency = 1.0 + looked / math.tau
+    return bool(max(sigma[:2]) <= sure[0] * leniency and sigma[2] <= sure[1] * leniency)

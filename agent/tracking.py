@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.continuity import Continuity, ContinuitySettings, Sight, turned
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.observation import Observation, RobotDescription
@@ -15,7 +17,7 @@ from agent.view import View, associate
 from agent.vision.lens import Lens
 from agent.vision.sift import Features
 from agent.vision.tracker import Tracker, TrackerSettings
-from hybridmap.pose import Array, PoseGaussian
+from hybridmap.pose import Array, Pose2, PoseGaussian
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,11 @@ class TrackingSettings:
         associate_px: a feature this near to a track is the same point.
         strikes: a track that the filter refuses this often in a row is given up.
         prior_spread: sigma of a new landmark's inverse depth, as a share of the expected one.
+        continuity: whether an image continues the one before.
+        patience: images that show other things than they should, one after the other, before the robot
+            takes itself for carried off. A person who walks by is gone by then.
+        blank_patience: likewise images that show nothing: somebody has switched off the light.
+        stale: m and rad; once the wheels have moved this much, nothing can be said of an image before.
     """
 
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
@@ -41,13 +48,23 @@ class TrackingSettings:
     associate_px: float = 1.5
     strikes: int = 3
     prior_spread: float = 0.6
+    continuity: ContinuitySettings = field(default_factory=ContinuitySettings)
+    patience: int = 30
+    blank_patience: int = 100
+    stale: tuple[float, float] = (0.4, 0.5)
 
 
 class Tracking:
     """Follows image points and filters an even choice of them.
 
+    An image that shows nothing of what the image before leads to expect is not believed: the tracks wait
+    where they were last seen, for the light to come back or somebody to step aside. If that does not happen
+    while the wheels stand, the robot was carried off.
+
     Attributes:
         history: where each track was seen from.
+        strange: how many images in a row were not believed because they show other things.
+        blank: likewise because they show nothing.
     """
 
     def __init__(self, description: RobotDescription, lens: Lens, settings: TrackingSettings) -> None:
@@ -59,6 +76,10 @@ class Tracking:
         self._filter = MappingFilter(
             description.camera, description.axle, description.wheel_noise, settings.filter
         )
+        self._continuity = Continuity(lens, description.camera, settings.tracker, settings.continuity)
+        self.strange = self.blank = 0
+        self._believed: NDArray[np.uint8] | None = None
+        self._since_believed = Pose2()
         self._strikes: dict[int, int] = {}
         self._next_track = 1
 
@@ -78,6 +99,16 @@ class Tracking:
         return self._filter.pose
 
     @property
+    def doubtful(self) -> bool:
+        """Whether the last image was not believed."""
+        return bool(self.strange or self.blank)
+
+    @property
+    def carried_off(self) -> bool:
+        """Whether images have shown something else for so long that the robot must be elsewhere."""
+        return self.strange >= self._settings.patience or self.blank >= self._settings.blank_patience
+
+    @property
     def converged_share(self) -> float:
         """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
         converged = self._filter.converged()
@@ -90,9 +121,9 @@ class Tracking:
     def step(self, observation: Observation) -> None:
         """Predict by the wheels, follow the tracks, correct by what they show."""
         self._filter.predict(observation.odometry)
-        if observation.image is None:
+        self._since_believed = self._since_believed @ observation.odometry.motion()
+        if observation.image is None or not self._follow(observation.image):
             return
-        self._tracker.track(observation.image, self._expected(observation))
         # A landmark whose track is lost stays out: what it taught is in the posture already.
         self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
         filtered = np.isin(self._tracker.ids, self._filter.ids)
@@ -135,13 +166,29 @@ class Tracking:
         self.history.reanchor(moved.mean, self._tracker.ids)
         return moved
 
-    def _expected(self, observation: Observation) -> Array:
+    def _follow(self, image: NDArray[np.uint8]) -> bool:
+        """Follow the tracks into an image; returns whether it is believed."""
+        before, expected = copy.copy(self._tracker), self._expected()
+        self._tracker.track(image, expected)
+        found = np.full(expected.shape, np.nan)
+        found[np.isin(before.ids, self._tracker.ids)] = self._tracker.pixels
+        moved, (way, turn) = self._since_believed, self._settings.stale
+        stale = np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn
+        sight = Sight.SAME
+        if self._believed is not None and not stale:
+            sight = self._continuity.compare(self._believed, image, moved.heading, expected, found)
+        if sight is Sight.SAME:
+            self.strange = self.blank = 0
+            self._believed, self._since_believed = image, Pose2()
+            return True
+        self._tracker = before
+        self.strange += sight is Sight.STRANGE
+        self.blank += sight is Sight.BLANK
+        return False
+
+    def _expected(self) -> Array:
         """(N, 2) px where the tracks should be now: by the filter, else by the turn alone."""
-        before = self._tracker.pixels
-        bearing = np.tan(self._camera.bearings(before))
-        turn = np.tan(observation.odometry.turn)
-        expected = before.copy()
-        expected[:, 0] = self._camera.cx - self._camera.fx * (bearing - turn) / (1 + bearing * turn)
+        expected = turned(self._camera, self._tracker.pixels, self._since_believed.heading)
         ids = self._filter.ids
         if len(ids):
             order = np.argsort(ids)

@@ -260,11 +260,11 @@ def test_a_mission_can_be_changed_at_any_time(walls, drive):
     step = pipeline.step(still(walls, tick=32))
     assert step.status.mission == "goto"
     assert "looking around" in step.status.doing
-    # It may have been carried anywhere in between: to map on would make a false edge.
+    # There is no map yet that it could have been carried away from: it begins one here.
     pipeline.set_mission(Carried())
     step = pipeline.step(still(walls, tick=33))
-    assert step.status.mission == "idle"
-    assert "has navigated" in step.status.detail
+    assert step.status.mission == "carried"
+    assert "no nodes yet" in step.status.detail
 
 
 def test_exploration_that_was_interrupted_goes_on(walls, drive):
@@ -351,17 +351,49 @@ def test_a_robot_that_is_stuck_at_something_its_rangers_miss_stops(walls, reckle
     assert "bump" in step.status.detail
 
 
-def test_mapping_after_navigating_makes_no_false_edge(walls):
+def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list[Step]]:
+    """A robot that has mapped from x = -1.0 to -0.3 m, has a goal for a while, and then is carried on.
+
+    Args:
+        walls: the world.
+        places: postures that it is carried through afterwards.
+
+    Returns:
+        The pipeline, what was in its map before, and the steps since.
+    """
     pipeline, before = on(Carried()), Pose2(-1.0)
     for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
         pipeline.step(walls.observe(before, Pose2(x), tick))
         before = Pose2(x)
     elements = set(pipeline.map.nodes) | set(pipeline.map.edges)
     pipeline.set_mission(GoTo(NodeId("r1", 1, 1)))
-    pipeline.step(still(walls, Pose2(0.3), tick=100))
+    pipeline.step(still(walls, places[0], tick=100))
     pipeline.set_mission(Carried())
-    for tick, x in enumerate(np.arange(0.3, 0.8, 0.025), 101):
-        step = pipeline.step(walls.observe(before, Pose2(x), tick))
-        before = Pose2(x)
-        assert step.changes == ()
+    steps, before = [], places[0]
+    for tick, pose in enumerate(places, 101):
+        steps.append(pipeline.step(walls.observe(before, pose, tick)))
+        before = pose
+    return pipeline, elements, steps
+
+
+def test_after_navigating_it_maps_on_once_it_recognises_a_place(walls):
+    """It was carried 0.7 m further meanwhile, which the wheels do not know."""
+    places = [Pose2(x) for x in np.arange(0.3, 0.9, 0.025)]
+    pipeline, elements, _ = carried_after_navigating(walls, places)
+    assert elements < set(pipeline.map.nodes)
+    assert len(pipeline.map.components()) == 1
+    first = min(node.number for node in elements)
+    for node in pipeline.map.nodes.values():
+        if node.id not in elements:
+            true = places[node.stamp_ns // 100_000_000 - 101]
+            from_start = pipeline.map.nodes[NodeId("r0", 1, first)].map_from_robot.mean.inverse()
+            assert (from_start @ node.map_from_robot.mean).distance(Pose2(-1.0).inverse() @ true) < 0.05
+
+
+def test_after_navigating_to_where_it_knows_nothing_it_does_not_map_on(walls):
+    away = [Pose2(x, 0.0, math.pi) for x in np.arange(0.3, 0.9, 0.025)]
+    pipeline, elements, steps = carried_after_navigating(walls, away)
     assert set(pipeline.map.nodes) | set(pipeline.map.edges) == elements
+    assert all(step.changes == () for step in steps)
+    assert "waiting to recognise a place of its own map: only 0 features" in steps[-1].status.detail
+    assert not pipeline.lost
