@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -16,6 +16,7 @@ from hybridmap.pose import Pose2
 from wire.bus import Bus, Request
 from wire.keys import Keys
 from wire.log_messages import Scalar, decode_record, encode_record
+from wire.metered import MeteredBus
 from wire.messages import (
     RouteRequest,
     decode_relocalize_answer,
@@ -65,10 +66,18 @@ class AgentReport:
     Attributes:
         status: what the agent says of itself.
         stamp_ns: time of the observation that it speaks of.
+        epoch: of the map that it makes.
+        unsent: changes that no server has on its disk yet.
+        traffic: bytes that it has sent and received over the fleet's network since it began.
+        linked: whether it sees its map server.
     """
 
     status: Status
     stamp_ns: int
+    epoch: int = 0
+    unsent: int = 0
+    traffic: int = 0
+    linked: bool = False
 
     @property
     def fix_node(self) -> NodeId | None:
@@ -76,12 +85,17 @@ class AgentReport:
         return self.status.fix_node
 
 
-def encode_status(status: Status, stamp_ns: int) -> bytes:
+def encode_report(report: AgentReport) -> bytes:
     """What the robot is doing, for people and for tests."""
+    status = report.status
     pose, fix = status.map_from_robot, status.node_from_robot
     return encode_record(
         {
-            "stamp_ns": stamp_ns,
+            "stamp_ns": report.stamp_ns,
+            "epoch": report.epoch,
+            "unsent": report.unsent,
+            "traffic": report.traffic,
+            "linked": report.linked,
             "doing": _one_line(status.doing),
             "detail": _one_line(status.detail),
             "nodes": status.nodes,
@@ -105,7 +119,7 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() else " " for c in text)[:MAX_WORDS]
 
 
-def decode_status(payload: bytes) -> AgentReport:
+def decode_report(payload: bytes) -> AgentReport:
     """Read a status.
 
     Raises:
@@ -125,7 +139,8 @@ def decode_status(payload: bytes) -> AgentReport:
             node_from_robot=_posture(values, "fix_x", "fix_y", "fix_heading"),
             legs=_typed(values, "legs", int),
         )
-        return AgentReport(status, _typed(values, "stamp_ns", int))
+        numbers = (_typed(values, name, int) for name in ("stamp_ns", "epoch", "unsent", "traffic"))
+        return AgentReport(status, *numbers, linked=_typed(values, "linked", bool))
     except (KeyError, ValueError, InvalidValue) as error:
         raise InvalidMessage(f"agent status: {error}") from None
 
@@ -144,7 +159,15 @@ def _posture(values: Mapping[str, Scalar], x: str, y: str, heading: str) -> Pose
 class FleetLink:
     """Runs beside the robot's loop; nothing here makes the loop wait, unless it asks to."""
 
-    def __init__(self, bus: Bus, keys: Keys, map_id: MapId, answer_timeout: float = 3.0) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        map_id: MapId,
+        answer_timeout: float = 3.0,
+        server: str = "s0",
+        unsent: Callable[[], int] = lambda: 0,
+    ) -> None:
         """Announce the agent and listen for missions.
 
         Args:
@@ -152,10 +175,18 @@ class FleetLink:
             keys: of the fleet.
             map_id: the map that the agent makes.
             answer_timeout: how long a question may take, s.
+            server: the map server that `server_in_reach` speaks of.
+            unsent: counts the changes that it does not have yet; called from any thread.
         """
         self._bus = bus
         self._keys = keys
+        self._map = map_id
         self._agent = map_id.agent
+        self._server = server
+        self._server_alive = False
+        self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
+        self._stamp_ns = 0
+        self._unsent = unsent
         self._timeout = answer_timeout
         self._missions: queue.SimpleQueue[Mission] = queue.SimpleQueue()
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
@@ -163,6 +194,8 @@ class FleetLink:
         self._open_questions = 0
         self._closing = [
             bus.serve(keys.mission(map_id.agent), self._take_mission),
+            bus.serve(keys.agent_status(map_id.agent), self._tell_status),
+            bus.watch(keys.server_alive(server), self._see_server),
             bus.announce(keys.agent_alive(map_id)),
         ]
         self._asker = threading.Thread(target=self._ask_all, name="questions", daemon=True)
@@ -175,9 +208,21 @@ class FleetLink:
             out.append(self._missions.get())
         return out
 
-    def report(self, status: Status, stamp_ns: int) -> None:
-        """Tell people what the robot is doing. Best effort."""
-        self._bus.publish(self._keys.agent_status(self._agent), encode_status(status, stamp_ns))
+    def server_in_reach(self) -> bool:
+        """Whether the map server can hear and be heard now, as far as is known."""
+        return self._server_alive and self._bus.connected()
+
+    def report(self, status: Status, stamp_ns: int, publish: bool = True) -> None:
+        """Tell people what the robot is doing: who asks, and, best effort, who listens.
+
+        Args:
+            status: of the pipeline.
+            stamp_ns: time of the observation that it speaks of.
+            publish: send it now; else only remember it for who asks.
+        """
+        self._status, self._stamp_ns = status, stamp_ns
+        if publish:
+            self._bus.publish(self._keys.agent_status(self._agent), encode_report(self._now()))
 
     def ask(self, question: Question) -> None:
         """Send a question; its answer comes with a later `answers`."""
@@ -203,6 +248,19 @@ class FleetLink:
         for closing in self._closing:
             closing.close()
         self._asker.join(self._timeout + 1.0)
+
+    def _now(self) -> AgentReport:
+        traffic = self._bus.traffic if isinstance(self._bus, MeteredBus) else 0
+        return AgentReport(
+            self._status, self._stamp_ns, self._map.epoch, self._unsent(), traffic, self.server_in_reach()
+        )
+
+    def _tell_status(self, request: Request) -> None:
+        request.reply(encode_report(self._now()))
+
+    def _see_server(self, key: str, alive: bool) -> None:
+        del key
+        self._server_alive = alive
 
     def _take_mission(self, request: Request) -> None:
         mission = decode_mission(request.payload)

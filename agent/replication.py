@@ -123,6 +123,11 @@ class Replicator:
             bus.serve(keys.logs(map_id.agent), self._work.put),
         ]
 
+    @property
+    def map_id(self) -> MapId:
+        """The map whose changes are taken."""
+        return self._map
+
     def submit(self, bodies: Iterable[ChangeBody], stamp_ns: int) -> None:
         """Hand over changes. Encodes them, and waits for neither disk nor network.
 
@@ -164,6 +169,11 @@ class Replicator:
                 refused=sum(len(one.refusals) for one in self._logs.values()),
                 failure=self._disk_failure or self._current.failure,
             )
+
+    def unacknowledged(self) -> int:
+        """Changes that were submitted and are not yet on every required server's disk."""
+        with self._changed:
+            return self._unacknowledged() + self._submitted - self._committed
 
     def refusals(self) -> dict[tuple[str, int], str]:
         """What servers have refused for good of the map that is being made: (server, sequence) to reason."""

@@ -7,19 +7,23 @@ from collections.abc import Callable
 
 from agent.drivers.robot import Robot
 from agent.fleet import FleetLink
+from agent.mission import Answer, Question
+from agent.observation import Observation
 from agent.pipeline import Pipeline, Step
 from agent.replication import Replicator
 
 REPORT_EVERY = 5
 """Ticks between two status reports."""
 
+LOCKSTEP_PATIENCE = 30.0
+"""In lock-step: how long a tick may wait for its own disk, and for a server that can be reached, s."""
+
 
 class Runner:
-    """Runs one robot until its body ends, or it is told to stop."""
+    """Runs one robot until its body ends, it is told to stop, or it must begin a fresh map."""
 
     def __init__(
         self,
-        robot: Robot,
         pipeline: Pipeline,
         fleet: FleetLink,
         replicator: Replicator,
@@ -29,41 +33,68 @@ class Runner:
         """Put the parts together.
 
         Args:
-            robot: the body.
             pipeline: the mind.
             fleet: questions, missions, status.
             replicator: where changes go: to the own disk, then to the server.
-            lockstep: wait for answers before the next tick (simulation only).
+            lockstep: let time stand still until the disk, a server in reach and the answers have come, so
+                that the outcome does not depend on the machine's speed (simulation only).
             on_step: called after each tick, for progress.
         """
-        self._robot = robot
         self._pipeline = pipeline
         self._fleet = fleet
         self._replicator = replicator
         self._lockstep = lockstep
         self._on_step = on_step
+        self._questions: tuple[Question, ...] = ()
+        self._answers: tuple[Answer, ...] = ()
+        self._ticks = 0
 
-    def run(self, stop: threading.Event) -> int:
-        """Loop until the body has no more observations or `stop` is set.
+    def tick(self, observation: Observation) -> Step:
+        """Take one observation; changes and status go their way, questions wait for `exchange`."""
+        for mission in self._fleet.missions():
+            self._pipeline.set_mission(mission)
+        answers, self._answers = (*self._answers, *self._fleet.answers()), ()
+        step = self._pipeline.step(observation, answers)
+        if step.changes:
+            self._replicator.submit(step.changes, observation.stamp_ns)
+            if self._lockstep:
+                self._replicator.flush(LOCKSTEP_PATIENCE)
+                if self._fleet.server_in_reach():
+                    self._replicator.wait_acknowledged(LOCKSTEP_PATIENCE)
+        self._questions = step.questions
+        now = self._ticks % REPORT_EVERY == 0 or bool(step.questions)
+        self._fleet.report(step.status, observation.stamp_ns, publish=now)
+        self._ticks += 1
+        self._on_step(step)
+        return step
+
+    @property
+    def curious(self) -> bool:
+        """Whether the last tick had questions."""
+        return bool(self._questions)
+
+    def exchange(self) -> None:
+        """Ask what the last tick wanted to know. A robot does not wait for the answers; in lock-step it does."""
+        for question in self._questions:
+            self._fleet.ask(question)
+        self._questions = ()
+        if self._lockstep:
+            self._answers = self._fleet.answers(wait=True)
+
+    def run(self, robot: Robot, stop: threading.Event) -> int:
+        """Loop until the body has no more observations, `stop` is set or the pipeline wants a fresh map.
 
         Returns:
             How many ticks were run.
         """
-        ticks = 0
-        while not stop.is_set():
-            observation = self._robot.sense()
+        first = self._ticks
+        while not (stop.is_set() or self._pipeline.lost):
+            observation = robot.sense()
             if observation is None:
                 break
-            for mission in self._fleet.missions():
-                self._pipeline.set_mission(mission)
-            step = self._pipeline.step(observation, self._fleet.answers(wait=self._lockstep))
-            self._robot.act(step.command)
-            if step.changes:
-                self._replicator.submit(step.changes, observation.stamp_ns)
-            for question in step.questions:
-                self._fleet.ask(question)
-            if ticks % REPORT_EVERY == 0 or step.questions:
-                self._fleet.report(step.status, observation.stamp_ns)
-            self._on_step(step)
-            ticks += 1
-        return ticks
+            robot.act(self.tick(observation).command)
+            if self.curious:
+                if self._lockstep:
+                    robot.rendezvous()
+                self.exchange()
+        return self._ticks - first

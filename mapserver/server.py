@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 
 from hybridmap.change import Change
-from hybridmap.errors import MapweaveError
+from hybridmap.errors import MapweaveError, NotConnected
 from mapserver.ingest import Ingest
 from mapserver.merger import Merger
 from mapserver.relocalization import Relocalizer
@@ -32,6 +32,9 @@ from wire.messages import (
 
 log = logging.getLogger(__name__)
 
+SETTLE_PATIENCE = 120.0
+"""In lock-step: how long a question waits for the merged map, s."""
+
 
 @dataclass(frozen=True)
 class ServerSettings:
@@ -40,10 +43,13 @@ class ServerSettings:
     Attributes:
         status_every: seconds between two status messages.
         merge_share: at most this share of the time is spent making the merged map anew.
+        lockstep: answer only when everything that came is merged, so that an answer does not depend on the
+            machine's speed (simulation only; a robot's question must not wait).
     """
 
     status_every: float = 0.5
     merge_share: float = 0.4
+    lockstep: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +87,7 @@ class MapServer:
         self._store = Store(path)
         self._merger = Merger()
         self._lock = threading.Lock()
-        self._changes: queue.SimpleQueue[Change | None] = queue.SimpleQueue()
+        self._changes: queue.SimpleQueue[Change | threading.Event | None] = queue.SimpleQueue()
         self._answers = self._new_answers(MergedMap.empty())
         self._dirty = False
         self._stop = threading.Event()
@@ -98,6 +104,7 @@ class MapServer:
             self._bus.serve(keys.relocalize(name), self._guarded(self._relocalize)),
             self._bus.serve(keys.route(name), self._guarded(self._route)),
             self._bus.serve(keys.server_map(name), self._guarded(self._map)),
+            self._bus.serve(keys.server_status(name), self._guarded(self._tell_status)),
             self._bus.announce(keys.server_alive(name)),
         ]
         self._teller.start()
@@ -120,6 +127,12 @@ class MapServer:
         """One line for people."""
         return self._answers.merged.summary()
 
+    def settle(self, timeout: float) -> bool:
+        """Wait until everything that came before this call is merged; False if the time is over first."""
+        merged = threading.Event()
+        self._changes.put(merged)
+        return merged.wait(timeout)
+
     # The merged map is kept up to date beside the questions.
 
     def _work(self) -> None:
@@ -136,6 +149,11 @@ class MapServer:
                 continue
             if change is None:
                 return
+            if isinstance(change, threading.Event):
+                if self._dirty:
+                    self._merge()
+                change.set()
+                continue
             with self._lock:
                 try:
                     self._merger.on_change(change)
@@ -170,19 +188,26 @@ class MapServer:
 
         return handle
 
+    def _in_step(self) -> None:
+        if self._settings.lockstep and not self.settle(SETTLE_PATIENCE):
+            raise NotConnected(f"the merged map was not up to date within {SETTLE_PATIENCE:g} s")
+
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)
+        self._in_step()
         with self._lock:
             return encode_relocalize_answer(self._answers.relocalizer.answer(view))
 
     def _route(self, payload: bytes) -> bytes:
         request = decode_route_request(payload)
+        self._in_step()
         answer = self._answers.router.route(
             request.start, request.goal, request.blocked, start_from_robot=request.start_from_robot
         )
         return encode_route_answer(answer)
 
     def _map(self, payload: bytes) -> bytes:
+        self._in_step()
         merged = self._answers.merged
         changes = tuple(merged.union().contents())
         return pack_map_file(MapFile("merged", merged.summary(), changes, dict(merged.postures)))
@@ -192,6 +217,10 @@ class MapServer:
     def _tell(self) -> None:
         while not self._stop.wait(self._settings.status_every):
             self._bus.publish(self._keys.server_status(self._name), encode_record(self._status()))
+
+    def _tell_status(self, payload: bytes) -> bytes:
+        self._in_step()
+        return encode_record(self._status())
 
     def _status(self) -> dict[str, str | int | float | bool]:
         merged = self._answers.merged

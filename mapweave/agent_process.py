@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,22 +16,27 @@ from agent.drivers.robot import Robot
 from agent.fleet import FleetLink
 from agent.journal import Journal
 from agent.mission import Idle, Mission
+from agent.observation import Observation, RobotDescription
 from agent.pipeline import Pipeline, PipelineSettings, Step
 from agent.replication import Replicator
-from agent.runner import Runner
+from agent.runner import LOCKSTEP_PATIENCE, Runner
+from hybridmap.node import MapId
+from wire.bus import Bus
 from wire.keys import Keys
 from wire.mapfile import MapFile, write_map_file
+from wire.metered import MeteredBus
 from wire.zenoh_bus import ZenohBus
 
 
 @dataclass(frozen=True)
 class AgentOptions:
-    """How an agent process runs.
+    """How an agent runs.
 
     Attributes:
         name: in the fleet.
         data: folder for its journal and its map file.
-        epoch: number of the new map; None takes the clock's seconds, which only grow.
+        epoch: number of the map if one is begun; None takes the clock's seconds, which only grow.
+        fresh: begin a new map even if the journal holds one.
         mission: at the start.
         seed: of the random choices in exploration.
         lockstep: wait for answers between ticks.
@@ -42,12 +48,143 @@ class AgentOptions:
     name: str
     data: Path
     epoch: int | None = None
+    fresh: bool = False
     mission: Mission = field(default_factory=Idle)
     seed: int = 0
     lockstep: bool = False
     server: str = "s0"
     total: int | None = None
     patience: float = 5.0
+
+
+class Agent:
+    """Mind, disk and link of one robot; whoever has its body calls `tick` and `exchange`.
+
+    It takes up the newest map of its journal. When the pipeline cannot find itself on that map, a fresh map
+    begins in a new epoch; the old one stays.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        bus: Bus,
+        keys: Keys,
+        settings: PipelineSettings,
+        options: AgentOptions,
+        on_step: Callable[[Step], None] = lambda step: None,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """Open the journal and join the fleet.
+
+        Args:
+            description: of the body.
+            bus: to the fleet; stays the caller's.
+            keys: of the fleet.
+            settings: of the pipeline.
+            options: how.
+            on_step: called after each tick.
+            say: takes lines for people.
+
+        Raises:
+            MapweaveError: the journal cannot be used; one line says why.
+        """
+        self._description = description
+        self._bus = MeteredBus(bus)
+        self._keys = keys
+        self._settings = replace(settings, seed=options.seed)
+        self._options = options
+        self._on_step = on_step
+        self._say = say
+        options.data.mkdir(parents=True, exist_ok=True)
+        self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
+        maps = self.journal.maps()
+        try:
+            if maps and not options.fresh:
+                self._resume(maps[-1])
+            else:
+                self._begin()
+        except BaseException:
+            self.journal.close()
+            raise
+
+    def _begin(self) -> None:
+        """A fresh map, whose number no map of this robot has had."""
+        newest = max((one.epoch for one in self.journal.maps()), default=None)
+        given = self._options.epoch
+        wanted = int(time.time()) if given is None else given
+        epoch = wanted if newest is None else max(wanted, newest + 1)
+        map_id = self.journal.open_map(epoch)
+        self._start(map_id, Pipeline(map_id, self._description, self._settings))
+
+    def _resume(self, map_id: MapId) -> None:
+        kept = self.journal.kept(map_id)
+        pipeline = Pipeline(map_id, self._description, self._settings, kept.contents, kept.next_number)
+        self.journal.open_map(map_id.epoch)
+        nodes = len(pipeline.map.nodes)
+        self._say(f"{self._options.name}: takes up map {map_id} with {nodes} nodes")
+        for line in kept.complaints:
+            self._say(f"{self._options.name}: {line}")
+        self._start(map_id, pipeline)
+
+    def _start(self, map_id: MapId, pipeline: Pipeline, mission: Mission | None = None) -> None:
+        options = self._options
+        pipeline.set_mission(options.mission if mission is None else mission)
+        self.pipeline = pipeline
+        self.replicator = Replicator(self._bus, self._keys, self.journal, map_id, servers=(options.server,))
+        # In lock-step a slow machine must not turn an answer into none.
+        patience = LOCKSTEP_PATIENCE if options.lockstep else 3.0
+        self._fleet = FleetLink(
+            self._bus, self._keys, map_id, patience, options.server, self.replicator.unacknowledged
+        )
+        self.runner = Runner(pipeline, self._fleet, self.replicator, options.lockstep, self._on_step)
+
+    @property
+    def map_id(self) -> MapId:
+        """The map that it makes."""
+        return self.replicator.map_id
+
+    def begin_anew(self) -> None:
+        """Leave a map on which the robot cannot find itself, and go on with the same mission in a fresh one."""
+        mission, old = self.pipeline.mission, self.map_id
+        self._leave()
+        self._begin()
+        self.pipeline.set_mission(mission)
+        self._say(
+            f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
+            "and the old one stays"
+        )
+
+    def tick(self, observation: Observation) -> Step:
+        """One tick; see Runner.tick. Begins a fresh map where that is needed."""
+        step = self.runner.tick(observation)
+        if self.pipeline.lost:
+            self.begin_anew()
+        return step
+
+    def run(self, robot: Robot, stop: threading.Event) -> None:
+        """Loop until the body has no more observations or `stop` is set."""
+        while True:
+            self.runner.run(robot, stop)
+            if stop.is_set() or not self.pipeline.lost:
+                return
+            self.begin_anew()
+
+    def write_map(self) -> Path:
+        """Write the map that it makes to its map file; returns where."""
+        path = self._options.data / f"{self._options.name}.mapweave"
+        contents = tuple(self.pipeline.map.contents())
+        write_map_file(path, MapFile("agent", str(self.map_id), contents, {}))
+        return path
+
+    def _leave(self) -> None:
+        self._fleet.close()
+        self.replicator.flush(10.0)
+        self.replicator.close()
+
+    def close(self) -> None:
+        """Commit what was mapped and leave the fleet. The bus stays open."""
+        self._leave()
+        self.journal.close()
 
 
 def run_agent(
@@ -65,29 +202,19 @@ def run_agent(
     """
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
-    options.data.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)
-    journal = Journal(options.data / f"{options.name}.sqlite", options.name)
-    epoch = options.epoch if options.epoch is not None else int(time.time())
-    map_id = journal.open_map(epoch)
-    pipeline = Pipeline(map_id, robot.describe(), replace(settings, seed=options.seed))
-    pipeline.set_mission(options.mission)
-    replicator = Replicator(bus, keys, journal, map_id, servers=(options.server,))
-    fleet = FleetLink(bus, keys, map_id)
-    try:
-        with _progress(console, options) as show:
-            Runner(robot, pipeline, fleet, replicator, options.lockstep, show).run(stop)
-    finally:
-        robot.close()
-        fleet.close()
-        replicator.flush(10.0)
-        path = options.data / f"{options.name}.mapweave"
-        write_map_file(path, MapFile("agent", str(map_id), tuple(pipeline.map.contents()), {}))
-        nodes, edges = len(pipeline.map.nodes), len(pipeline.map.edges)
-        console.print(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
-        _hand_over(console, replicator, bus, options)
-        replicator.close()
-        journal.close()
+    with _progress(console, options) as show:
+        agent = Agent(robot.describe(), bus, keys, settings, options, show, console.print)
+        try:
+            agent.run(robot, stop)
+        finally:
+            robot.close()
+            path = agent.write_map()
+            nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
+            console.print(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
+            agent.replicator.flush(10.0)
+            _hand_over(console, agent.replicator, bus, options)
+            agent.close()
 
 
 def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options: AgentOptions) -> None:

@@ -1,33 +1,30 @@
-"""The simulator as a process: a world, its robots, and the bridge to the bus."""
+"""The simulator as a process: a scenario's world, its robots, and the bridge to the bus."""
 
 from __future__ import annotations
 
 import threading
 
-from hybridmap.errors import SettingsError
+from mapweave.trial.scenario import Scenario
 from sim.bridge import SimBridge
-from sim.office import make_office
 from sim.simulation import Simulation
 from wire.bus import Bus
 
+PATIENCE = 60.0
+"""How long the other robots wait for one that does not ask, s."""
 
-def run_sim(bus: Bus, fleet: str, robots: int, rooms: int, seed: int, stop: threading.Event) -> None:
-    """Serve simulated bodies r0, r1 ... until told to stop.
+
+def run_sim(bus: Bus, fleet: str, scenario: Scenario, seed: int, stop: threading.Event) -> None:
+    """Serve the simulated bodies of a scenario until told to stop.
 
     Raises:
-        SettingsError: a number of robots or rooms, or a seed, that cannot work.
+        MapweaveError: the world cannot be built, or holds no place for so many robots.
     """
-    if not 1 <= robots <= 16:
-        raise SettingsError(f"--robots {robots}: use 1 to 16")
-    if not 3 <= rooms <= 12:
-        raise SettingsError(f"--rooms {rooms}: use 3 to 12")
-    if seed < 0:
-        raise SettingsError(f"--seed {seed}: use 0 or more")
-    world = make_office(seed, rooms)
-    with Simulation(world, [f"r{k}" for k in range(robots)], seed) as simulation:
-        bridge = SimBridge(simulation, bus, fleet)
+    world = scenario.world(seed)
+    with Simulation(world, scenario.robots, seed) as simulation:
+        bridge = SimBridge(simulation, bus, fleet, PATIENCE)
         try:
-            print(f"simulating {robots} robots in an office of {rooms} rooms, seed {seed}", flush=True)
+            names = ", ".join(simulation.robots)
+            print(f"simulating {names} in {world.name}, seed {seed}", flush=True)
             bridge.run(stop)
         finally:
             bridge.close()

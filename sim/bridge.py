@@ -9,10 +9,17 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from agent.drivers.messages import ENDED, StepRequest, decode_step, encode_description, encode_observation
+from agent.drivers.messages import (
+    AGAIN,
+    ENDED,
+    StepRequest,
+    decode_step,
+    encode_description,
+    encode_observation,
+)
 from agent.drivers.remote import clip
 from hybridmap.errors import MapweaveError
-from sim.control import ControlDesk
+from sim.desk import ControlDesk
 from sim.lockstep import Lockstep, Seat
 from sim.simulated import Simulated
 from wire.bus import Bus, Request
@@ -59,10 +66,12 @@ class SimBridge:
         self._desk = ControlDesk(simulation, lambda: self._lockstep.active, self._wall, self._stop)
         self._changed = threading.Condition()
         self._inbox: deque[Callable[[], None]] = deque()
+        self._limit: int | None = None
+        self._advancing: Request | None = None
         self._stopping = False
         self._ended = False
         self._told: set[str] = set()
-        self._declared = [bus.watch(keys.agents_alive(), self._presence)]
+        self._declared = [bus.watch(keys.robot_drivers(), self._presence)]
         for name in simulation.robots:
             self._declared.append(bus.serve(keys.robot_describe(name), self._describer(name)))
             self._declared.append(bus.serve(keys.robot_step(name), self._stepper(name)))
@@ -79,9 +88,16 @@ class SimBridge:
             while not (self._stopping or stop.is_set()):
                 self._read_inbox()
                 seats = self._lockstep.due(time.monotonic())
-                if seats:
+                asking = [seat for seat in seats if seat.step is not None and seat.step.rendezvous]
+                if asking:
+                    # Everybody has finished the tick: these may ask the fleet now, the others wait for them.
+                    for seat in asking:
+                        self._lockstep.answer(seat, b"", time.monotonic())
+                elif self._may_advance(seats):
                     self._tick(seats)
                 else:
+                    if seats or not self._lockstep.active:
+                        self._reached()
                     self._wait()
         finally:
             self._end()
@@ -111,6 +127,23 @@ class SimBridge:
             with self._timed("replying"):
                 self._lockstep.answer(seat, encode_observation(observation), time.monotonic())
 
+    def _may_advance(self, seats: list[Seat]) -> bool:
+        """Whether to tick: when all have asked, or nobody drives and somebody wants time to pass."""
+        if self._limit is None:
+            return bool(seats)
+        return self._simulation.tick < self._limit and (bool(seats) or not self._lockstep.active)
+
+    def _reached(self) -> None:
+        """All that was to be simulated is, and every robot has finished: say so to who waits for it."""
+        if self._advancing is not None:
+            self._advancing.reply(self._desk.reached())
+            self._advancing = None
+
+    def _advance(self, tick: int, request: Request) -> None:
+        if self._advancing is not None:
+            self._advancing.refuse(f"asked anew, {AGAIN}")
+        self._limit, self._advancing = tick, request
+
     def _read_inbox(self) -> None:
         while self._inbox:
             self._inbox.popleft()()
@@ -122,6 +155,10 @@ class SimBridge:
     def _answer_control(self, request: Request) -> None:
         with self._timed("control"):
             try:
+                tick = self._desk.advances_to(request.payload)
+                if tick is not None:
+                    self._advance(tick, request)
+                    return
                 request.reply(self._desk.answer(request.payload))
             except MapweaveError as error:
                 request.refuse(str(error))
@@ -136,6 +173,9 @@ class SimBridge:
             self._ended = True
         # From here on handlers refuse by themselves, so that nothing comes after this.
         self._read_inbox()
+        if self._advancing is not None:
+            self._advancing.refuse(ENDED)
+            self._advancing = None
         self._tell(self._lockstep.refuse_all(ENDED))
 
     @contextmanager
@@ -169,9 +209,9 @@ class SimBridge:
             request.refuse(ENDED)
 
     def _presence(self, key: str, alive: bool) -> None:
-        agent, epoch = self._keys.parse_agent_alive(key)
-        if not self._put(lambda: self._lockstep.presence(agent, epoch, alive)) and not alive:
-            self._tell({agent})
+        robot, driver = self._keys.parse_robot_driver(key)
+        if not self._put(lambda: self._lockstep.presence(robot, driver, alive)) and not alive:
+            self._tell({robot})
 
     def _put(self, task: Callable[[], None]) -> bool:
         """Leave a task for the simulation's thread; False if that has ended."""

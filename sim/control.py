@@ -1,26 +1,26 @@
 """Truth and intervention, for whoever scores a run: robots and servers never ask here.
 
-One question on the key `sim/control`, a MessagePack map with the operation's name in `op`.
+The questions that `sim.desk` answers, as methods.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.drivers.messages import AGAIN
 from hybridmap.errors import InvalidValue, NotConnected
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan, Rectangle
-from sim.simulated import Simulated
+from sim.snapshot import Snapshot
 from wire.bus import Bus
 from wire.keys import Keys
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 
 MAX_BYTES = 64 * 2**20
-MAX_STAMPS = 100_000
 MAX_RECTANGLES = 100_000
 MAX_ROBOTS = 1024
 FARTHEST = 1e6
@@ -58,103 +58,6 @@ class SimStatus:
     stamp_ns: int
     robots: dict[str, RobotStatus] = field(default_factory=dict)
     wall: dict[str, float] = field(default_factory=dict)
-
-
-class ControlDesk:
-    """Answers control questions. Call it between ticks only."""
-
-    def __init__(
-        self,
-        simulation: Simulated,
-        active: Callable[[], set[str]],
-        wall: Mapping[str, float],
-        stop: Callable[[], None],
-    ) -> None:
-        """Put the desk in front of a simulation.
-
-        Args:
-            simulation: whose truth is told.
-            active: names of the robots that take part now.
-            wall: s by part beside the simulation's own, kept by the caller.
-            stop: ends the run.
-        """
-        self._simulation = simulation
-        self._active = active
-        self._wall = wall
-        self._stop = stop
-        self._operations: dict[str, Callable[[Reader], dict[str, object]]] = {
-            "kidnap": self._kidnap,
-            "status": self._status,
-            "truth_at": self._truth_at,
-            "trajectory": self._trajectory,
-            "plan": self._plan,
-            "stop": self._end,
-        }
-
-    def answer(self, question: bytes) -> bytes:
-        """Do what is asked.
-
-        Raises:
-            MapweaveError: the question is broken, or the simulation refuses.
-        """
-        reader = Reader(question, "control", MAX_BYTES)
-        operation = reader.text("op", 32)
-        if operation not in self._operations:
-            raise reader.error(f"no operation {operation!r}; there are {', '.join(self._operations)}")
-        return pack(self._operations[operation](reader))
-
-    def _robot(self, reader: Reader) -> str:
-        name = reader.name("robot")
-        if name not in self._simulation.robots:
-            raise InvalidValue(f"no robot {name!r}; there are {', '.join(self._simulation.robots)}")
-        return name
-
-    def _kidnap(self, reader: Reader) -> dict[str, object]:
-        values = reader.array("pose", 3)
-        if len(values) != 3:
-            raise reader.error("pose must be [x, y, heading]")
-        numbers = [reader.as_number(value, "pose", -FARTHEST, FARTHEST) for value in values]
-        self._simulation.kidnap(self._robot(reader), Pose2(*numbers))
-        return {}
-
-    def _status(self, reader: Reader) -> dict[str, object]:
-        simulation, active = self._simulation, self._active()
-        robots = {
-            name: [
-                *simulation.truth(name).vector.tolist(),
-                simulation.collisions(name),
-                name in active,
-            ]
-            for name in simulation.robots
-        }
-        return {
-            "tick": simulation.tick,
-            "t": simulation.stamp_ns,
-            "robots": robots,
-            "wall": {**simulation.seconds, **self._wall},
-        }
-
-    def _truth_at(self, reader: Reader) -> dict[str, object]:
-        name = self._robot(reader)
-        stamps = [reader.as_integer(s, "t", 0, MAX_STAMP_NS) for s in reader.array("t", MAX_STAMPS)]
-        poses = [self._simulation.truth_at(name, stamp).vector for stamp in stamps]
-        return {"p": np.array(poses, "<f8").tobytes()}
-
-    def _trajectory(self, reader: Reader) -> dict[str, object]:
-        stamps, poses = self._simulation.trajectory(self._robot(reader))
-        return {"t": stamps.astype("<i8").tobytes(), "p": poses.astype("<f8").tobytes()}
-
-    def _plan(self, reader: Reader) -> dict[str, object]:
-        plan = self._simulation.world.plan
-        return {
-            "rooms": list(map(_pack_rectangle, plan.rooms)),
-            "walls": list(map(_pack_rectangle, plan.walls)),
-            "furniture": list(map(_pack_rectangle, plan.furniture)),
-        }
-
-    def _end(self, reader: Reader) -> dict[str, object]:
-        self._stop()
-        return {}
 
 
 class SimControl:
@@ -221,6 +124,51 @@ class SimControl:
         )
         return FloorPlan(rooms, walls, furniture)
 
+    def apply(self, event: Mapping[str, object]) -> str:
+        """Let something happen, as a scenario's table says it; returns what has happened, in words."""
+        return self._ask("apply", event=dict(event)).text("said", 500)
+
+    def advance(self, tick: int, patience: float) -> bool:
+        """Let time pass until a tick is over and every robot has finished with it; then time stands still.
+
+        From the first call on time passes only so. Asking again for the same tick is no error.
+
+        Args:
+            tick: the one to reach.
+            patience: how long to wait, s.
+
+        Returns:
+            Whether it was reached in time.
+        """
+        question = pack({"op": "advance", "tick": tick})
+        replies = self._bus.ask(self._key, question, patience)
+        if replies and replies[0].error and AGAIN not in replies[0].error:
+            raise InvalidValue(f"the simulator refuses advance: {replies[0].error}")
+        return any(not reply.error for reply in replies)
+
+    def snapshot(self) -> Snapshot:
+        """What a bird sees, and what the robots saw last."""
+        reader = self._ask("snapshot")
+        actors, furniture = (
+            tuple(_read_rectangle(reader, value) for value in reader.array(name, MAX_RECTANGLES))
+            for name in ("actors", "furniture")
+        )
+        poses = {
+            name: Pose2(*_numbers(reader, name, value, 3))
+            for name, value in reader.table("robots", MAX_ROBOTS).items()
+        }
+        images = {
+            name: _read_image(reader, value) for name, value in reader.table("images", MAX_ROBOTS).items()
+        }
+        return Snapshot(
+            tick=reader.integer("tick", 0, MAX_NUMBER),
+            stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
+            robots=poses,
+            actors=actors,
+            furniture=furniture,
+            images={name: images.get(name) for name in poses},
+        )
+
     def stop(self) -> None:
         """End the simulation; its agents are told."""
         self._ask("stop")
@@ -228,14 +176,10 @@ class SimControl:
     def _ask(self, operation: str, **fields: object) -> Reader:
         replies = self._bus.ask(self._key, pack({"op": operation, **fields}), self._timeout)
         if not replies:
-            raise NotConnected(f"{self._key}: nobody answers; start the simulator with: mapweave sim")
+            raise NotConnected(f"{self._key}: nobody answers; start the simulator with: mapweave sim serve")
         if replies[0].error:
             raise InvalidValue(f"the simulator refuses {operation}: {replies[0].error}")
         return Reader(replies[0].payload, f"answer to {operation}", MAX_BYTES)
-
-
-def _pack_rectangle(box: Rectangle) -> list[object]:
-    return [float(n) for n in (box.x, box.y, box.length, box.width, box.heading)] + [box.name]
 
 
 def _read_rectangle(reader: Reader, value: object) -> Rectangle:
@@ -256,3 +200,19 @@ def _read_poses(reader: Reader, count: int) -> Array:
     if not np.isfinite(poses).all():
         raise reader.error("p holds numbers that are not finite")
     return poses
+
+
+def _numbers(reader: Reader, name: str, value: object, count: int) -> list[float]:
+    parts = reader.as_array(value, name, count)
+    if len(parts) != count:
+        raise reader.error(f"{name} must be {count} numbers")
+    return [reader.as_number(number, name, -FARTHEST, FARTHEST) for number in parts]
+
+
+def _read_image(reader: Reader, value: object) -> NDArray[np.uint8]:
+    height, width, data = (*reader.as_array(value, "image", 3), 0, 0, 0)[:3]
+    rows, columns = (reader.as_integer(side, "image", 1, 1 << 14) for side in (height, width))
+    pixels = reader.as_binary(data, "image", MAX_BYTES)
+    if len(pixels) != rows * columns:
+        raise reader.error(f"an image of {columns}x{rows} px cannot have {len(pixels)} bytes")
+    return np.frombuffer(pixels, np.uint8).reshape(rows, columns)

@@ -31,7 +31,7 @@ class Seat:
         sequence: number of the last step that was answered; 0 before.
         answer: to that step.
         answered_at: when, s.
-        epochs: of its agents that are alive.
+        drivers: numbers of those that are alive.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Seat:
     sequence: int = 0
     answer: bytes = b""
     answered_at: float = 0.0
-    epochs: set[int] = field(default_factory=set)
+    drivers: set[int] = field(default_factory=set)
 
 
 class Lockstep:
@@ -91,13 +91,13 @@ class Lockstep:
             seat.step, seat.request = step, request
         seat.active = seat.asked = True
 
-    def presence(self, name: str, epoch: int, alive: bool) -> None:
-        """Take the news that an agent came or went; time does not wait for a robot without its agent."""
+    def presence(self, name: str, driver: int, alive: bool) -> None:
+        """Take the news that a driver came or went; time does not wait for a robot that nobody drives."""
         seat = self._seats.get(name)
         if seat is None:
             return
-        (seat.epochs.add if alive else seat.epochs.discard)(epoch)
-        if alive or seat.epochs or not seat.active:
+        (seat.drivers.add if alive else seat.drivers.discard)(driver)
+        if alive or seat.drivers or not seat.active:
             return
         log.info("the agent of robot %s is gone: the robot stands still until it asks again", name)
         seat.active = False

@@ -4,12 +4,13 @@
     mapweave/1/<fleet>/agent/<agent>/head/<epoch>     beacon: the newest sequence number
     mapweave/1/<fleet>/agent/<agent>/log/<epoch>      question: a range of the log
     mapweave/1/<fleet>/agent/<agent>/alive/<epoch>    liveliness
-    mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people
+    mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk
     mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, map
-    mapweave/1/<fleet>/server/<server>/status         likewise alive
+    mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
+    mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of whoever drives that body
     mapweave/1/<fleet>/sim/control                    question to the simulator; likewise alive
 
 The identity is a chunk at a fixed place before the class of the message, so that an access rule can name it.
@@ -158,6 +159,14 @@ class Keys:
         """Where a robot's body takes a command and gives the next observation."""
         return f"{self.root}/robot/{check_name(robot)}/step"
 
+    def robot_driver(self, robot: str, number: int) -> str:
+        """Under which one that drives a robot's body is alive."""
+        return f"{self.root}/robot/{check_name(robot)}/driver/{check_epoch(number)}"
+
+    def robot_drivers(self) -> str:
+        """Pattern: everybody who drives a body."""
+        return f"{self.root}/robot/*/driver/*"
+
     def sim_control(self) -> str:
         """Where the simulator takes commands (kidnap, truth, stop)."""
         return f"{self.root}/sim/control"
@@ -188,6 +197,11 @@ class Keys:
         """Which agent."""
         return self._parse_names("agent/*/status", key)[0]
 
+    def parse_robot_driver(self, key: str) -> tuple[str, int]:
+        """Which robot, and the number of who drives it."""
+        robot, number = self._chunks("robot/*/driver/*", key)
+        return _name(robot, key), _number(number, key)
+
     def parse_ack(self, key: str) -> tuple[str, str]:
         """Which server, to which agent."""
         server, agent = self._parse_names("server/*/ack/*", key)
@@ -209,10 +223,7 @@ class Keys:
 
     def _parse_map(self, what: str, key: str) -> MapId:
         agent, epoch = self._chunks(f"agent/*/{what}/*", key)
-        # The text must be the one that `_of_map` makes: "007" and digits of other scripts are none.
-        if not (epoch.isascii() and epoch.isdigit() and str(int(epoch)) == epoch and int(epoch) <= MAX_EPOCH):
-            raise InvalidMessage(f"key {key!r}: {epoch!r} is no epoch")
-        return MapId(_name(agent, key), int(epoch))
+        return MapId(_name(agent, key), _number(epoch, key))
 
     def _parse_names(self, form: str, key: str) -> list[str]:
         return [_name(chunk, key) for chunk in self._chunks(form, key)]
@@ -231,3 +242,10 @@ def _name(chunk: str, key: str) -> str:
         return check_name(chunk)
     except InvalidValue as error:
         raise InvalidMessage(f"key {key!r}: {error}") from None
+
+
+def _number(chunk: str, key: str) -> int:
+    # The text must be the one that a number prints as: "007" and digits of other scripts are none.
+    if not (chunk.isascii() and chunk.isdigit() and str(int(chunk)) == chunk and int(chunk) <= MAX_EPOCH):
+        raise InvalidMessage(f"key {key!r}: {chunk!r} is no epoch")
+    return int(chunk)

@@ -44,14 +44,16 @@ class MemoryHub:
         self._lock = threading.RLock()
         self._buses: list[MemoryBus] = []
         self._faults = Faults()
+        self._disturbed: MemoryBus | None = None
         self._random = np.random.default_rng(0)
         self._held: list[tuple[int, MemoryBus, Sample]] = []
         self._clock = 0
 
-    def disturb(self, faults: Faults, random: np.random.Generator) -> None:
-        """From now on treat messages badly, by the given source of chance."""
+    def disturb(self, faults: Faults, random: np.random.Generator, bus: MemoryBus | None = None) -> None:
+        """From now on treat messages badly, by the given source of chance: one bus's, or everybody's."""
         with self._lock:
             self._faults = faults
+            self._disturbed = bus
             self._random = random
 
     def calm(self) -> None:
@@ -96,7 +98,7 @@ class MemoryHub:
             if sender._cut:
                 return
             self._clock += 1
-            faults = self._faults
+            faults = self._faults if self._disturbed in (None, sender) else Faults()
             if self._random.random() >= faults.drop:
                 for _ in range(2 if self._random.random() < faults.double else 1):
                     if self._random.random() < faults.delay:

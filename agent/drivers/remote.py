@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from agent.drivers.messages import (
 )
 from agent.observation import Command, Observation, RobotDescription
 from hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
-from wire.bus import Bus
+from wire.bus import Bus, Closing
 from wire.keys import Keys
 
 ASK_TIMEOUT = 3.0
@@ -70,6 +71,8 @@ class RemoteRobot:
         self._command = Command()
         self._description: RobotDescription | None = None
         self._closed = threading.Event()
+        # A body waits for its driver no longer than it lives.
+        self._alive: Closing = bus.announce(keys.robot_driver(name, secrets.randbits(52)))
 
     def describe(self) -> RobotDescription:
         """What the body says of itself; asked once.
@@ -97,6 +100,18 @@ class RemoteRobot:
         self._sequence += 1
         return observation
 
+    def rendezvous(self) -> None:
+        """Wait until every other robot of the simulation has finished this tick; no time passes.
+
+        Raises:
+            DeviceError: nobody answers, or not properly.
+        """
+        if self._closed.is_set():
+            return
+        step = StepRequest(self._sequence + 1, self._command, rendezvous=True)
+        self._ask(self._step_key, encode_step(step), bytes)
+        self._sequence += 1
+
     def act(self, command: Command) -> Command:
         """Keep the command for the next tick.
 
@@ -113,6 +128,7 @@ class RemoteRobot:
     def close(self) -> None:
         """Ask no more. A body stands still by itself when its agent asks no more or is no longer alive."""
         self._closed.set()
+        self._alive.close()
 
     def _ask(self, key: str, payload: bytes, decode: Callable[[bytes], _T]) -> _T | None:
         """Ask until there is an answer; None if there will be none, or this robot was closed."""
@@ -138,7 +154,7 @@ class RemoteRobot:
             if time.monotonic() >= end:
                 raise DeviceError(
                     f"{key}: {reason} for {self._patience:g} s; start the robot's body (for a simulated one: "
-                    "mapweave sim) with the same fleet and endpoint"
+                    "mapweave sim serve) with the same fleet and endpoint"
                 )
             if self._closed.wait(PAUSE):
                 return None

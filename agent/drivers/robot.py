@@ -1,4 +1,4 @@
-"""The Robot protocol: four methods that the Koala, a recording, the simulator and a test all have."""
+"""The Robot protocol: a few methods that the Koala, a recording, the simulator and a test all have."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ class Robot(Protocol):
 
     def act(self, command: Command) -> Command:
         """Send a command; returns the command that is really applied (clipped to the limits)."""
+        ...
+
+    def rendezvous(self) -> None:
+        """Simulation in lock-step: wait until all robots have finished this tick. Others have nothing to do."""
         ...
 
     def close(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,16 @@ def add_to(commands: Any) -> None:
         "--driver", choices=["remote"], default="remote", help="remote: a body behind Zenoh keys (simulator)"
     )
     parser.add_argument(
-        "--mission", choices=["idle", "explore"], default="explore", help="what to do at the start"
+        "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
     )
     parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
-    parser.add_argument("--epoch", type=int, help="number of the new map (default: from the clock)")
+    parser.add_argument("--epoch", type=int, help="number of a new map (default: from the clock)")
+    parser.add_argument(
+        "--fresh", action="store_true", help="begin a new map; else the newest map of the journal goes on"
+    )
+    parser.add_argument(
+        "--body", metavar="ENDPOINT", help="Zenoh endpoint of the robot's body (default: the fleet's)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
@@ -40,7 +47,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
     from agent.drivers.remote import RemoteRobot
-    from agent.mission import Explore, Idle
+    from agent.mission import Carried, Explore, Idle
     from mapweave.agent_process import AgentOptions, run_agent
 
     name = check_name(arguments.name)
@@ -48,21 +55,27 @@ def run(arguments: argparse.Namespace) -> int:
     network = network_of(arguments, settings)
     stop = stop_on_signals()
     bus, keys = connect(network)
+    body = bus
     try:
-        robot = RemoteRobot(bus, network.fleet, name)
+        if arguments.body:
+            body, _ = connect(replace(network, endpoints=(arguments.body,)))
+        robot = RemoteRobot(body, network.fleet, name)
         # Who is told to stop while it waits for its body stops waiting.
         threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
         options = AgentOptions(
             name=name,
             data=arguments.data,
             epoch=arguments.epoch,
-            mission=Explore() if arguments.mission == "explore" else Idle(),
+            fresh=arguments.fresh,
+            mission={"explore": Explore, "carried": Carried, "idle": Idle}[arguments.mission](),
             seed=arguments.seed,
             lockstep=arguments.lockstep,
             server=network.server,
         )
         run_agent(robot, bus, keys, settings.pipeline, options, stop)
     finally:
+        if body is not bus:
+            body.close()
         bus.close()
     return 0
 

@@ -19,6 +19,9 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
     parser.add_argument("--data", type=Path, default=Path("out/server"), help="folder for the store")
+    parser.add_argument(
+        "--lockstep", action="store_true", help="answer only what is merged already: repeatable simulation"
+    )
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -26,7 +29,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
     from hybridmap.node import check_name
-    from mapserver.server import MapServer
+    from mapserver.server import MapServer, ServerSettings
     from wire.bus_settings import BusSettings
     from wire.keys import Keys
     from wire.zenoh_bus import ZenohBus
@@ -37,7 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
-        with MapServer(bus, keys, arguments.data / f"{name}.sqlite", name) as server:
+        how = ServerSettings(lockstep=arguments.lockstep)
+        with MapServer(bus, keys, arguments.data / f"{name}.sqlite", name, how) as server:
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
             said = ""

@@ -1,39 +1,200 @@
-"""`mapweave sim`: robots in a simulated office."""
+"""`mapweave sim`: serve simulated bodies, or run scenarios and judge them."""
 
 from __future__ import annotations
 
 import argparse
+import json
+from pathlib import Path
 from typing import Any
 
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
 
 def add_to(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the commands."""
     parser: argparse.ArgumentParser = commands.add_parser(
         "sim",
-        help="simulate robots in an office",
-        description="Simulate differential-drive robots with cameras in a PyBullet office, in lock-step: "
-        "time advances when every agent has sent its command. Robots are called r0, r1 ...",
+        help="simulated robots: run scenarios, or serve bodies for your own agents",
+        description="Robots with cameras in PyBullet worlds. `run` tries a scenario with a whole fleet and "
+        "judges it, `batch` does so with many seeds, `serve` only gives bodies to agents that you start.",
     )
-    parser.add_argument("--robots", type=int, default=3, help="how many (default: 3)")
-    parser.add_argument("--rooms", type=int, default=3, help="rooms along the corridor (default: 3)")
-    parser.add_argument("--seed", type=int, default=0, help="of textures, furniture, start places and faults")
+    kinds = parser.add_subparsers(title="what to do", metavar="WHAT", required=True)
+    _add_run(kinds)
+    _add_batch(kinds)
+    _add_serve(kinds)
+    listing = kinds.add_parser("list", help="the scenarios that come with Mapweave")
+    listing.set_defaults(run=run_list)
+
+
+def _add_scenario(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenario", help="a .toml file, or a name from `mapweave sim list`")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
+        help="override the file, for example --set world.rooms=5; may be given several times",
+    )  # fmt: skip
+
+
+def _add_fleet(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--one-process", action="store_true", help="all robots in this process; the outcome is the same"
+    )
+    parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML for the robots' pipeline")
+    parser.add_argument("--json", action="store_true", help="print figures and verdicts as one JSON object")
+
+
+def _add_run(kinds: Any) -> None:
+    parser = kinds.add_parser(
+        "run",
+        help="try a scenario",
+        description="Run a scenario with server, simulator and an agent for each robot; leave a report folder "
+        "with figures, trajectories (TUM), map, picture and film. Exit status 0: all expectations were met; "
+        "2: not; 1: it could not be run.",
+    )
+    _add_scenario(parser)
+    parser.add_argument("--seed", type=int, help="other seeds, other worlds (default: the scenario's)")
+    parser.add_argument("--out", type=Path, help="folder for the report (default: out/sim/NAME-SEED)")
+    parser.add_argument("--no-film", action="store_true", help="make no film: a little quicker")
+    parser.add_argument(
+        "--view", type=int, nargs="?", const=8765, metavar="PORT",
+        help="show the trial live at http://127.0.0.1:PORT (default port: 8765)",
+    )  # fmt: skip
+    _add_fleet(parser)
+    parser.set_defaults(run=run_one)
+
+
+def _add_batch(kinds: Any) -> None:
+    parser = kinds.add_parser(
+        "batch",
+        help="try a scenario with many seeds",
+        description="Run a scenario once a seed and show the median and the worst of every figure. Exit status "
+        "0: every trial met its expectations; 2: not; 1: the scenario could not be read.",
+    )
+    _add_scenario(parser)
+    parser.add_argument("--seeds", type=int, default=10, metavar="N", help="how many (default: 10)")
+    parser.add_argument("--first", type=int, help="the first seed (default: the scenario's)")
+    parser.add_argument("--out", type=Path, help="folder for the reports (default: out/sim/NAME)")
+    parser.add_argument("--film", action="store_true", help="make a film of each trial")
+    _add_fleet(parser)
+    parser.set_defaults(run=run_batch)
+
+
+def _add_serve(kinds: Any) -> None:
+    parser = kinds.add_parser(
+        "serve",
+        help="simulated bodies for agents that you start yourself",
+        description="Serve the robots of a scenario, in lock-step: time advances when every agent has sent its "
+        "command. The scenario's events do not happen by themselves.",
+    )
+    _add_scenario(parser)
+    parser.add_argument("--seed", type=int, help="of world, start places and faults")
+    parser.add_argument(
+        "--listen", metavar="ENDPOINT", help="be reachable here, instead of connecting to the fleet's router"
+    )
     add_network(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run_serve)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_list(arguments: argparse.Namespace) -> int:
+    """Name and summary of each scenario."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapweave.trial.scenario import load_scenario, scenario_names, scenario_path
+
+    del arguments
+    table = Table(box=None, show_header=False)
+    for name in scenario_names():
+        table.add_row(name, load_scenario(scenario_path(name)).summary)
+    Console().print(table)
+    return 0
+
+
+def run_one(arguments: argparse.Namespace) -> int:
+    """Run one trial and print what came of it."""
+    from rich.console import Console
+
+    from mapweave.trial.run import TrialOptions, run_trial
+    from mapweave.trial.scenario import load_scenario, scenario_path
+    from mapweave.trial.summary import summary_table
+
+    settings = settings_of(arguments)
+    scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
+    seed = scenario.seed if arguments.seed is None else check_seed(arguments.seed)
+    out = arguments.out or Path("out/sim") / f"{scenario.name}-{seed}"
+    trial = run_trial(
+        scenario,
+        TrialOptions(
+            seed=seed,
+            out=out,
+            processes=not arguments.one_process,
+            settings=settings.pipeline,
+            settings_file=arguments.settings,
+            film_every=0.0 if arguments.no_film else 1.0,
+            view=arguments.view,
+            quiet=arguments.json,
+        ),
+    )
+    if arguments.json:
+        print(json.dumps(trial.as_dict()))
+    else:
+        console = Console()
+        console.print(summary_table(scenario, seed, trial))
+        console.print(f"the report is in {out}: report.md, map.png, film.webm, trajectories ...")
+    return 0 if trial.passed else 2
+
+
+def run_batch(arguments: argparse.Namespace) -> int:
+    """Run many trials and print the table."""
+    from mapweave.trial.batch import BatchOptions, run_batch_of_trials
+    from mapweave.trial.scenario import load_scenario, scenario_path
+
+    settings = settings_of(arguments)
+    scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
+    first = scenario.seed if arguments.first is None else check_seed(arguments.first)
+    options = BatchOptions(
+        first=first,
+        seeds=arguments.seeds,
+        out=arguments.out or Path("out/sim") / scenario.name,
+        processes=not arguments.one_process,
+        settings=settings.pipeline,
+        settings_file=arguments.settings,
+        film=arguments.film,
+        json=arguments.json,
+    )
+    return 0 if run_batch_of_trials(scenario, options) else 2
+
+
+def run_serve(arguments: argparse.Namespace) -> int:
     """Serve the simulated bodies until told to stop."""
+    from mapweave.sim_process import run_sim
+    from mapweave.trial.scenario import load_scenario, scenario_path
+    from wire.bus_settings import BusSettings
+    from wire.zenoh_bus import ZenohBus
+
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
-
-    from mapweave.sim_process import run_sim
-
+    scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
+    seed = scenario.seed if arguments.seed is None else check_seed(arguments.seed)
     stop = stop_on_signals()
-    bus, _ = connect(network)
+    if arguments.listen:
+        bus = ZenohBus(BusSettings(mode="router", listen=(arguments.listen,)))
+    else:
+        bus = ZenohBus(BusSettings(mode="client", endpoints=network.endpoints))
     try:
-        run_sim(bus, network.fleet, arguments.robots, arguments.rooms, arguments.seed, stop)
+        run_sim(bus, network.fleet, scenario, seed, stop)
     finally:
         bus.close()
     return 0
+
+
+def check_seed(seed: int) -> int:
+    """A seed that random generators take.
+
+    Raises:
+        SettingsError: it is negative.
+    """
+    from hybridmap.errors import SettingsError
+
+    if seed < 0:
+        raise SettingsError(f"--seed {seed}: use 0 or more")
+    return seed

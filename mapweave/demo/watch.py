@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
-from agent.fleet import AgentReport, decode_status
+from agent.fleet import AgentReport, decode_report
 from hybridmap.errors import InvalidMessage
 from wire.bus import Bus, Sample
 from wire.keys import Keys
@@ -73,7 +73,7 @@ class Watch:
             closing.close()
 
     def _agent(self, sample: Sample) -> None:
-        report = decode_status(sample.payload)
+        report = decode_report(sample.payload)
         name = self._keys.parse_agent_status(sample.key)
         with self._lock:
             self._agents[name] = report

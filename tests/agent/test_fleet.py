@@ -18,9 +18,9 @@ from agent.fleet import (
     AgentReport,
     FleetLink,
     decode_mission,
-    decode_status,
+    decode_report,
     encode_mission,
-    encode_status,
+    encode_report,
 )
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question, WhereAmI, WhichWay
 from agent.pipeline import Status
@@ -71,7 +71,7 @@ def test_missions_come_back_as_they_were(mission: Mission) -> None:
 
 @given(statuses, st.integers(0, 2**53))
 def test_statuses_come_back_as_they_were(status: Status, stamp_ns: int) -> None:
-    report = decode_status(encode_status(status, stamp_ns))
+    report = decode_report(encode_report(AgentReport(status, stamp_ns)))
     assert report == AgentReport(status, stamp_ns)
     assert report.fix_node == status.fix_node
 
@@ -85,7 +85,7 @@ scalars = st.one_of(
 
 @given(st.binary(max_size=200))
 def test_garbage_is_no_mission_and_no_status(data: bytes) -> None:
-    for decode in (decode_mission, decode_status):
+    for decode in (decode_mission, decode_report):
         with pytest.raises(InvalidMessage):
             decode(data)
 
@@ -102,32 +102,32 @@ def test_a_mission_is_read_or_refused(name: object, node: object) -> None:
 
 @given(statuses, st.data())
 def test_a_status_with_a_strange_field_is_read_or_refused(status: Status, data: st.DataObject) -> None:
-    fields = msgpack.unpackb(encode_status(status, 5))
+    fields = msgpack.unpackb(encode_report(AgentReport(status, 5)))
     name = data.draw(st.sampled_from(sorted(fields["s"])))
     fields["s"][name] = data.draw(scalars)
     try:
-        report = decode_status(msgpack.packb(fields))
+        report = decode_report(msgpack.packb(fields))
     except InvalidMessage:
         return
     numbers = [*report.status.map_from_robot.vector, *report.status.node_from_robot.vector]
     assert np.isfinite(numbers).all()
-    assert decode_status(encode_status(report.status, report.stamp_ns)) == report
+    assert decode_report(encode_report(report)) == report
 
 
 @given(statuses, st.data())
 def test_a_status_without_a_field_is_refused(status: Status, data: st.DataObject) -> None:
-    fields = msgpack.unpackb(encode_status(status, 5))
+    fields = msgpack.unpackb(encode_report(AgentReport(status, 5)))
     name = data.draw(st.sampled_from(sorted(fields["s"])))
     del fields["s"][name]
     with pytest.raises(InvalidMessage, match=name):
-        decode_status(msgpack.packb(fields))
+        decode_report(msgpack.packb(fields))
 
 
 @given(st.text(), st.integers(1, 400))
 def test_whatever_was_said_can_be_told(text: str, times: int) -> None:
     """A status quotes servers and drivers: line breaks and long stories must not end the robot's loop."""
     status = Status("looking", text * times, 0, 0, Pose2(), False)
-    said = decode_status(encode_status(status, 0)).status.detail
+    said = decode_report(encode_report(AgentReport(status, 0))).status.detail
     assert said.isprintable()
     assert len(said) == min(len(text) * times, MAX_WORDS)
     assert all(c == d for c, d in zip(text * times, said, strict=False) if c.isprintable())
@@ -196,7 +196,7 @@ def test_what_is_no_command_is_refused_and_changes_nothing(
 
 def test_the_fleet_hears_what_the_robot_does(link: FleetLink, other: MemoryBus) -> None:
     heard: list[AgentReport] = []
-    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(decode_status(sample.payload)))
+    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(decode_report(sample.payload)))
     status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False, "goto", THERE, Pose2(0.1, 0, 0), 4)
     link.report(status, 123)
     eventually(lambda: heard == [AgentReport(status, 123)])

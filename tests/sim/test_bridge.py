@@ -16,7 +16,6 @@ from agent.drivers.remote import RemoteRobot
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue, NotConnected
-from hybridmap.node import MapId
 from hybridmap.pose import Array, Pose2
 from sim.bridge import SimBridge
 from sim.control import SimControl
@@ -296,7 +295,6 @@ def test_a_dead_agent_blocks_nobody(stage: Stage, end: str) -> None:
     simulation = FakeSimulation()
     stage.start(simulation, patience=60.0)
     bus = stage.join()
-    bus.announce(KEYS.agent_alive(MapId("r1", 4)))
     mortal = Driver(RemoteRobot(bus, "test", "r1"), 2, lambda _: 0.0)
     lively = Driver(stage.robot("r0", patience=30.0), 12, lambda _: 0.0)
     mortal.start()

@@ -45,7 +45,7 @@ class Children:
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
         """Run `mapweave` with arguments."""
-        with self._log(name).open("wb") as output:
+        with self._log(name).open("ab") as output:
             self._running[name] = subprocess.Popen(
                 [sys.executable, "-m", "mapweave", *arguments], stdout=output, stderr=subprocess.STDOUT
             )
@@ -69,6 +69,13 @@ class Children:
         try:
             process.wait(patience)
         except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def kill(self, name: str) -> None:
+        """End one at once, without a word (SIGKILL)."""
+        process = self._running.pop(name, None)
+        if process is not None:
             process.kill()
             process.wait()
 

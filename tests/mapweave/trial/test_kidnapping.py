@@ -12,7 +12,7 @@ from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from mapweave.demo.kidnapping import CLEARANCE, LEAST_LANDMARKS, NEAR, NothingToShow, plan_kidnapping
+from mapweave.trial.kidnapping import CLEARANCE, LEAST_LANDMARKS, NEAR, NothingToShow, plan_kidnapping
 from sim.floorplan import FloorPlan, Rectangle
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)

@@ -18,6 +18,8 @@ CLEARANCE = 0.32
 """m from walls and furniture where the robot is put down: it must be able to turn."""
 NEAR = 0.6
 """m from some node that the room's own robot has made: the place is mapped."""
+FAR = 2.0
+"""m; a goal is worth a drive."""
 LEAST_LANDMARKS = 30
 """A goal is a place with a view."""
 
@@ -92,6 +94,45 @@ def plan_kidnapping(
     if place is None:
         raise NothingToShow(f"no free place near the nodes in {room}")
     return Kidnapping(robot, room, host, place, goals[int(rng.integers(len(goals)))])
+
+
+def choose_goal(
+    merged: HybridMap,
+    components: Mapping[NodeId, int],
+    truth: Mapping[NodeId, Pose2],
+    robot: str,
+    world_from_robot: Pose2,
+    foreign: bool,
+    seed: int,
+) -> NodeId:
+    """Choose a node to which a robot can be sent from where it is.
+
+    Args:
+        merged: all nodes.
+        components: of the merged map.
+        truth: where each node really is.
+        robot: who is sent.
+        world_from_robot: where it is now.
+        foreign: whether the node shall be another robot's.
+        seed: of the choice.
+
+    Raises:
+        NothingToShow: no node is good for that.
+    """
+    nearest = min(sorted(truth), key=lambda n: truth[n].distance(world_from_robot), default=None)
+    goals = [
+        n
+        for n in sorted(truth)
+        if nearest is not None
+        and components[n] == components[nearest]
+        and (n.agent != robot) == foreign
+        and len(merged.nodes[n].landmarks) >= LEAST_LANDMARKS
+        and truth[n].distance(world_from_robot) >= FAR
+    ]
+    if not goals:
+        whose = "another robot's" if foreign else "its own"
+        raise NothingToShow(f"no node of {whose} map is {FAR:g} m away with a view, and joined to here")
+    return goals[int(np.random.default_rng([seed, 0x60A1]).integers(len(goals)))]
 
 
 def _goals(

@@ -1,0 +1,330 @@
+"""Runs a scenario on a fleet, event by event. Time stands still while it looks or acts: so nothing that it
+decides depends on how quick the machine is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from agent.fleet import AgentReport, encode_mission
+from agent.mission import Carried, Explore, GoTo, Idle, Mission
+from hybridmap.errors import NotConnected
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2
+from mapweave.trial import actions
+from mapweave.trial.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage
+from mapweave.trial.kidnapping import Kidnapping, NothingToShow, choose_goal, plan_kidnapping
+from mapweave.trial.recording import Fix, Lost, Moment
+from mapweave.trial.reports import Reports
+from mapweave.trial.scenario import CONDITIONS, LONGEST, ScenarioEvent, When
+from sim import events
+from wire.mapfile import MapFile, unpack_map_file
+
+LOOK_EVERY = {"joined": 5.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "grown": 1.0}
+"""How often it is looked whether something has come true, simulated s."""
+STRIDE = 5.0
+"""Time is let go on by at most this without showing progress, s."""
+RECOVERY_PATIENCE = 120.0
+"""How long all may take to be well again after something came back, wall s."""
+
+MISSIONS: dict[str, Mission] = {"idle": Idle(), "explore": Explore(), "carried": Carried()}
+
+
+class Conductor:
+    """Lets a scenario happen.
+
+    Attributes:
+        moments: what was done and noticed.
+        lost: robots that were carried away.
+        recoveries_s: wall time that each return took.
+        now: simulated time, s.
+        done: how many events have happened.
+        doing: what is waited for, or done.
+        agents: what those in reach said last.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        fleet: Fleet,
+        on_look: Callable[[Conductor], None] = lambda conductor: None,
+        stride: float = STRIDE,
+    ) -> None:
+        """Take the means.
+
+        Args:
+            stage: what is tried, and where.
+            fleet: started.
+            on_look: called whenever time stands still: for progress, film and live view.
+            stride: how long time goes on between two such calls at most, simulated s.
+        """
+        self._stage = stage
+        self._fleet = fleet
+        self._on_look = on_look
+        self._stride = min(stride, STRIDE)
+        self.reports = Reports(fleet.bus, fleet.keys)
+        self.moments: list[Moment] = []
+        self.lost: list[Lost] = []
+        self.recoveries_s: list[float] = []
+        self.now = 0.0
+        self.done = 0
+        self.doing = "starting"
+        self.agents: dict[str, AgentReport] = {}
+        self._alive = set(stage.robots)
+        self._cut: set[str] = set()
+        self._sent: Lost | None = None
+        self._plot: Kidnapping | None = None
+        self._grown: tuple[str, int] = ("", 0)
+
+    def run(self) -> None:
+        """All events, in order.
+
+        Raises:
+            MapweaveError: somebody died who should not have, or an event cannot happen.
+        """
+        for event in self._stage.scenario.events:
+            self.doing = _in_words(event)
+            self._wait(event.when)
+            self._act(event)
+            self.done += 1
+            self._on_look(self)
+
+    def note(self, text: str) -> None:
+        """Remember that something happened now."""
+        self.moments.append(Moment(round(self.now * 1e9), text))
+
+    # Waiting
+
+    def _wait(self, when: When) -> None:
+        began = self.now
+        since = began if not when.after else None
+        end = began + when.within if when.within < LONGEST else LONGEST * 10
+        while True:
+            if since is None and self._true(when.after):
+                since = self.now
+                self.note(f"{CONDITIONS[when.after]}: yes")
+            due = max(when.at, since + when.plus) if since is not None else LONGEST * 10
+            if self.now >= due - 1e-6:
+                return
+            if self.now >= end - 1e-6:
+                if when.after:
+                    self.note(f"{CONDITIONS[when.after]}: not within {when.within:.0f} s")
+                return
+            look = self.now + (LOOK_EVERY[when.after] if when.after and since is None else STRIDE)
+            self._advance(min(due, end, look))
+
+    def _advance(self, until: float) -> None:
+        while self.now < until - 1e-6:
+            tick = round(min(until, self.now + self._stride) * TICKS_PER_SECOND)
+            tick = max(tick, round(self.now * TICKS_PER_SECOND) + 1)
+            self._fleet.advance(tick)
+            self.now = tick / TICKS_PER_SECOND
+            self._look()
+
+    def _look(self) -> None:
+        self.agents = self.reports.agents(sorted(self._alive - self._cut))
+        for lost in self.lost:
+            report = self.agents.get(lost.robot)
+            if report is None or report.stamp_ns <= lost.stamp_ns:
+                continue
+            status = report.status
+            if lost.fix is None and status.fix_node is not None and status.mission == "goto":
+                lost.fix = Fix(report.stamp_ns, status.fix_node, status.node_from_robot)
+            if lost.arrived_ns is None and status.mission == "goto":
+                lost.legs = max(lost.legs, status.legs)
+                if status.finished and lost is self._sent:
+                    lost.arrived_ns = report.stamp_ns
+        self._on_look(self)
+
+    def _true(self, condition: str) -> bool:
+        match condition:
+            case "joined":
+                server = self.reports.server(SERVER)
+                return server.components == 1 and server.maps >= len(self._stage.robots)
+            case "explored":
+                exploring = [a for a in self.agents.values() if a.status.mission == "explore"]
+                return bool(exploring) and all(a.status.finished for a in exploring)
+            case "found":
+                return bool(self.lost) and self.lost[-1].fix is not None
+            case "arrived":
+                return self._sent is not None and self._sent.arrived_ns is not None
+            case _:
+                robot, nodes = self._grown
+                return robot in self.agents and self.agents[robot].status.nodes > nodes
+
+    # Acting
+
+    def _act(self, event: ScenarioEvent) -> None:
+        fleet, action = self._fleet, event.action
+        match action:
+            case actions.Wait():
+                pass
+            case actions.SetMission(mission, robot):
+                names = sorted(self._alive - self._cut) if robot == actions.EVERYBODY else [robot]
+                for name in names:
+                    self._command(name, MISSIONS[mission])
+                self.note(f"{', '.join(names)}: {mission}")
+            case actions.Abduct(robot):
+                self._abduct(robot)
+            case actions.Send(robot, goal):
+                self._send(robot, goal)
+            case events.Kidnap(robot):
+                self.note(fleet.control.apply(event.table))
+                self._mark_lost(robot)
+            case actions.KillAgent(robot):
+                before = self.agents.get(robot)
+                self._grown = (robot, before.status.nodes if before is not None else 0)
+                fleet.kill_agent(robot)
+                self._alive.discard(robot)
+                self.note(f"the agent of {robot} is killed")
+            case actions.StartAgent(robot):
+                began = time.monotonic()
+                fleet.start_agent(robot)
+                self._alive.add(robot)
+                self.note(f"the agent of {robot} is started again")
+                self._recover(began)
+            case actions.KillServer():
+                fleet.kill_server()
+                self.note("the map server is killed")
+            case actions.StartServer():
+                began = time.monotonic()
+                fleet.start_server()
+                self.note("the map server is started again")
+                self._recover(began)
+            case actions.Cut(robot):
+                fleet.cut(robot)
+                self._cut.add(robot)
+                self.note(f"the network of {robot} is cut")
+            case actions.Worsen(robot, loss, delay):
+                fleet.worsen(robot, loss, delay)
+                self.note(f"the network of {robot} loses {loss:.0%} and delays by {delay:g} s")
+            case actions.Restore(robot):
+                began = time.monotonic()
+                fleet.restore(robot)
+                self._cut.discard(robot)
+                self.note(f"the network of {robot} is back")
+                self._recover(began)
+            case _:
+                self.note(fleet.control.apply(event.table))
+
+    def _recover(self, began: float) -> None:
+        """Wait, while simulated time stands still, until the server has what every robot has."""
+        end = began + RECOVERY_PATIENCE
+        while not self._all_well():
+            if time.monotonic() > end:
+                self.note(f"not all was well again after {RECOVERY_PATIENCE:.0f} s")
+                return
+            time.sleep(0.02)
+        self.recoveries_s.append(time.monotonic() - began)
+        self.note(f"all is well again after {self.recoveries_s[-1]:.2f} s of wall time")
+
+    def _all_well(self) -> bool:
+        """Whether every agent that should be in reach is, and has told the server everything."""
+        names = sorted(self._alive - self._cut)
+        agents = self.reports.agents(names)
+        if len(agents) < len(names) or any(a.unsent or not a.linked for a in agents.values()):
+            return False
+        try:
+            self.reports.server(SERVER)
+        except NotConnected:
+            return False
+        return True
+
+    def _command(self, robot: str, mission: Mission) -> None:
+        replies = self._fleet.bus.ask(self._fleet.keys.mission(robot), encode_mission(mission), 10.0)
+        if not replies or replies[0].error:
+            why = replies[0].error if replies else "no answer"
+            raise NotConnected(f"agent {robot} did not take its mission: {why}")
+
+    # Losing and sending
+
+    def merged(self) -> MapFile:
+        """The server's merged map, with everything in it that has come.
+
+        Raises:
+            NotConnected: it does not hand it out.
+        """
+        replies = self._fleet.bus.ask(self._fleet.keys.server_map(SERVER), b"", 120.0)
+        for reply in replies:
+            if not reply.error:
+                return unpack_map_file(reply.payload)
+        why = replies[0].error if replies else "no answer"
+        raise NotConnected(f"the map server did not hand out the merged map: {why}")
+
+    def _abduct(self, robot: str) -> None:
+        merged = self.merged()
+        status = self._fleet.control.status()
+        try:
+            self._plot = plot = plan_kidnapping(
+                HybridMap(merged.changes),
+                {node: component for node, (component, _) in merged.postures.items()},
+                self._truth_of(HybridMap(merged.changes)),
+                self._fleet.control.plan(),
+                (robot,) if robot else self._stage.robots,
+                [r.world_from_robot for r in status.robots.values()],
+                self._stage.seed,
+            )
+        except NothingToShow as reason:
+            self.note(f"nobody is kidnapped: {reason}")
+            self._plot = None
+            return
+        self._fleet.control.kidnap(plot.robot, plot.world_from_robot)
+        self.note(f"{plot.robot} is put down in {plot.room}, which only {plot.host} has mapped")
+        self._mark_lost(plot.robot)
+
+    def _mark_lost(self, robot: str) -> None:
+        status = self._fleet.control.status()
+        pose = status.robots[robot].world_from_robot
+        room = self._fleet.control.plan().room_at(pose.x, pose.y) or "nowhere"
+        self.lost.append(Lost(robot, room, status.stamp_ns, pose))
+
+    def _send(self, robot: str, goal: str) -> None:
+        lost = next((one for one in reversed(self.lost) if robot in ("", one.robot)), None)
+        if lost is None:
+            if not robot:
+                self.note("nobody is sent: no robot was lost")
+                return
+            # A robot that nobody carried away is sent from where it knows itself to be.
+            self._mark_lost(robot)
+            lost = self.lost[-1]
+        try:
+            node = self._goal(lost, goal)
+        except NothingToShow as reason:
+            self.note(f"{lost.robot} is not sent: {reason}")
+            return
+        lost.goal, self._sent = node, lost
+        self._command(lost.robot, GoTo(node))
+        self.note(f"{lost.robot} shall go to {node}")
+
+    def _goal(self, lost: Lost, goal: str) -> NodeId:
+        if goal not in ("foreign", "own"):
+            return NodeId.parse(goal)
+        if goal == "foreign" and self._plot is not None and self._plot.robot == lost.robot:
+            return self._plot.goal
+        merged = self.merged()
+        whole = HybridMap(merged.changes)
+        components = {node: component for node, (component, _) in merged.postures.items()}
+        return choose_goal(
+            whole, components, self._truth_of(whole), lost.robot, lost.world_from_robot,
+            goal == "foreign", self._stage.seed,
+        )  # fmt: skip
+
+    def _truth_of(self, whole: HybridMap) -> dict[NodeId, Pose2]:
+        truth: dict[NodeId, Pose2] = {}
+        for robot in self._stage.robots:
+            nodes = [node for node in whole.nodes.values() if node.id.agent == robot]
+            poses = self._fleet.control.truth_at(robot, [node.stamp_ns for node in nodes])
+            truth.update(zip([node.id for node in nodes], poses, strict=True))
+        return truth
+
+
+def _in_words(event: ScenarioEvent) -> str:
+    when = event.when
+    table = {name: value for name, value in event.table.items() if name != "do"}
+    what = " ".join([str(event.table["do"]).replace("_", " "), *(str(v) for v in table.values())])
+    if when.after:
+        return f"until {when.after} (at most {when.within:.0f} s), then {what}"
+    if when.at:
+        return f"at {when.at:.0f} s: {what}"
+    return f"{when.plus:.0f} s later: {what}" if when.plus else what

@@ -1,0 +1,171 @@
+"""A fleet in one process: the same agents and the same server over a bus in memory."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from agent.fleet import decode_mission
+from agent.observation import Command
+from hybridmap.errors import MapweaveError
+from mapserver.server import MapServer, ServerSettings
+from mapweave.agent_process import Agent, AgentOptions
+from mapweave.trial.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
+from sim.control import SimControl
+from sim.desk import ControlDesk
+from sim.simulation import Simulation
+from wire.bus import Request
+from wire.keys import Keys
+from wire.log_messages import encode_record
+from wire.memory import Faults, MemoryBus, MemoryHub
+
+THREADS = 2
+"""OpenCV and numpy let go of the interpreter for long enough that two are quicker than one."""
+
+
+class LocalFleet:
+    """Calls every agent itself, tick by tick. Its answers are those of a fleet of processes."""
+
+    def __init__(self, stage: Stage) -> None:
+        """Nothing runs yet."""
+        self._stage = stage
+        self.keys = Keys(FLEET)
+        self._hub = MemoryHub()
+        self.bus = MemoryBus(self._hub)
+        self.control = SimControl(self.bus, FLEET, timeout=60.0)
+        self._buses: dict[str, MemoryBus] = {}
+        self._agents: dict[str, Agent] = {}
+        self._commands: dict[str, Command] = {}
+        self._server: MapServer | None = None
+        self._server_bus: MemoryBus | None = None
+        self._simulation: Simulation | None = None
+        self._thinking = 0.0
+        self._asking = 0.0
+        self._log: list[str] = []
+        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="robots")
+
+    def start(self) -> None:
+        """Build the world, start the server, then the agents."""
+        cv2.setNumThreads(1)
+        stage = self._stage
+        self.start_server()
+        world = stage.scenario.world(stage.seed)
+        self._simulation = simulation = Simulation(world, stage.scenario.robots, stage.seed)
+        sim_bus = MemoryBus(self._hub)
+        self._buses["sim"] = sim_bus
+        # The desk answers in the bus's thread while this one waits: never during a tick.
+        desk = ControlDesk(simulation, lambda: set(self._agents), {}, lambda: None)
+
+        def answer(request: Request) -> None:
+            try:
+                request.reply(desk.answer(request.payload))
+            except MapweaveError as error:
+                request.refuse(str(error))
+
+        sim_bus.serve(self.keys.sim_control(), answer)
+        for robot in stage.robots:
+            self.start_agent(robot)
+
+    def advance(self, tick: int) -> None:
+        """Tick by tick: the world, then every robot, then what they want to know."""
+        simulation = self._simulation
+        assert simulation is not None
+        while simulation.tick < tick:
+            simulation.advance(self._commands)
+            began = time.perf_counter()
+            names = list(self._agents)
+            self._commands = dict(zip(names, self._pool.map(self._tick, names), strict=True))
+            asked = time.perf_counter()
+            for agent in self._agents.values():
+                if agent.runner.curious:
+                    agent.runner.exchange()
+            self._thinking += asked - began
+            self._asking += time.perf_counter() - asked
+
+    def _tick(self, robot: str) -> Command:
+        assert self._simulation is not None
+        return self._agents[robot].tick(self._simulation.observe(robot)).command
+
+    def kill_agent(self, robot: str) -> None:
+        """Drop an agent. In lock-step all that it has mapped is on its disk already."""
+        self._agents.pop(robot).close()
+        self._commands.pop(robot, None)
+        self._buses.pop(robot).close()
+
+    def start_agent(self, robot: str) -> None:
+        """Start an agent with the disk that is there."""
+        stage, simulation = self._stage, self._simulation
+        assert simulation is not None
+        bus = self._buses[robot] = MemoryBus(self._hub)
+        mission = decode_mission(encode_record({"mission": stage.scenario.missions[robot], "node": ""}))
+        options = AgentOptions(
+            name=robot,
+            data=stage.agents,
+            epoch=FIRST_EPOCH,
+            mission=mission,
+            seed=stage.agent_seed(robot),
+            lockstep=True,
+            server=SERVER,
+        )
+        self._agents[robot] = Agent(
+            simulation.describe(robot), bus, self.keys, stage.settings, options, say=self._log.append
+        )
+
+    def kill_server(self) -> None:
+        """Drop the server and its bus."""
+        if self._server is not None and self._server_bus is not None:
+            self._server.__exit__(None, None, None)
+            self._server_bus.close()
+            self._server = self._server_bus = None
+
+    def start_server(self) -> None:
+        """Start the server with the disk that is there."""
+        self._stage.store.parent.mkdir(parents=True, exist_ok=True)
+        self._server_bus = MemoryBus(self._hub)
+        settings = ServerSettings(lockstep=True)
+        self._server = MapServer(self._server_bus, self.keys, self._stage.store, SERVER, settings)
+        self._server.__enter__()
+
+    def cut(self, robot: str) -> None:
+        """Take a robot's bus off the hub."""
+        self._hub.cut(self._buses[robot])
+
+    def worsen(self, robot: str, loss: float, delay: float) -> None:
+        """Lose what the robot publishes, and hold some of it back; questions are not touched."""
+        faults = Faults(drop=loss, delay=min(1.0, delay))
+        random = np.random.default_rng([self._stage.seed, 0x105E])
+        self._hub.disturb(faults, random, self._buses[robot])
+
+    def restore(self, robot: str) -> None:
+        """Put the bus back, and treat it well."""
+        self._hub.restore(self._buses[robot])
+        self._hub.calm()
+
+    def end(self) -> None:
+        """Close everything, the server last; what was said is written down."""
+        for robot in list(self._agents):
+            agent = self._agents[robot]
+            agent.write_map()
+            agent.replicator.flush(10.0)
+            self.kill_agent(robot)
+        for bus in self._buses.values():
+            bus.close()
+        self.kill_server()
+        if self._simulation is not None:
+            self._simulation.close()
+        self._pool.shutdown()
+        self.bus.close()
+        self._write_log(self._stage.out / "logs")
+
+    def _write_log(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "agents.log").write_text("".join(f"{line}\n" for line in self._log), encoding="utf-8")
+
+    def wall(self) -> dict[str, float]:
+        """The simulator's parts, the robots' share (drawing included), and questions to the server."""
+        parts = dict(self._simulation.seconds) if self._simulation is not None else {}
+        return {**parts, "robots": self._thinking, "questions": self._asking}

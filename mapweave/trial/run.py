@@ -1,0 +1,195 @@
+"""One trial from beginning to end: fleet, conductor, recording, figures, folder."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from agent.pipeline import PipelineSettings
+from hybridmap.errors import SettingsError
+from mapweave.trial.conductor import Conductor
+from mapweave.trial.disks import read_disks
+from mapweave.trial.expectations import Verdict, check
+from mapweave.trial.figures import Figures
+from mapweave.trial.fleet import Fleet, Stage
+from mapweave.trial.recording import Recording, RobotRecord, Trajectory
+from mapweave.trial.scenario import Scenario
+from mapweave.trial.score import score
+from mapweave.trial.show import Show
+
+OWN = "mapweave-trial"
+"""A file of this name marks a folder as a trial's: only such a folder is emptied."""
+
+
+@dataclass(frozen=True)
+class TrialOptions:
+    """How a trial is run.
+
+    Attributes:
+        seed: of everything.
+        out: folder for the report; an earlier trial's in it is replaced.
+        processes: a process for each agent, the server and the simulator; else all in one.
+        settings: of every robot's pipeline.
+        settings_file: where they came from, if from a file.
+        film_every: simulated seconds between two frames of the film; 0 makes none.
+        view: port of the live view, None for none.
+        quiet: no progress on the terminal.
+    """
+
+    seed: int
+    out: Path
+    processes: bool = True
+    settings: PipelineSettings = PipelineSettings()
+    settings_file: Path | None = None
+    film_every: float = 1.0
+    view: int | None = None
+    quiet: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What came of it."""
+
+    recording: Recording
+    figures: Figures
+    verdicts: tuple[Verdict, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every expectation was met."""
+        return all(verdict.good for verdict in self.verdicts)
+
+
+def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
+    """Run a scenario and leave its report in a folder.
+
+    Raises:
+        MapweaveError: something could not be started, or ended; one line says what.
+    """
+    from mapweave.trial.folder import write_folder
+
+    _make_room(options.out)
+    stage = Stage(scenario, options.seed, options.out, options.settings, options.settings_file)
+    with Show(scenario.name, stage.robots, len(scenario.events), options.quiet) as show:
+        recording = _record(stage, options, show)
+        show.stage("scoring")
+        figures = score(recording)
+        verdicts = tuple(check(figures, scenario.expectations))
+        write_folder(options.out, recording, figures, verdicts, scenario.text)
+    return Trial(recording, figures, verdicts)
+
+
+def _record(stage: Stage, options: TrialOptions, show: Show) -> Recording:
+    began = time.monotonic()
+    with ExitStack() as stack:
+        fleet = _fleet(stage, options.processes)
+        stack.callback(fleet.end)
+        show.stage("starting server, simulator and agents")
+        fleet.start()
+        started = time.monotonic()
+        camera = stack.enter_context(_filming(stage, options, fleet))
+
+        def look(conductor: Conductor) -> None:
+            show.look(conductor)
+            camera(conductor)
+
+        conductor = Conductor(stage, fleet, look, options.film_every or 1.0)
+        stack.callback(conductor.reports.close)
+        conductor.run()
+        ran = time.monotonic() - started
+        show.stage("asking for the merged map and the truth")
+        merged = conductor.merged()
+        status, control = fleet.control.status(), fleet.control
+        truth = {robot: Trajectory(*control.trajectory(robot)) for robot in stage.robots}
+        conductor.agents = conductor.reports.agents(stage.robots)
+        plan, wall = control.plan(), fleet.wall()
+        reports = conductor.reports
+        fleet.end()
+    disks = read_disks(stage.agents, stage.store, stage.robots)
+    robots = {
+        robot: RobotRecord(
+            truth=truth[robot],
+            estimates=reports.estimates(robot),
+            collisions=status.robots[robot].collisions,
+            map_bytes=disks[robot].map_bytes,
+            wire_bytes=reports.traffic(robot),
+            unsaved=disks[robot].unsaved,
+            map_hash=disks[robot].map_hash,
+        )
+        for robot in stage.robots
+    }
+    return Recording(
+        scenario=stage.scenario.name,
+        seed=stage.seed,
+        robots=robots,
+        plan=plan,
+        merged=merged,
+        lost=tuple(conductor.lost),
+        moments=tuple(conductor.moments),
+        recoveries_s=tuple(conductor.recoveries_s),
+        sim_s=status.stamp_ns / 1e9,
+        wall_s=ran,
+        wall={**wall, "starting": started - began, "whole": time.monotonic() - began},
+    )
+
+
+def _fleet(stage: Stage, processes: bool) -> Fleet:
+    if processes:
+        from mapweave.trial.process_fleet import ProcessFleet
+
+        return ProcessFleet(stage)
+    from mapweave.trial.local_fleet import LocalFleet
+
+    return LocalFleet(stage)
+
+
+@contextmanager
+def _filming(stage: Stage, options: TrialOptions, fleet: Fleet) -> Iterator[Callable[[Conductor], None]]:
+    """Film and live view: whatever was asked for gets a frame whenever time stands still."""
+    if not options.film_every and options.view is None:
+        yield lambda conductor: None
+        return
+    from mapweave.trial.film import Film
+    from mapweave.trial.live import Live
+
+    with ExitStack() as stack:
+        plan = fleet.control.plan()
+        film = stack.enter_context(Film(options.out / "film.webm", plan, stage.robots))
+        live = None if options.view is None else stack.enter_context(Live(options.view, stage.scenario.name))
+        due = 0.0
+
+        def frame(conductor: Conductor) -> None:
+            nonlocal due
+            if conductor.now < due - 1e-6:
+                return
+            due = conductor.now + (options.film_every or 1.0)
+            said = {robot: _said(report.status.doing) for robot, report in conductor.agents.items()}
+            drawn = film.add(fleet.control.snapshot(), (), said)
+            if live is not None:
+                live.show(drawn)
+
+        yield frame
+
+
+def _said(doing: str) -> str:
+    return doing[:40]
+
+
+def _make_room(out: Path) -> None:
+    """An empty folder; only a folder that an earlier trial has made is emptied.
+
+    Raises:
+        SettingsError: there is something else in it.
+    """
+    if out.is_dir() and any(out.iterdir()):
+        if not (out / OWN).is_file():
+            raise SettingsError(f"{out}: is not empty and holds no earlier trial; choose another --out")
+        shutil.rmtree(out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / OWN).write_text("This folder was made by a trial and is emptied by the next one.\n")
+
+
