@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,19 @@ from hybridmap.node import Edge, EdgeKind, NodeId
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan
 
-COLOURS = ("#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0", "#b8860b", "#555555")
+_PARTS = re.compile(r"[0-9]+|[^0-9]+")
+COLOURS = (
+    "#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0", "#b8860b", "#555555",
+    "#7fb3d5", "#f5b041", "#82c99a", "#c39bd3", "#6e2c00", "#0b5345", "#1a237e", "#9aa7b0",
+)  # fmt: skip
+
+
+def colours_of(robots: Iterable[str]) -> dict[str, str]:
+    """A colour like `#1f77b4` for each robot, the same in every picture and film: r2 comes before r10."""
+    ordered = sorted(
+        set(robots), key=lambda n: [(len(p), p) if p.isdigit() else (0, p) for p in _PARTS.findall(n)]
+    )
+    return {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(ordered)}
 
 
 @dataclass(frozen=True)
