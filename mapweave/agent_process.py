@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from agent.drivers.robot import Robot
 from agent.fleet import FleetLink
 from agent.journal import Journal
+from agent.kept import Kept
 from agent.mission import Idle, Mission
 from agent.observation import Observation, RobotDescription
 from agent.pipeline import Pipeline, PipelineSettings, Step
@@ -117,13 +118,13 @@ class Agent:
         self._start(map_id, Pipeline(map_id, self._description, self._settings))
 
     def _resume(self, map_id: MapId) -> None:
-        kept = self.journal.kept(map_id)
+        kept = Kept.of(self.journal, map_id)
         pipeline = Pipeline(map_id, self._description, self._settings, kept.contents, kept.next_number)
         self.journal.open_map(map_id.epoch)
         nodes = len(pipeline.map.nodes)
         self._say(f"{self._options.name}: takes up map {map_id} with {nodes} nodes")
-        for line in kept.complaints:
-            self._say(f"{self._options.name}: {line}")
+        if kept.complaint:
+            self._say(f"{self._options.name}: {kept.complaint}")
         self._start(map_id, pipeline)
 
     def _start(self, map_id: MapId, pipeline: Pipeline, mission: Mission | None = None) -> None:

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from agent.pipeline import PipelineSettings
 from hybridmap.errors import MapweaveError, SettingsError
-from mapweave.trial.batch_table import Attempt, batch_as_dict, batch_table
+from mapweave.trial.batch_table import Attempt, batch_json, batch_table
 from mapweave.trial.run import TrialOptions, run_trial
 from mapweave.trial.scenario import Scenario
 
@@ -70,13 +70,13 @@ def run_batch_of_trials(scenario: Scenario, options: BatchOptions) -> bool:
                 for line in attempts[-1].complaints:
                     console.print(f"seed {seed}: {line}", highlight=False)
             progress.update(task, advance=1, detail=f"{len(failed)} failed")
-    summary = batch_as_dict(attempts)
+    summary = batch_json(attempts)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "batch.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if options.json:
         print(json.dumps(summary))
     else:
-        Console().print(batch_table(scenario.name, attempts))
+        Console().print(batch_table(attempts, scenario.name))
     return all(attempt.passed for attempt in attempts)
 
 

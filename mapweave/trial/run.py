@@ -6,8 +6,9 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from agent.pipeline import PipelineSettings
 from hybridmap.errors import SettingsError
@@ -57,6 +58,16 @@ class Trial:
     recording: Recording
     figures: Figures
     verdicts: tuple[Verdict, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "scenario": self.recording.scenario,
+            "seed": self.recording.seed,
+            "passed": self.passed,
+            "figures": self.figures.as_dict(),
+            "verdicts": [asdict(verdict) for verdict in self.verdicts],
+        }
 
     @property
     def passed(self) -> bool:
