@@ -32,6 +32,8 @@ BAR = 34
 """Height of the line of text above the plan, and of the one below, px."""
 LABEL = 20
 """Height of the label below a camera's image, px."""
+LARGEST = 300
+"""Height of a camera's image at most, px: the simulator's cameras have hardly more."""
 GAP = 6
 """px."""
 TRAIL = 300
@@ -40,6 +42,8 @@ JUMP = 0.3
 """m; between two frames no robot drives this far: it was carried, and its trail is cut."""
 ROBOT_RADIUS = 0.17
 """m."""
+NO_NODES: Array = np.zeros((0, 3))
+FONT = cv2.FONT_HERSHEY_SIMPLEX
 SHIFT = 4
 """Fractional bits of the coordinates that OpenCV draws at."""
 
@@ -79,7 +83,7 @@ def lay_out(size: tuple[int, int], extent: tuple[float, float], robots: int) -> 
 
     def arrange(columns: int) -> tuple[float, Layout]:
         rows = math.ceil(robots / columns)
-        cell_height = min((height - GAP) // rows - LABEL - GAP, int(0.6 * width / columns * 3 / 4))
+        cell_height = min((height - GAP) // rows - LABEL - GAP, int(0.6 * width / columns * 3 / 4), LARGEST)
         cell = max(cell_height * 4 // 3, 4), max(cell_height, 3)
         grid = columns * (cell[0] + GAP) + GAP
         free = max(width - grid - 2 * GAP, 8), max(height - 2 * BAR, 8)
@@ -133,6 +137,7 @@ class Scene:
         self._fill(self._bare, plan.rooms, FLOOR)
         self._fill(self._bare, plan.walls, SOLID)
         self._furniture: tuple[Rectangle, ...] = ()
+        self._nodes: list[Array] = [NO_NODES for _ in robots]
         self._furnished = self._bare
         self._trails: dict[str, deque[Array]] = {name: deque(maxlen=TRAIL) for name in robots}
 
@@ -151,17 +156,15 @@ class Scene:
             statuses: what each robot is doing, a few words.
             caption: what is happening, one line below the plan.
         """
-        frame = self._background(snapshot.furniture).copy()
-        nodes, statuses = nodes or {}, statuses or {}
-        for name in self._robots:
-            if name in nodes and len(nodes[name]):
-                self._draw_nodes(frame, np.asarray(nodes[name]), _mixed(self._colours[name], 0.35))
+        frame = self._background(snapshot.furniture, nodes or {}).copy()
+        statuses = statuses or {}
         for name, pose in snapshot.robots.items():
             if name in self._trails:
                 self._draw_trail(frame, name, pose)
         self._fill(frame, snapshot.actors, ACTOR)
         for actor in snapshot.actors:
-            self._label(frame, actor.name, self._pixel(actor.x, actor.y), ACTOR)
+            x, y = self._pixel(actor.x, actor.y)
+            self._label(frame, actor.name, (x + 12, y - 12), ACTOR)
         for name, pose in snapshot.robots.items():
             if name in self._colours:
                 self._draw_robot(frame, name, pose)
@@ -171,16 +174,23 @@ class Scene:
         self._write(frame, caption, (GAP + 2, self.size[1] - 12), INK, 0.5)
         return frame
 
-    def _background(self, furniture: tuple[Rectangle, ...]) -> Frame:
-        """The building; drawn again only when furniture was moved."""
-        if furniture != self._furniture:
-            self._furniture = furniture
+    def _background(self, furniture: tuple[Rectangle, ...], nodes: Mapping[str, Array]) -> Frame:
+        """The building and the places in it; drawn again only when something of it is another."""
+        shown = [nodes.get(name, NO_NODES) for name in self._robots]
+        same = all(np.array_equal(a, b) for a, b in zip(shown, self._nodes, strict=True))
+        if furniture != self._furniture or not same:
+            # Copies: who calls may go on to fill the same arrays.
+            self._furniture, self._nodes = furniture, [np.array(poses, np.float64) for poses in shown]
             self._furnished = self._bare.copy()
             self._fill(self._furnished, furniture, SOLID)
+            for name, poses in zip(self._robots, self._nodes, strict=True):
+                self._draw_nodes(self._furnished, poses, _mixed(self._colours[name], 0.35))
         return self._furnished
 
     def _draw_nodes(self, frame: Frame, poses: Array, colour: Colour) -> None:
         """Dots with a tick where they look, all in two calls."""
+        if not len(poses):
+            return
         reach = 0.16 * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
         lines = self._subpixels(np.stack([poses[:, :2], poses[:, :2] + reach], axis=1))
         dots = np.repeat(lines[:, :1], 2, axis=1)
@@ -219,16 +229,16 @@ class Scene:
             # Cameras have different shapes: what does not fill the cell is framed.
             scale = min(width / image.shape[1], height / image.shape[0])
             w, h = max(int(image.shape[1] * scale), 1), max(int(image.shape[0] * scale), 1)
-            small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+            small = cv2.resize(
+                image, (w, h), interpolation=cv2.INTER_AREA if scale < 0.6 else cv2.INTER_LINEAR
+            )
             dy, dx = (height - h) // 2, (width - w) // 2
-            cell[dy : dy + h, dx : dx + w] = small[:, :, None]
+            cell[dy : dy + h, dx : dx + w] = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
         cv2.rectangle(frame, (x - 2, y - 2), (x + width + 1, y + height + LABEL), colour, 2)
         frame[y + height : y + height + LABEL, x : x + width] = PAPER
         self._write(frame, name, (x + 4, y + height + 14), colour, 0.45, 2)
-        # Hershey letters of this size are about 7.5 px wide.
-        begin = 14 + 9 * len(name)
-        fits = max(int((width - begin) / 7.5), 0)
-        self._write(frame, status[:fits], (x + begin, y + height + 14), INK, 0.4)
+        begin = 12 + _width(name, 0.45, 2)
+        self._write(frame, _shortened(status, width - begin, 0.4), (x + begin, y + height + 14), INK, 0.4)
 
     def _fill(self, frame: Frame, boxes: Iterable[Rectangle], colour: Colour) -> None:
         for box in boxes:
@@ -242,9 +252,9 @@ class Scene:
     def _write(
         self, frame: Frame, text: str, at: tuple[int, int], colour: Colour, scale: float, weight: int = 1
     ) -> None:
-        # OpenCV's letters are ASCII; for others it draws question marks, several for each.
+        # Older OpenCV's letters are ASCII; for others it draws question marks, several for each.
         plain = text.encode("ascii", "replace").decode()
-        cv2.putText(frame, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, weight, cv2.LINE_AA)
+        cv2.putText(frame, plain, at, FONT, scale, colour, weight, cv2.LINE_AA)
 
     def _subpixels(self, points: NDArray[Any]) -> NDArray[np.int32]:
         """(..., 2) m in world to fixed-point px."""
@@ -256,6 +266,21 @@ class Scene:
     def _pixel(self, x: float, y: float) -> tuple[int, int]:
         px, py = self._subpixels(np.array([x, y])) >> SHIFT
         return int(px), int(py)
+
+
+def _width(text: str, scale: float, weight: int = 1) -> int:
+    """Of a text, px."""
+    return int(cv2.getTextSize(text, FONT, scale, weight)[0][0])
+
+
+def _shortened(text: str, room: int, scale: float) -> str:
+    """As much of a text as there is room for, px; dots stand for what is left out."""
+    if _width(text, scale) <= room:
+        return text
+    shorter = text[: int(len(text) * room / _width(text, scale))] if room > 0 else ""
+    while shorter and _width(shorter + "..", scale) > room:
+        shorter = shorter[:-1]
+    return shorter + ".." if shorter else ""
 
 
 def _bgr(colour: str) -> Colour:
