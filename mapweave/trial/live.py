@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -21,12 +22,12 @@ QUALITY = 80
 STUCK = 5.0
 """s; a viewer that takes nothing for this long is dropped."""
 BOUNDARY = "frame"
-PAGE = b"""<!doctype html>
+PAGE = """<!doctype html>
 <meta charset="utf-8">
-<title>Mapweave</title>
+<title>{title}</title>
 <style>
-  body { margin: 0; background: #fff; color: #555; font: 14px sans-serif; text-align: center }
-  img { max-width: 100%; max-height: 100vh }
+  body {{ margin: 0; background: #fff; color: #555; font: 14px sans-serif; text-align: center }}
+  img {{ max-width: 100%; max-height: 100vh }}
 </style>
 <img src="/stream" alt="The trial is over." onerror="this.replaceWith(this.alt)">
 """
@@ -37,17 +38,20 @@ class Live:
 
     Attributes:
         url: of the page.
+        page: itself, HTML.
     """
 
-    def __init__(self, port: int = PORT) -> None:
+    def __init__(self, port: int = PORT, title: str = "Mapweave") -> None:
         """Begin to serve.
 
         Args:
             port: on this machine's loopback; 0 takes a free one.
+            title: of the page.
 
         Raises:
             SettingsError: the port is in use, or may not be used.
         """
+        self.page = PAGE.format(title=html.escape(title)).encode()
         self._changed = threading.Condition()
         self._encoding = threading.Lock()
         self._frame: Frame | None = None
@@ -142,7 +146,7 @@ class _Viewer(BaseHTTPRequestHandler):
         try:
             match self.path.partition("?")[0]:
                 case "/":
-                    self._send("text/html; charset=utf-8", PAGE)
+                    self._send("text/html; charset=utf-8", self.server.live.page)
                 case "/frame.jpg":
                     self._send_frame()
                 case "/stream":

@@ -36,10 +36,10 @@ LARGEST = 300
 """Height of a camera's image at most, px: the simulator's cameras have hardly more."""
 GAP = 6
 """px."""
-TRAIL = 300
-"""Remembered postures of each robot: 30 s, if every tick is drawn."""
-JUMP = 0.3
-"""m; between two frames no robot drives this far: it was carried, and its trail is cut."""
+TRAIL = 30.0
+"""Of each robot's way, this much is shown, simulated s."""
+FASTEST = 1.0
+"""m/s; no robot drives faster: it was carried, and its trail is cut."""
 ROBOT_RADIUS = 0.17
 """m."""
 NO_NODES: Array = np.zeros((0, 3))
@@ -139,7 +139,7 @@ class Scene:
         self._furniture: tuple[Rectangle, ...] = ()
         self._nodes: list[Array] = [NO_NODES for _ in robots]
         self._furnished = self._bare
-        self._trails: dict[str, deque[Array]] = {name: deque(maxlen=TRAIL) for name in robots}
+        self._trails: dict[str, deque[tuple[float, float, float]]] = {name: deque() for name in robots}
 
     def draw(
         self,
@@ -160,7 +160,7 @@ class Scene:
         statuses = statuses or {}
         for name, pose in snapshot.robots.items():
             if name in self._trails:
-                self._draw_trail(frame, name, pose)
+                self._draw_trail(frame, name, pose, snapshot.stamp_ns / 1e9)
         self._fill(frame, snapshot.actors, ACTOR)
         for actor in snapshot.actors:
             x, y = self._pixel(actor.x, actor.y)
@@ -197,14 +197,15 @@ class Scene:
         cv2.polylines(frame, list(lines), False, colour, 1, cv2.LINE_AA, SHIFT)
         cv2.polylines(frame, list(dots), False, colour, 4, cv2.LINE_AA, SHIFT)
 
-    def _draw_trail(self, frame: Frame, name: str, pose: Pose2) -> None:
+    def _draw_trail(self, frame: Frame, name: str, pose: Pose2, now: float) -> None:
         trail = self._trails[name]
-        here = np.array([pose.x, pose.y])
-        if trail and np.hypot(*(here - trail[-1])) > JUMP:
+        if trail and math.dist((pose.x, pose.y), trail[-1][1:]) > FASTEST * max(now - trail[-1][0], 0.0):
             trail.clear()
-        trail.append(here)
+        trail.append((now, pose.x, pose.y))
+        while trail[0][0] < now - TRAIL:
+            trail.popleft()
         if len(trail) > 1:
-            line = self._subpixels(np.array(trail))
+            line = self._subpixels(np.array(trail)[:, 1:])
             cv2.polylines(frame, [line], False, _mixed(self._colours[name], 0.2), 2, cv2.LINE_AA, SHIFT)
 
     def _draw_robot(self, frame: Frame, name: str, pose: Pose2) -> None:
