@@ -17,6 +17,11 @@ from hybridmap.pose import Array, Pose2
 
 CELL = 0.05
 """Grid step of the free-space search, m."""
+REACH = 2.0
+"""Clearances on the grid are measured up to here, m: a wall is compared with the cells around it alone."""
+
+Box = tuple[float, float, float, float]
+"""(x0, y0, x1, y1) m, in world, upright."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +66,16 @@ def distances_to(rectangles: Iterable[Rectangle], points: NDArray[Any]) -> Array
     points = np.asarray(points, dtype=np.float64)
     nearest: Array = np.full(len(points), np.inf)
     for box in rectangles:
-        local = np.abs(Pose2(box.x, box.y, box.heading).inverse().apply(points))
-        outside = np.maximum(local - [box.length / 2, box.width / 2], 0.0)
-        np.minimum(nearest, np.hypot(outside[:, 0], outside[:, 1]), out=nearest)
+        np.minimum(nearest, _distances(box, points), out=nearest)
     return nearest
+
+
+def _distances(box: Rectangle, points: NDArray[Any]) -> Array:
+    """(...) m from (..., 2) points to a rectangle, zero inside."""
+    local = np.abs(Pose2(box.x, box.y, box.heading).inverse().apply(points))
+    outside = np.maximum(local - [box.length / 2, box.width / 2], 0.0)
+    distances: Array = np.hypot(outside[..., 0], outside[..., 1])
+    return distances
 
 
 @dataclass(frozen=True)
@@ -82,7 +93,7 @@ class FloorPlan:
     furniture: tuple[Rectangle, ...] = ()
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> Box:
         """(x0, y0, x1, y1) m, in world, around everything."""
         corners = np.concatenate([r.corners for r in (*self.rooms, *self.walls)])
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -121,36 +132,38 @@ class FloorPlan:
         raise InvalidValue(f"no room {name!r}; there are {', '.join(r.name for r in self.rooms)}")
 
     @cached_property
-    def _grid(self) -> tuple[Array, Array]:
-        """Cell centres (rows, columns, 2) m, in world, and their clearances (rows, columns) m."""
-        x0, y0, x1, y1 = self.bounds
-        xs = np.arange(x0 + CELL / 2, x1, CELL)
-        ys = np.arange(y0 + CELL / 2, y1, CELL)
-        centres: Array = np.stack(np.meshgrid(xs, ys), axis=-1)
-        return centres, self.clearances(centres.reshape(-1, 2)).reshape(centres.shape[:2])
-
-    def furnished(self, piece: Rectangle) -> FloorPlan:
-        """The same plan with one more piece of furniture; what was measured of the rest is kept."""
-        plan = FloorPlan(self.rooms, self.walls, (*self.furniture, piece))
-        centres, clearances = self._grid
-        to_piece = distances_to([piece], centres.reshape(-1, 2)).reshape(clearances.shape)
-        plan.__dict__["_grid"] = centres, np.minimum(clearances, to_piece)
-        return plan
+    def grid(self) -> Grid:
+        """The clearances of the whole building."""
+        return Grid.of(self.rooms, (*self.walls, *self.furniture), self.bounds, self.bounds)
 
     def free_regions(self, radius: float) -> list[Array]:
         """Connected sets of points where a disc fits, each (N, 2) m, in world, largest set first.
 
         Two points of one set are joined by a path along which the disc fits (to the 5 cm of the grid).
         """
-        centres, clearances = self._grid
-        _, labels = cv2.connectedComponents((clearances >= radius).astype(np.uint8), connectivity=4)
-        regions = [centres[labels == label] for label in range(1, int(labels.max()) + 1)]
+        grid = self.grid
+        free = grid.clearances >= radius
+        if radius > REACH:
+            free = self.clearances(grid.centres.reshape(-1, 2)).reshape(free.shape) >= radius
+        count, labels = cv2.connectedComponents(free.astype(np.uint8), connectivity=4)
+        regions = [grid.centres[labels == label] for label in range(1, count)]
         return sorted(regions, key=len, reverse=True)
 
-    def free_points(self, radius: float) -> Array:
-        """(N, 2) m, in world: grid points of the largest region where a disc of this radius fits."""
+    def free_points(self, radius: float, room: str | None = None) -> Array:
+        """(N, 2) m, in world: grid points of the largest region where a disc of this radius fits.
+
+        Args:
+            radius: of the disc, m.
+            room: name of a room; then the largest of the parts of one region that lie in it.
+
+        Raises:
+            InvalidValue: no such room.
+        """
         regions = self.free_regions(radius)
-        return regions[0] if regions else np.zeros((0, 2))
+        if room is not None:
+            box = [self.room(room)]
+            regions = [region[distances_to(box, region) <= 1e-9] for region in regions]
+        return max(regions, key=len, default=np.zeros((0, 2)))
 
     def random_free_pose(self, rng: np.random.Generator, radius: float, room: str | None = None) -> Pose2:
         """A reachable pose with any heading, in any room or the given one.
@@ -163,10 +176,72 @@ class FloorPlan:
         Raises:
             InvalidValue: no such room, or nothing that large fits there.
         """
-        points = self.free_points(radius)
-        if room is not None:
-            points = points[distances_to([self.room(room)], points) <= 1e-9]
+        points = self.free_points(radius, room)
         if len(points) == 0:
             raise InvalidValue(f"a disc of {radius} m fits nowhere in {room or 'the building'}")
-        x, y = points[rng.integers(len(points))] + rng.uniform(-CELL / 4, CELL / 4, 2)
-        return Pose2(float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
+        return random_pose(rng, points)
+
+
+def random_pose(rng: np.random.Generator, points: NDArray[Any]) -> Pose2:
+    """One of (N, 2) grid points in world, off by less than half a cell, with any heading."""
+    x, y = points[rng.integers(len(points))] + rng.uniform(-CELL / 4, CELL / 4, 2)
+    return Pose2(float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Clearances at points 5 cm apart.
+
+    Attributes:
+        centres: (rows, columns, 2) m, in world.
+        clearances: (rows, columns) m to the nearest wall or furniture, at most `REACH`; zero outside.
+    """
+
+    centres: Array
+    clearances: Array
+
+    @staticmethod
+    def of(rooms: Iterable[Rectangle], solids: Iterable[Rectangle], bounds: Box, window: Box) -> Grid:
+        """The part of a building's grid that lies in a window.
+
+        Args:
+            rooms: where one may be.
+            solids: walls and furniture, at least all within `REACH` of the window.
+            bounds: of the whole building; its grid is the same whatever the window.
+            window: what is measured.
+        """
+        x0, y0, x1, y1 = bounds
+        xs, ys = np.arange(x0 + CELL / 2, x1, CELL), np.arange(y0 + CELL / 2, y1, CELL)
+        xs, ys = xs[(xs >= window[0]) & (xs <= window[2])], ys[(ys >= window[1]) & (ys <= window[3])]
+        centres: Array = np.stack(np.meshgrid(xs, ys), axis=-1)
+        inside = np.zeros(centres.shape[:2], bool)
+        for room in rooms:
+            cells = _around(centres, room, 0.0)
+            inside[cells] |= _distances(room, centres[cells]) <= 1e-9
+        grid = Grid(centres, np.where(inside, REACH, 0.0))
+        for box in solids:
+            grid.add(box)
+        return grid
+
+    def with_box(self, box: Rectangle) -> Grid:
+        """The same grid with one more solid thing."""
+        grid = Grid(self.centres, self.clearances.copy())
+        grid.add(box)
+        return grid
+
+    def add(self, box: Rectangle) -> None:
+        """One more solid thing, in place."""
+        cells = _around(self.centres, box, REACH)
+        here = self.clearances[cells]
+        np.minimum(here, _distances(box, self.centres[cells]), out=here)
+
+
+def _around(centres: Array, box: Rectangle, margin: float) -> tuple[slice, slice]:
+    """Rows and columns of the cells that lie within a margin of an upright box around a rectangle."""
+    if centres.size == 0:
+        return slice(0, 0), slice(0, 0)
+    low, high = box.corners.min(axis=0) - margin - 1e-9, box.corners.max(axis=0) + margin + 1e-9
+    xs, ys = centres[0, :, 0], centres[:, 0, 1]
+    columns = slice(int(np.searchsorted(xs, low[0])), int(np.searchsorted(xs, high[0], "right")))
+    rows = slice(int(np.searchsorted(ys, low[1])), int(np.searchsorted(ys, high[1], "right")))
+    return rows, columns

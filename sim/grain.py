@@ -1,4 +1,4 @@
-"""Noise fields: the grain of plaster and wood, clouds, and the light on a wall."""
+"""Noise fields: the grain of plaster and wood, and clouds."""
 
 from __future__ import annotations
 
@@ -38,11 +38,3 @@ def clouds(rng: np.random.Generator, width_px: int, height_px: int, steepness: f
         weight /= 2 ** (steepness - 1)
         size /= 2
     return np.asarray(total / np.sqrt(max(power, 1e-9)), dtype=np.float32)
-
-
-def lighting(rng: np.random.Generator, width_px: int, height_px: int) -> Field:
-    """Brightness that falls off from a lamp somewhere above, (height, width), 0.6 to 1."""
-    x = np.linspace(-0.5, 0.5, width_px, dtype=np.float32)
-    y = np.linspace(0.0, 1.0, height_px, dtype=np.float32)
-    centre = float(rng.uniform(-0.3, 0.3))
-    return np.asarray(1.0 - 0.25 * (x[None, :] - centre) ** 2 - 0.22 * y[:, None] ** 2, dtype=np.float32)

@@ -1,11 +1,11 @@
-"""Painters of whole surfaces: wall segments with prints on them, furniture, floors."""
+"""Painters of whole surfaces: walls, furniture, floors. `sim.worlds.light` shines on them."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from sim.grain import clouds, lighting, noise
+from sim.grain import Field, clouds, noise
 from sim.print import LETTERS, framed_print
 from sim.texture import Image
 
@@ -13,12 +13,22 @@ TEXELS_PER_METRE = 280
 """Resolution of walls and furniture: what a 320 px, 60 degree camera resolves at 1 m."""
 
 
-def wall(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
-    """Plaster with grain and stains, prints at different heights, and a skirting board."""
-    base = float(rng.uniform(140, 215))
-    surface = base + 7 * clouds(rng, width_px, height_px, 1.3)
-    surface *= lighting(rng, width_px, height_px)
-    canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
+def plaster(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
+    """Painted plaster with faint grain, few marks, now and then a socket, and a skirting board."""
+    canvas = _plaster(rng, width_px, height_px, paint)
+    for _ in range(int(rng.poisson(width_px * height_px / 160_000))):
+        x, y = int(rng.integers(width_px)), int(rng.integers(height_px))
+        reach = rng.normal(0.0, 14.0, 2)
+        end = (x + int(reach[0]), y + int(reach[1]))
+        cv2.line(canvas, (x, y), end, int(canvas[y, x]) - int(rng.integers(8, 30)), 1, cv2.LINE_AA)
+    if width_px > 60 and rng.random() < 0.25:
+        _socket(canvas, int(rng.uniform(20, width_px - 40)), height_px - int(0.33 * TEXELS_PER_METRE))
+    return _skirted(rng, canvas)
+
+
+def wall(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
+    """Painted plaster with prints at different heights, and a skirting board."""
+    canvas = _plaster(rng, width_px, height_px, paint)
     metre = TEXELS_PER_METRE
     # Low prints are what a robot sees near by, high ones what it sees across the room.
     bands = ((0.12, 0.75), (0.8, 1.45), (1.5, 2.1))
@@ -31,8 +41,32 @@ def wall(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
         left = int(rng.uniform(0.03 * width_px, 0.97 * width_px - width))
         if top >= 0 and width > 20 and left >= 0:
             canvas[top : top + height, left : left + width] = framed_print(rng, width, height)
-    skirting = int(0.06 * metre)
-    canvas[height_px - skirting :] = int(rng.integers(50, 110))
+    return _skirted(rng, canvas)
+
+
+def concrete(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
+    """Cast concrete: blotches, pores, and the marks of the boards it was cast in."""
+    blotches = _seamless(clouds(rng, width_px, height_px, 1.6), across=True)
+    surface = 0.8 * paint + 9 * blotches + 3 * noise(rng, width_px, height_px, 2.0)
+    canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
+    _pores(rng, canvas, 4000)
+    for y in range(height_px - int(0.5 * TEXELS_PER_METRE), 0, -int(0.5 * TEXELS_PER_METRE)):
+        cv2.line(canvas, (0, y), (width_px, y), int(0.66 * paint), 1, cv2.LINE_AA)
+    return canvas
+
+
+def cladding(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
+    """Trapezoidal sheet metal: upright ribs, all alike, on a low concrete plinth, with scratches."""
+    rib = np.arange(width_px) / (0.2 * TEXELS_PER_METRE) % 1.0
+    shade = np.select([rib < 0.4, rib < 0.5, rib < 0.9], [1.0, 0.8, 0.93], 1.08)
+    surface = paint * shade[None, :] + 4 * _seamless(clouds(rng, width_px, height_px, 1.3), across=True)
+    canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
+    for _ in range(int(rng.poisson(width_px * height_px / 40_000))):
+        x, y = int(rng.integers(width_px)), int(rng.integers(height_px))
+        end = (x + int(rng.normal(0, 25)), y + int(rng.normal(0, 5)))
+        cv2.line(canvas, (x, y), end, int(rng.integers(60, 120)), 1, cv2.LINE_AA)
+    plinth = int(0.25 * TEXELS_PER_METRE)
+    canvas[height_px - plinth :] = concrete(rng, width_px, plinth, 0.8 * paint)
     return canvas
 
 
@@ -102,6 +136,94 @@ def crate(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
     return canvas
 
 
-def floor(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
-    """Almost plain linoleum: what the camera sees there is worth little."""
-    return np.clip(118 + 4 * clouds(rng, width_px, height_px, 2.0), 0, 255).astype(np.uint8)
+def linoleum(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
+    """Almost plain, with flecks that only a near camera sees: what it sees there is worth little."""
+    soft = _seamless(clouds(rng, width_px, height_px, 2.0), across=True, down=True)
+    surface = 122 + 4 * soft + 2.5 * noise(rng, width_px, height_px, 2.0)
+    return np.clip(surface, 0, 255).astype(np.uint8)
+
+
+def screed(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
+    """The floor of a hall: concrete with stains, tyre marks and cracks."""
+    blotches = _seamless(clouds(rng, width_px, height_px, 1.7), across=True, down=True)
+    canvas = np.clip(128 + 7 * blotches, 0, 255).astype(np.uint8)
+    _pores(rng, canvas, 8000)
+    area = width_px * height_px / TEXELS_PER_METRE**2
+    for _ in range(int(rng.poisson(0.25 * area))):
+        centre = (int(rng.integers(width_px)), int(rng.integers(height_px)))
+        axes = (int(rng.uniform(6, 45)), int(rng.uniform(6, 30)))
+        stain = np.zeros_like(canvas)
+        cv2.ellipse(stain, centre, axes, float(rng.uniform(0, 180)), 0, 360, 28, -1, cv2.LINE_AA)
+        canvas = cv2.subtract(canvas, cv2.blur(stain, (15, 15))).astype(np.uint8)
+    for _ in range(int(rng.poisson(0.12 * area))):
+        steps = rng.normal(0.0, 12.0, (14, 2)) + rng.normal(0.0, 14.0, 2)
+        crack = rng.uniform([0, 0], [width_px, height_px]) + np.cumsum(steps, axis=0)
+        cv2.polylines(canvas, [crack.astype(np.int32)], False, 70, 1, cv2.LINE_AA)
+    return canvas
+
+
+def tiles(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
+    """Square tiles of 30 cm with joints; each a little lighter or darker."""
+    side = 0.3 * TEXELS_PER_METRE
+    columns, rows = int(width_px / side) + 1, int(height_px / side) + 1
+    shades = rng.normal(0.0, 5.0, (rows, columns))
+    row, column = (np.arange(n) / side for n in (height_px, width_px))
+    surface = (
+        135 + shades[np.ix_(row.astype(int), column.astype(int))] + 3 * clouds(rng, width_px, height_px, 1.5)
+    )
+    joint = (column % 1.0 < 0.016)[None, :] | (row % 1.0 < 0.016)[:, None]
+    return np.asarray(np.clip(np.where(joint, 95, surface), 0, 255), np.uint8)
+
+
+def _plaster(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
+    grain = _seamless(clouds(rng, width_px, height_px, 1.3), across=True)
+    fine = noise(rng, width_px, height_px, 2.0)
+    return np.asarray(np.clip(paint + 6 * grain + 1.5 * fine, 0, 255), np.uint8)
+
+
+def _seamless(grain: Field, across: bool, down: bool = False) -> Field:
+    """Grain that fades out where the next length of wall or floor begins, which has grain of its own."""
+    for axis, wanted in ((1, across), (0, down)):
+        if wanted:
+            size = grain.shape[axis]
+            edge = np.minimum(np.arange(size), np.arange(size)[::-1]) + 0.5
+            ramp = np.minimum(edge / (0.15 * TEXELS_PER_METRE), 1.0).astype(np.float32)
+            grain = grain * (ramp[None, :] if axis else ramp[:, None])
+    return grain
+
+
+def _skirted(rng: np.random.Generator, canvas: Image) -> Image:
+    """With a skirting board, the same along every wall, scuffed."""
+    board = int(0.06 * TEXELS_PER_METRE)
+    if len(canvas) > 4 * board:
+        scuffs = noise(rng, canvas.shape[1], board, 3.0)
+        canvas[-board:] = np.clip(78 + 5 * scuffs, 0, 255).astype(np.uint8)
+        canvas[-board - 1] = 50
+    return canvas
+
+
+def _socket(canvas: Image, x: int, y: int) -> None:
+    """A wall socket, all alike, 8 cm wide."""
+    side = int(0.08 * TEXELS_PER_METRE)
+    if y < 0:
+        return
+    cv2.rectangle(canvas, (x, y), (x + side, y + side), 236, -1)
+    cv2.rectangle(canvas, (x, y), (x + side, y + side), 120, 1)
+    centre = (x + side // 2, y + side // 2)
+    cv2.circle(canvas, centre, side // 3, 205, -1, cv2.LINE_AA)
+    for hole in (-3, 3):
+        cv2.circle(canvas, (centre[0] + hole, centre[1]), 1, 30, -1, cv2.LINE_AA)
+
+
+def _pores(rng: np.random.Generator, canvas: Image, texels: int) -> None:
+    """Dark dots, one in so many texels."""
+    height_px, width_px = canvas.shape
+    count = width_px * height_px // texels
+    places = rng.integers(0, [width_px, height_px], (count, 2))
+    for (x, y), size, grey in zip(
+        places.tolist(),
+        rng.integers(1, 3, count).tolist(),
+        rng.integers(60, 110, count).tolist(),
+        strict=True,
+    ):
+        cv2.circle(canvas, (x, y), size, grey, -1, cv2.LINE_AA)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan, Rectangle
+from sim.furnishing import rearrange
+from sim.starting import spread
 from sim.texture import Texture
 
 
@@ -141,6 +143,21 @@ def block_panels(block: Block, sides: Sequence[Texture], top: Texture | None = N
     return panels
 
 
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """What belongs to one piece of furniture.
+
+    Attributes:
+        blocks: which of the world's blocks, a range.
+        panels: which of the world's panels, a range.
+        movable: whether people push it around.
+    """
+
+    blocks: range
+    panels: range
+    movable: bool = True
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """All that stands still.
@@ -151,6 +168,10 @@ class World:
         blocks: what one can run into.
         panels: what one can see.
         background: grey where no panel is (the ceiling).
+        pieces: one for each of `plan.furniture`, in the same order; empty where nobody knows what belongs to
+            what, and then nothing can be moved.
+        start_rooms: names of the rooms in which robots start; by default those called "room ...".
+        look_along: whether robots start looking along the longer side of their room.
     """
 
     name: str
@@ -158,6 +179,9 @@ class World:
     blocks: tuple[Block, ...]
     panels: tuple[Panel, ...]
     background: int = 200
+    pieces: tuple[Piece, ...] = ()
+    start_rooms: tuple[str, ...] = ()
+    look_along: bool = False
 
     def start_poses(self, robots: int, seed: int, clearance: float = 0.45) -> tuple[Pose2, ...]:
         """Free poses, robot i in room i (counted around), where no two robots come close.
@@ -168,18 +192,62 @@ class World:
             clearance: to walls and furniture, m.
 
         Raises:
-            InvalidValue: there is no such place.
+            InvalidValue: there is no room to start in, or so many robots do not fit.
         """
-        rng = np.random.default_rng([seed, 0x57A27])
-        rooms = [room.name for room in self.plan.rooms if room.name.startswith("room")]
+        names = [room.name for room in self.plan.rooms]
+        rooms = self.start_rooms or tuple(name for name in names if name.startswith("room"))
         if not rooms:
             raise InvalidValue(f"world {self.name} has no room to start in")
-        poses: list[Pose2] = []
-        for robot in range(robots):
-            room = rooms[robot % len(rooms)]
-            tries = [self.plan.random_free_pose(rng, clearance, room) for _ in range(30)]
-            # The farthest of a few random places from those already taken: never on top of one another.
-            apart = [min((p.distance(q) for q in poses), default=math.inf) for p in tries]
-            good = [p for p, gap in zip(tries, apart, strict=True) if gap > 1.0]
-            poses.append(good[0] if good else tries[int(np.argmax(apart))])
-        return tuple(poses)
+        return spread(self.plan, rooms, robots, clearance, self.look_along, seed)
+
+    def rearranged(
+        self, seed: int, share: float, keep_clear: Sequence[Pose2] = (), clearance: float = 0.5
+    ) -> World:
+        """The same world after people have moved furniture: other places in the same rooms.
+
+        Blocks, panels and furniture keep their order and textures, so what did not move is the same object
+        at the same index. Every room that could be reached still can.
+
+        Args:
+            seed: other seeds, other pieces and places.
+            share: of the furniture that moves, 0 to 1, at least one piece; less where there is no place.
+            keep_clear: robots, `world_from_robot`, near which nothing is put down.
+            clearance: from the middle of such a robot, m.
+
+        Raises:
+            InvalidValue: no such share, or nothing that could be put elsewhere.
+        """
+        if not 0.0 < share <= 1.0:
+            raise InvalidValue(f"a share of the furniture is more than 0 and at most 1, not {share}")
+        movable = [k for k, piece in enumerate(self.pieces) if piece.movable]
+        rng = np.random.default_rng([seed, 0x3E44A])
+        wanted = max(1, round(share * len(movable)))
+        plan, moves = rearrange(self.plan, movable, wanted, rng, keep_clear, clearance)
+        if not moves:
+            raise InvalidValue(f"world {self.name} has no furniture that can stand elsewhere in its room")
+        blocks, panels = list(self.blocks), list(self.panels)
+        for move in moves:
+            piece, old = self.pieces[move.index], self.plan.furniture[move.index]
+            motion = (
+                Pose2(move.place.x, move.place.y, move.place.heading)
+                @ Pose2(old.x, old.y, old.heading).inverse()
+            )
+            for k in piece.blocks:
+                blocks[k] = replace(blocks[k], base=moved_rectangle(blocks[k].base, motion))
+            for k in piece.panels:
+                panels[k] = moved_panel(panels[k], motion)
+        return replace(self, plan=plan, blocks=tuple(blocks), panels=tuple(panels))
+
+
+def moved_rectangle(rectangle: Rectangle, motion: Pose2) -> Rectangle:
+    """Where a rectangle is after a motion of the floor, `new_from_old`."""
+    place = motion @ Pose2(rectangle.x, rectangle.y, rectangle.heading)
+    return replace(rectangle, x=place.x, y=place.y, heading=place.heading)
+
+
+def moved_panel(panel: Panel, motion: Pose2) -> Panel:
+    """Where a panel is after a motion over the floor, `new_from_old`."""
+    turn = Pose2(heading=motion.heading)
+    return replace(
+        panel, corner=motion.apply(panel.corner), along=turn.apply(panel.along), down=turn.apply(panel.down)
+    )

@@ -10,7 +10,7 @@ import pytest
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan, Rectangle
-from sim.office import make_office
+from sim.worlds.office import make_office
 from sim.world import Block, PanelSet, World
 
 

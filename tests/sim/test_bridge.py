@@ -20,7 +20,7 @@ from hybridmap.pose import Array, Pose2
 from sim.bridge import SimBridge
 from sim.control import SimControl
 from sim.floorplan import FloorPlan, Rectangle
-from sim.office import make_office
+from sim.worlds.office import make_office
 from sim.simulated import Simulated
 from sim.simulation import Simulation
 from wire.keys import Keys

@@ -15,9 +15,12 @@ from agent.observation import Command
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2
 from sim.body import BodySettings
-from sim.office import make_office
-from sim.simulation import RANGE_NOISE, Simulation
+from sim.robots import RobotSetup
+from sim.simulation import Simulation
 from sim.world import World
+from sim.worlds.office import make_office
+
+RANGE_NOISE = RobotSetup("r0").range_noise
 
 
 def fingerprint(seed: int) -> str:
@@ -160,7 +163,7 @@ def test_a_collision_counts_once_however_long_it_lasts(walled: World) -> None:
 def test_robot_stays_level(bare: World) -> None:
     """The camera must not nod: under 0.15 degree while starting, stopping and turning, at full speed."""
     with Simulation(bare, ["r0"], 5, [Pose2()]) as simulation:
-        body = simulation._bodies["r0"]
+        body = simulation._robots["r0"].body
         worst = 0.0
         for command in [Command(0.3), Command(-0.3), Command(0.0, 0.8), Command(0.3, -0.8), Command()]:
             for _ in range(15):

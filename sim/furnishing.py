@@ -1,0 +1,197 @@
+"""Where furniture can stand so that robots still get everywhere and are caught nowhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Pose2
+from sim.floorplan import FloorPlan, Grid, Rectangle, distances_to
+
+PASSAGE = 0.45
+"""A disc of this radius gets from the middle of each room to all rooms to which it got before, m."""
+ROBOT = 0.28
+"""Furniture leaves no new corner where a disc of this radius fits and cannot get out, m."""
+MIDDLE = 0.75
+"""A way ends at most so far from the middle of a large room, along each axis, m."""
+DOORWAY = 0.08
+"""And so far from the middle of a doorway, m."""
+GAP = 0.02
+"""Between furniture and the wall behind it, m."""
+AROUND = 1.3
+"""Whether a piece is in the way is decided within so much of its room, m."""
+AWAY = 0.5
+"""Furniture that moves stands at least this far from where it stood, m."""
+TRIES = 40
+"""Places that are tried for one piece."""
+
+
+class Site:
+    """One room and what is next to it, while it is being furnished.
+
+    Connections are compared within this part of the building alone: two places that are joined only by a
+    way around the building count as apart, so the answer errs on the side of free floor.
+    """
+
+    def __init__(self, plan: FloorPlan, room: Rectangle) -> None:
+        """Measure the free floor.
+
+        Args:
+            plan: with all that stands already.
+            room: upright, of the plan.
+        """
+        x, y = room.length / 2 + AROUND, room.width / 2 + AROUND
+        window = (room.x - x, room.y - y, room.x + x, room.y + y)
+        near = Rectangle.spanning(*window)
+        self.room = room
+        self._solids = [s for s in (*plan.walls, *plan.furniture) if _near(s, near)]
+        rooms = [r for r in plan.rooms if _near(r, near)]
+        self._grid = Grid.of(rooms, self._solids, plan.bounds, window)
+        self._middles = [cells for r in rooms if (cells := self._middle(r)).any()]
+        self._pockets, passages = _components(self._grid, ROBOT)[0], _components(self._grid, PASSAGE)[1]
+        self._joined = [_labels(passages, cells) for cells in self._middles]
+
+    def allows(self, piece: Rectangle) -> bool:
+        """Whether a piece is in the room, cuts nothing, and leaves every way open."""
+        return self._fits(piece) and self._leaves_way(piece)
+
+    def add(self, piece: Rectangle) -> None:
+        """The piece stands there from now on."""
+        self._grid.add(piece)
+        self._solids.append(piece)
+        self._pockets = _components(self._grid, ROBOT)[0]
+
+    def _fits(self, piece: Rectangle) -> bool:
+        beyond = np.abs(piece.corners - [self.room.x, self.room.y])
+        if (beyond > [self.room.length / 2, self.room.width / 2]).any():
+            return False
+        return not overlap(piece, self._solids)
+
+    def _leaves_way(self, piece: Rectangle) -> bool:
+        grid = self._grid.with_box(piece)
+        if _components(grid, ROBOT)[0] > self._pockets:
+            return False
+        passages = _components(grid, PASSAGE)[1]
+        now = [_labels(passages, cells) for cells in self._middles]
+        # Rooms that one region reached are still reached by one region.
+        for k, before in enumerate(self._joined):
+            for other in range(k + 1):
+                if before & self._joined[other] and not now[k] & now[other]:
+                    return False
+        return True
+
+    def _middle(self, room: Rectangle) -> NDArray[np.bool_]:
+        """(rows, columns) the cells that count as a room's middle."""
+        slack = min(MIDDLE, max(DOORWAY, 0.35 * min(room.length, room.width)))
+        return np.asarray(np.abs(self._grid.centres - [room.x, room.y]).max(axis=2) <= slack)
+
+
+@dataclass(frozen=True)
+class Move:
+    """A piece of furniture that stands elsewhere.
+
+    Attributes:
+        index: in the plan's furniture.
+        place: where now.
+    """
+
+    index: int
+    place: Rectangle
+
+
+def rearrange(
+    plan: FloorPlan,
+    movable: Sequence[int],
+    wanted: int,
+    rng: np.random.Generator,
+    keep_clear: Sequence[Pose2],
+    clearance: float,
+) -> tuple[FloorPlan, list[Move]]:
+    """Move furniture to other places in its room.
+
+    Args:
+        plan: the building.
+        movable: indices into its furniture.
+        wanted: how many pieces; fewer move where there is no other place for more.
+        rng: where chance comes from.
+        keep_clear: robots, `world_from_robot`.
+        clearance: from the middle of a robot to a piece that moves, m.
+
+    Returns:
+        The new plan, its furniture in the same order, and what moved.
+    """
+    robots = np.array([[pose.x, pose.y] for pose in keep_clear]).reshape(-1, 2)
+    moves: list[Move] = []
+    for index in rng.permutation(np.asarray(movable, dtype=np.intp)).tolist():
+        if len(moves) >= wanted:
+            break
+        piece = plan.furniture[index]
+        room = next((r for r in plan.rooms if r.name == plan.room_at(piece.x, piece.y)), None)
+        if room is None:
+            continue
+        others = (*plan.furniture[:index], *plan.furniture[index + 1 :])
+        site = Site(replace(plan, furniture=others), room)
+        for _ in range(TRIES):
+            place = (against_wall if rng.random() < 0.6 else standing)(rng, room, piece)
+            if math.hypot(place.x - piece.x, place.y - piece.y) < AWAY:
+                continue
+            if len(robots) and distances_to([place], robots).min() < clearance:
+                continue
+            if site.allows(place):
+                moves.append(Move(index, place))
+                furniture = (*plan.furniture[:index], place, *plan.furniture[index + 1 :])
+                plan = replace(plan, furniture=furniture)
+                break
+    return plan, moves
+
+
+def against_wall(rng: np.random.Generator, room: Rectangle, piece: Rectangle) -> Rectangle:
+    """A piece of the same size somewhere along a side of an upright room."""
+    side = int(rng.integers(4))
+    across, along = (room.length, room.width) if side % 2 == 0 else (room.width, room.length)
+    slide = float(rng.uniform(-0.5, 0.5)) * max(along - piece.length, 0.0)
+    reach = across / 2 - piece.width / 2 - GAP
+    heading = side * math.pi / 2
+    x = room.x + math.cos(heading) * reach - math.sin(heading) * slide
+    y = room.y + math.sin(heading) * reach + math.cos(heading) * slide
+    return replace(piece, x=x, y=y, heading=heading + math.pi / 2)
+
+
+def standing(rng: np.random.Generator, room: Rectangle, piece: Rectangle) -> Rectangle:
+    """A piece of the same size anywhere in an upright room, turned anyhow."""
+    x = room.x + float(rng.uniform(-0.5, 0.5)) * max(room.length - 1.2, 0.0)
+    y = room.y + float(rng.uniform(-0.5, 0.5)) * max(room.width - 1.2, 0.0)
+    return replace(piece, x=x, y=y, heading=float(rng.uniform(0.0, math.pi)))
+
+
+def overlap(piece: Rectangle, others: Iterable[Rectangle]) -> bool:
+    """Whether a piece covers any of several rectangles in part."""
+    box = _box(piece)
+    near = (_box(other) for other in others if _near(piece, other))
+    return any(cv2.rotatedRectangleIntersection(box, other)[0] != cv2.INTERSECT_NONE for other in near)
+
+
+def _components(grid: Grid, radius: float) -> tuple[int, NDArray[np.int32]]:
+    """How many regions a disc of a radius has, and (rows, columns) which one each cell is in; 0 is none."""
+    count, labels = cv2.connectedComponents((grid.clearances >= radius).astype(np.uint8), connectivity=4)
+    return count - 1, np.asarray(labels, np.int32)
+
+
+def _labels(labels: NDArray[np.int32], cells: NDArray[np.bool_]) -> set[int]:
+    return set(np.unique(labels[cells]).tolist()) - {0}
+
+
+def _near(a: Rectangle, b: Rectangle) -> bool:
+    """Whether the circles around two rectangles meet."""
+    reach = math.hypot(a.length, a.width) / 2 + math.hypot(b.length, b.width) / 2
+    return math.hypot(a.x - b.x, a.y - b.y) <= reach
+
+
+def _box(piece: Rectangle) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """OpenCV's form of a rectangle."""
+    return (piece.x, piece.y), (piece.length, piece.width), math.degrees(piece.heading)

@@ -1,0 +1,329 @@
+"""Builds a world from its design: blocks, panels, textures in the light of lamps."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import InvalidValue
+from hybridmap.pose import Array, Pose2
+from sim.floorplan import FloorPlan, Rectangle
+from sim.surface import TEXELS_PER_METRE
+from sim.texture import Painter, Texture
+from sim.world import Block, Panel, Piece, World, block_panels, upright_panel
+from sim.worlds.design import Design, Furniture, Poster, Room, Wall, check_design
+from sim.worlds.light import Lit, Vector
+from sim.worlds.textures import NOTHING, Textures
+
+SEGMENT = 1.3
+"""Walls are papered in pieces at most this wide, m: one filter level fits a whole piece."""
+TILE = 3.0
+"""Floors are laid in pieces at most this long, m."""
+OFF_WALL = 0.004
+"""Posters hang so far in front of their wall, m."""
+NEAR_WALL = 0.5
+"""A poster's place is at most so far from its wall, m."""
+MAX_TEXELS = 2048
+"""Of one texture across and down; larger surfaces are coarser."""
+LAMP_SPACING = 3.2
+"""Lamps hang about this far apart, m."""
+LAMP_DROP = 0.15
+"""And this far below the ceiling, m."""
+DARK = 1.5
+"""Rooms smaller than this have no lamp, m^2: door openings, lit from the rooms that they join."""
+QUANTUM = 2.0**-20
+"""Panels are placed to a millionth of a metre: a world moved by whole metres is then drawn the same to the
+last bit, which is what makes twin rooms twins."""
+
+ROOMS, WALLS, FURNITURE, POSTERS, PAINT, SHARED = range(6)
+"""What textures' seeds are for."""
+
+
+def build_world(design: Design, where: str = "world", folder: Path | None = None) -> World:
+    """Build a world.
+
+    Args:
+        design: of anybody.
+        where: for the error's text, for example the name of the design's file.
+        folder: that names of picture files start from.
+
+    Raises:
+        InvalidValue: something in the design cannot be built.
+    """
+    check_design(design, where)
+    return _Builder(design, where, folder or Path()).world()
+
+
+def plan_of(design: Design) -> FloorPlan:
+    """The floor plan of a design."""
+    return FloorPlan(
+        tuple(_room_rectangle(room) for room in design.rooms),
+        tuple(wall_rectangle(wall) for wall in design.walls),
+        tuple(piece_rectangle(piece) for piece in design.furniture),
+    )
+
+
+def wall_rectangle(wall: Wall) -> Rectangle:
+    """What a wall covers; upright, and exact, if its line is."""
+    (x0, y0), (x1, y1) = wall.start, wall.end
+    half = wall.thickness / 2
+    if y0 == y1:
+        return Rectangle.spanning(min(x0, x1), y0 - half, max(x0, x1), y0 + half)
+    if x0 == x1:
+        return Rectangle.spanning(x0 - half, min(y0, y1), x0 + half, max(y0, y1))
+    length, heading = math.dist(wall.start, wall.end), math.atan2(y1 - y0, x1 - x0)
+    return Rectangle((x0 + x1) / 2, (y0 + y1) / 2, length, wall.thickness, heading)
+
+
+def piece_rectangle(piece: Furniture) -> Rectangle:
+    """What a piece of furniture covers."""
+    return Rectangle(*piece.at, piece.length, piece.width, math.radians(piece.heading_deg), piece.name)
+
+
+def _room_rectangle(room: Room) -> Rectangle:
+    return Rectangle.spanning(*room.low, *room.high, room.name)
+
+
+@dataclass(frozen=True)
+class _Seeds:
+    """Seeds of one item's textures, one after another.
+
+    What an item shows depends on its own number and seed alone, so that moving or adding another item
+    leaves it as it is.
+    """
+
+    start: tuple[int, ...]
+
+    def __iter__(self) -> Iterator[tuple[int, ...]]:
+        return ((*self.start, k) for k in itertools.count())
+
+
+class _Builder:
+    """What one world's parts have in common: rooms with their light, and textures."""
+
+    def __init__(self, design: Design, where: str, folder: Path) -> None:
+        self._design = design
+        self._where = where
+        self._names = Textures(folder, design.seed)
+        self._textures: dict[tuple[object, ...], Texture] = {}
+        self._plan = plan_of(design)
+        self._low = np.array([room.low for room in design.rooms])
+        self._high = np.array([room.high for room in design.rooms])
+        self._lamps = [self._light(room) for room in design.rooms]
+        self._paints = [self._paint(room) for room in design.rooms]
+
+    def world(self) -> World:
+        """All parts, in the order of the design."""
+        design, plan = self._design, self._plan
+        blocks: list[Block] = []
+        panels: list[Panel] = []
+        pieces: list[Piece] = []
+        for number, (wall, base) in enumerate(zip(design.walls, plan.walls, strict=True)):
+            blocks.append(Block(base, 0.0, self._height(wall)))
+            seeds = iter(self._seeds(WALLS, number, wall.seed))
+            panels += self._papered(wall, base, seeds, f"{self._where}: walls[{number}]")
+        for number, (piece, base) in enumerate(zip(design.furniture, plan.furniture, strict=True)):
+            seeds = iter(self._seeds(FURNITURE, number, piece.seed))
+            block = Block(base, 0.0, piece.height)
+            sides = self._sides(piece, block, seeds, f"{self._where}: furniture[{number}]")
+            block_range = range(len(blocks), len(blocks) + 1)
+            pieces.append(Piece(block_range, range(len(panels), len(panels) + len(sides)), piece.movable))
+            blocks.append(block)
+            panels += sides
+        for number, poster in enumerate(design.posters):
+            seeds = iter(self._seeds(POSTERS, number, poster.seed))
+            panels.append(self._hung(poster, seeds, f"{self._where}: posters[{number}]"))
+        for number, room in enumerate(design.rooms):
+            seeds = iter(self._seeds(ROOMS, number, room.seed))
+            panels += self._laid(room, seeds, f"{self._where}: rooms[{number}]")
+        return World(
+            design.name, plan, tuple(blocks), tuple(panels), design.background, tuple(pieces),
+            design.start_rooms, design.look_along,
+        )  # fmt: skip
+
+    def _seeds(self, kind: int, number: int, seed: int | None) -> _Seeds:
+        return _Seeds(
+            (self._design.seed, SHARED, kind, seed) if seed is not None else (self._design.seed, kind, number)
+        )
+
+    def _light(self, room: Room) -> tuple[Vector, ...]:
+        """Lamps that shine into a room, in its frame: its own, or those of the rooms around."""
+        own = _lamps(room, self._design.height)
+        if own:
+            return own
+        touching = (self._low <= np.array(room.high) + 1e-6) & (self._high >= np.array(room.low) - 1e-6)
+        around = [self._design.rooms[k] for k in np.flatnonzero(touching.all(axis=1))]
+        return tuple(
+            (x + other.low[0] - room.low[0], y + other.low[1] - room.low[1], z)
+            for other in around
+            for x, y, z in _lamps(other, self._design.height)
+        )
+
+    def _paint(self, room: Room) -> float:
+        if room.paint is not None:
+            return float(room.paint)
+        number = self._design.rooms.index(room)
+        rng = np.random.default_rng(next(iter(self._seeds(PAINT, number, room.seed))))
+        return float(rng.uniform(150.0, 200.0))
+
+    def _height(self, wall: Wall) -> float:
+        return self._design.height if wall.height is None else wall.height
+
+    def _papered(
+        self, wall: Wall, base: Rectangle, seeds: Iterator[tuple[int, ...]], where: str
+    ) -> list[Panel]:
+        """The four faces of a wall, in pieces."""
+        panels: list[Panel] = []
+        height = self._height(wall)
+        if wall.texture == NOTHING:
+            return panels
+        corners = base.corners
+        for first, second in ((1, 2), (2, 3), (3, 0), (0, 1)):
+            start, end = corners[first], corners[second]
+            pieces = max(1, math.ceil(float(np.linalg.norm(end - start)) / SEGMENT))
+            for k in range(pieces):
+                a, b = start + (end - start) * k / pieces, start + (end - start) * (k + 1) / pieces
+                bare = upright_panel((a[0], a[1]), (b[0], b[1]), 0.0, height, BLANK)
+                panels.append(self._textured(bare, wall.texture, next(seeds), True, where))
+        return panels
+
+    def _sides(
+        self, piece: Furniture, block: Block, seeds: Iterator[tuple[int, ...]], where: str
+    ) -> list[Panel]:
+        """The faces of a piece of furniture that are drawn."""
+        east, west = piece.ends or (piece.texture, piece.texture)
+        names = (east, piece.texture, west, piece.texture, piece.top)
+        bare = block_panels(block, [BLANK] * 4, BLANK)
+        # Every face takes its seed, drawn or not: another texture on one face changes that face alone.
+        faces = zip(bare, names, seeds, strict=False)
+        return [self._textured(p, name, seed, piece.lit, where) for p, name, seed in faces if name != NOTHING]
+
+    def _laid(self, room: Room, seeds: Iterator[tuple[int, ...]], where: str) -> list[Panel]:
+        """A room's floor in tiles, each seen from above: x to the right, y up the picture."""
+        if room.floor == NOTHING:
+            return []
+        size = np.array(room.high) - room.low
+        columns, rows = np.ceil(size / TILE).astype(int).tolist()
+        length, width = size[0] / columns, size[1] / rows
+        left, top = room.low[0], room.high[1]
+        tiles = [
+            Panel(
+                np.array([left + column * length, top - row * width, 0.0]),
+                np.array([length, 0.0, 0.0]),
+                np.array([0.0, -width, 0.0]),
+                BLANK,
+            )
+            for row in range(rows)
+            for column in range(columns)
+        ]
+        return [self._textured(tile, room.floor, next(seeds), True, where) for tile in tiles]
+
+    def _hung(self, poster: Poster, seeds: Iterator[tuple[int, ...]], where: str) -> Panel:
+        """A poster on the face of the wall that is nearest to its place."""
+        at = np.array(poster.at)
+        if poster.texture == NOTHING:
+            raise InvalidValue(f"{where}: a poster needs a texture")
+        nearest, face, number = math.inf, Pose2(), -1
+        for index, base in enumerate(self._plan.walls):
+            frame, reach, gap = _nearest_face(base, at)
+            if gap < nearest:
+                nearest, face, number = gap, frame, index
+                half = reach
+        if number < 0 or not 0.0 < nearest <= NEAR_WALL:
+            raise InvalidValue(f"{where}: at must be in front of a wall, at most {NEAR_WALL} m from it")
+        slide = float(face.inverse().apply(at)[1])
+        if abs(slide) + poster.width / 2 > half + 1e-6:
+            raise InvalidValue(f"{where}: wider than its wall (walls[{number}]) has place there")
+        if poster.bottom + poster.height > self._height(self._design.walls[number]) + 1e-6:
+            raise InvalidValue(f"{where}: higher than its wall (walls[{number}])")
+        ends = face.apply(
+            np.array([[OFF_WALL, slide - poster.width / 2], [OFF_WALL, slide + poster.width / 2]])
+        )
+        bare = upright_panel(
+            (ends[0, 0], ends[0, 1]),
+            (ends[1, 0], ends[1, 1]),
+            poster.bottom,
+            poster.bottom + poster.height,
+            BLANK,
+        )
+        return self._textured(bare, poster.texture, next(seeds), True, where)
+
+    def _textured(self, bare: Panel, name: str, seed: tuple[int, ...], lit: bool, where: str) -> Panel:
+        """A panel in its exact place, with its texture; equal textures are one object."""
+        corner, right, left = (
+            _exact(v) for v in (bare.corner, bare.corner + bare.along, bare.corner + bare.down)
+        )
+        along, down = right - corner, left - corner
+        room = self._facing(corner, along, down)
+        painter = self._names.painter(name, self._paints[room] if room >= 0 else 180.0, where)
+        if lit:
+            low = np.array([*self._low[room], 0.0]) if room >= 0 else np.zeros(3)
+            lamps = self._lamps[room] if room >= 0 else ()
+            painter = Lit(painter, _vector(corner - low), _vector(along), _vector(down), lamps)
+        return Panel(corner, along, down, self._texture(painter, along, down, seed))
+
+    def _texture(self, painter: Painter, along: Array, down: Array, seed: tuple[int, ...]) -> Texture:
+        size = [round(float(np.linalg.norm(side)) * TEXELS_PER_METRE) for side in (along, down)]
+        width, height = (min(max(4, px), MAX_TEXELS) for px in size)
+        key = (painter, width, height, seed)
+        if key not in self._textures:
+            self._textures[key] = Texture(width, height, seed, painter)
+        return self._textures[key]
+
+    def _facing(self, corner: Array, along: Array, down: Array) -> int:
+        """The room that a panel faces, or -1: where one stands 5 cm in front of its middle."""
+        normal = -np.cross(along, down)
+        point = (corner + along / 2 + down / 2 + 0.05 * normal / np.linalg.norm(normal))[:2]
+        inside = ((self._low <= point) & (point <= self._high)).all(axis=1)
+        return int(np.argmax(inside)) if inside.any() else -1
+
+
+BLANK = Texture.plain(0)
+"""On panels that have no texture yet."""
+
+
+def _nearest_face(base: Rectangle, at: NDArray[np.float64]) -> tuple[Pose2, float, float]:
+    """The face of a wall that is nearest to a point in front of it.
+
+    Returns:
+        The frame in the face's middle (x outward, y to the right as seen from outside), half the face's
+        width, and how far the point is from the wall, m; zero inside.
+    """
+    frame = Pose2(base.x, base.y, base.heading)
+    x, y = frame.inverse().apply(at)
+    beyond_x, beyond_y = abs(x) - base.length / 2, abs(y) - base.width / 2
+    gap = math.hypot(max(beyond_x, 0.0), max(beyond_y, 0.0))
+    if beyond_x > beyond_y:
+        heading, reach, half = (0.0 if x > 0 else math.pi), base.length / 2, base.width / 2
+    else:
+        heading, reach, half = math.copysign(math.pi / 2, y), base.width / 2, base.length / 2
+    return frame @ Pose2(heading=heading) @ Pose2(reach), half, gap
+
+
+def _lamps(room: Room, height: float) -> tuple[Vector, ...]:
+    """Where lamps hang, m, in the room."""
+    length, width = room.high[0] - room.low[0], room.high[1] - room.low[1]
+    if length * width < DARK:
+        return ()
+    columns, rows = (max(1, round(side / LAMP_SPACING)) for side in (length, width))
+    return tuple(
+        (length * (column + 0.5) / columns, width * (row + 0.5) / rows, height - LAMP_DROP)
+        for row in range(rows)
+        for column in range(columns)
+    )
+
+
+def _exact(point: Array) -> Array:
+    """A point on the grid of panels' corners."""
+    rounded: Array = np.round(point / QUANTUM) * QUANTUM
+    return rounded
+
+
+def _vector(v: Array) -> Vector:
+    return float(v[0]), float(v[1]), float(v[2])

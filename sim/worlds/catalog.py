@@ -1,0 +1,89 @@
+"""The kinds of world there are, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from hybridmap.errors import InvalidValue
+from sim.world import World
+from sim.worlds.build import build_world
+from sim.worlds.design import MAX_SEED, Design, within
+from sim.worlds.file import load_world
+from sim.worlds.office import OfficeParameters, office
+from wire.tables import build
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How one kind of world is made.
+
+    Attributes:
+        parameters: a frozen dataclass, with defaults that work.
+        design: of (parameters, seed).
+    """
+
+    parameters: type[Any]
+    design: Callable[[Any, int], Design]
+
+
+KINDS: dict[str, Kind] = {
+    "office": Kind(OfficeParameters, office),
+}
+
+
+def make_design(kind: str, seed: int, /, **parameters: Any) -> Design:
+    """Design a world.
+
+    Args:
+        kind: one of `KINDS`.
+        seed: other seeds, other worlds of this kind.
+        parameters: fields of `KINDS[kind].parameters`.
+
+    Raises:
+        InvalidValue: no such kind or seed, or a parameter out of range.
+        SettingsError: no such parameter, or one of another type.
+    """
+    if kind not in KINDS:
+        raise InvalidValue(f"no kind of world {kind!r}; there are {', '.join(KINDS)}")
+    within("a world's seed", seed, 0, MAX_SEED)
+    made = KINDS[kind]
+    return made.design(build(made.parameters, parameters, kind), seed)
+
+
+def make_world(kind: str, seed: int, /, **parameters: Any) -> World:
+    """Build a world: see `make_design`."""
+    return build_world(make_design(kind, seed, **parameters), kind)
+
+
+def world_from_table(table: Mapping[str, Any], seed: int, folder: Path) -> World:
+    """The world that a scenario's `[world]` table asks for.
+
+    Args:
+        table: `kind` (by default office) and its parameters, or `file` alone.
+        seed: of made worlds; a world from a file is the same whatever the seed.
+        folder: that the file's name starts from.
+
+    Raises:
+        MapweaveError: a table, or a file, that makes no world.
+    """
+    rest = dict(table)
+    file, kind = rest.pop("file", None), rest.pop("kind", None)
+    if file is not None:
+        if kind is not None or rest:
+            raise InvalidValue("world: with file, nothing else can be set; edit the file")
+        if not isinstance(file, str):
+            raise InvalidValue(f"world: file must be a name, not {file!r}")
+        return load_world(folder / file)
+    if kind is None:
+        kind = "office"
+    if not isinstance(kind, str):
+        raise InvalidValue(f"world: kind must be a name, not {kind!r}")
+    return make_world(kind, seed, **rest)
+
+
+def parameter_names(kind: str) -> tuple[str, ...]:
+    """Names of a kind's parameters."""
+    return tuple(field.name for field in fields(KINDS[kind].parameters))

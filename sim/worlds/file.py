@@ -1,0 +1,73 @@
+"""Worlds in files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from hybridmap.errors import SettingsError
+from sim.world import World
+from sim.worlds.build import build_world
+from sim.worlds.design import Design, Furniture, Poster, Room, Wall
+from wire.tables import build, read_toml
+
+ITEMS: dict[str, type[Any]] = {"rooms": Room, "walls": Wall, "furniture": Furniture, "posters": Poster}
+"""Lists of a file, and what each of their tables is."""
+
+
+def load_world(path: Path) -> World:
+    """Build the world that a file describes.
+
+    Raises:
+        MapweaveError: the file is missing, is not TOML, or describes nothing that can be built.
+    """
+    return build_world(load_design(path), str(path), path.parent)
+
+
+def load_design(path: Path) -> Design:
+    """Read what a file describes; what is out of range is found when it is built.
+
+    Raises:
+        SettingsError: the file is missing, is not TOML, or has an unknown name or a value of a wrong kind.
+    """
+    table = read_toml(path)
+    for name, cls in ITEMS.items():
+        tables = table.get(name, [])
+        if not isinstance(tables, list) or not all(isinstance(one, dict) for one in tables):
+            raise SettingsError(f"{path}: {name} must be a list of tables: write [[{name}]]")
+        table[name] = tuple(build(cls, one, f"{path}: {name}[{k}]") for k, one in enumerate(tables))
+    return build(Design, table, str(path))
+
+
+def save_design(design: Design, path: Path) -> None:
+    """Write a file that gives the same world again.
+
+    Raises:
+        SettingsError: the file cannot be written.
+    """
+    lines = _lines(design)
+    for name in ITEMS:
+        for item in getattr(design, name):
+            lines += ["", f"[[{name}]]", *_lines(item)]
+    try:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise SettingsError(f"{path}: {error.strerror}") from None
+
+
+def _lines(item: Any) -> list[str]:
+    """Fields that are not as by default, one a line."""
+    return [
+        f"{field.name} = {_toml(value)}"
+        for field in dataclasses.fields(item)
+        if field.name not in ITEMS and (value := getattr(item, field.name)) != field.default
+    ]
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    # Texts that can be printed, numbers that are finite, and flags are the same in JSON and in TOML.
+    return json.dumps(value, ensure_ascii=False)
