@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.node import Edge, EdgeKind, NodeId
+from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan
 
+WIDTH = 12.0
+"""Of a picture, inches."""
 _PARTS = re.compile(r"[0-9]+|[^0-9]+")
 COLOURS = (
     "#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0", "#b8860b", "#555555",
@@ -44,19 +47,21 @@ class Outline:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A drive to draw over a map.
+    """A drive of a robot that was put down somewhere, to draw over a map.
 
     Attributes:
         positions: (N, 2) m.
-        start: where it began.
-        goal: where it shall end.
+        start: where it was put down.
+        goal: where it shall end, if it was sent anywhere.
         label: for the legend.
+        robot: its name, written where it was put down.
     """
 
     positions: Array
     start: Pose2
-    goal: Pose2
+    goal: Pose2 | None
     label: str
+    robot: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,16 +73,20 @@ class MapPicture:
         postures: of each node.
         edges: between nodes; those of kind MERGED are drawn as links between maps.
         outline: floor plan, may be empty.
-        drive: of the lost robot, if there was one.
+        drives: of lost robots.
         landmarks: (N, 2) m, points that nodes see.
+        starts: where each robot began.
+        false: links that are known to be false; they stand out.
     """
 
     title: str
     postures: Mapping[NodeId, Pose2]
     edges: Sequence[Edge]
     outline: Outline = field(default_factory=Outline)
-    drive: Drive | None = None
+    drives: Sequence[Drive] = ()
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    starts: Mapping[str, Pose2] = field(default_factory=dict)
+    false: frozenset[EdgeId] = frozenset()
 
 
 def outline_of(plan: FloorPlan) -> Outline:
@@ -97,28 +106,37 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 8), dpi=110, layout="constrained")
+    figure = Figure(figsize=(WIDTH, _height(picture)), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     _draw_outline(axes, picture.outline)
     if len(picture.landmarks):
         axes.plot(*picture.landmarks.T, ".", color="#999999", markersize=1.2, zorder=1, alpha=0.6)
-    colours = {
-        agent: COLOURS[k % len(COLOURS)]
-        for k, agent in enumerate(sorted({n.agent for n in picture.postures}))
-    }
+    colours = colours_of([*(n.agent for n in picture.postures), *picture.starts])
     _draw_edges(axes, picture, colours)
     _draw_nodes(axes, picture, colours)
-    if picture.drive is not None:
-        _draw_drive(axes, picture.drive)
+    _draw_starts(axes, picture.starts, colours)
+    _draw_drives(axes, picture.drives)
     axes.set_aspect("equal")
+    _draw_scale(axes)
     axes.set_xlabel("x, m")
     axes.set_ylabel("y, m")
     axes.set_title(picture.title)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=6, frameon=False, fontsize=9)
+        # Below the plan, wherever that ends: the layout makes room for what the figure owns.
+        figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="png")
+
+
+def _height(picture: MapPicture) -> float:
+    """Of the figure, inches: as the building needs it, within reason."""
+    shown = [corners for _, corners in picture.outline.rooms] + list(picture.outline.solids)
+    shown.append(np.array([[p.x, p.y] for p in picture.postures.values()]).reshape(-1, 2))
+    points = np.concatenate(shown)
+    width, height = np.ptp(points, axis=0) if len(points) else (1.0, 1.0)
+    legend = 0.25 * math.ceil((len(picture.starts) + 6) / 6)
+    return float(np.clip(0.92 * WIDTH * height / max(width, 1e-6), 4.5, 12.0) + 1.0 + legend)
 
 
 def _draw_outline(axes: Any, outline: Outline) -> None:
@@ -130,20 +148,37 @@ def _draw_outline(axes: Any, outline: Outline) -> None:
         axes.fill(*corners.T, color="#cfc8ba", edgecolor="#a79f8f", linewidth=0.5, zorder=0.4)
 
 
+def _draw_scale(axes: Any) -> None:
+    """A bar of a round length at the lower right, within the picture."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    length = max((m for m in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if m < (right - left) / 6), default=0.1)
+    end, height = right - 0.02 * (right - left), bottom + 0.02 * (top - bottom)
+    # The bar must not make the picture larger.
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    axes.plot([end - length, end], [height, height], "-", color="#222222", linewidth=4, solid_capstyle="butt")
+    axes.annotate(
+        f"{length:g} m", (end - length / 2, height), (0, 4), textcoords="offset points", ha="center",
+        va="bottom", fontsize=9, color="#222222",
+    )  # fmt: skip
+
+
 def _draw_edges(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> None:
     labelled = set()
     for edge in picture.edges:
         if edge.a not in picture.postures or edge.b not in picture.postures:
             continue
         a, b = picture.postures[edge.a], picture.postures[edge.b]
-        between = edge.a.map != edge.b.map
-        loop = edge.kind is EdgeKind.LOOP
-        colour = "#e6007e" if between else "#7a7a7a" if loop else colours[edge.a.agent]
-        label = "link between maps" if between else "loop within a map" if loop else None
+        if edge.id in picture.false:
+            label, colour, width, alpha, order, style = "false link", "#000000", 2.2, 1.0, 4.5, ":"
+        elif edge.a.map != edge.b.map:
+            label, colour, width, alpha, order, style = "link between maps", "#e6007e", 1.6, 0.9, 4.0, "-"
+        elif edge.kind is EdgeKind.LOOP:
+            label, colour, width, alpha, order, style = "loop within a map", "#7a7a7a", 1.0, 0.6, 2.0, "-"
+        else:
+            label, colour, width, alpha, order, style = "", colours[edge.a.agent], 1.0, 0.6, 2.0, "-"
         axes.plot(
-            [a.x, b.x], [a.y, b.y], "-", color=colour, linewidth=1.6 if between else 1.0,
-            alpha=0.9 if between else 0.6, zorder=4 if between else 2,
-            label=None if label in labelled else label,
+            [a.x, b.x], [a.y, b.y], style, color=colour, linewidth=width, alpha=alpha, zorder=order,
+            label=None if label in labelled else label or None,
         )  # fmt: skip
         labelled.add(label)
 
@@ -151,6 +186,8 @@ def _draw_edges(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> N
 def _draw_nodes(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> None:
     for agent, colour in colours.items():
         own = np.array([p.vector for n, p in picture.postures.items() if n.agent == agent])
+        if not len(own):
+            continue
         axes.quiver(
             own[:, 0], own[:, 1], np.cos(own[:, 2]), np.sin(own[:, 2]), color=colour,
             angles=np.degrees(own[:, 2]), scale=42, width=0.0022, headwidth=4, zorder=3,
@@ -159,9 +196,28 @@ def _draw_nodes(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> N
         axes.plot(own[:, 0], own[:, 1], "o", color=colour, markersize=4, zorder=3, label=label)
 
 
-def _draw_drive(axes: Any, drive: Drive) -> None:
-    axes.plot(*drive.positions.T, "--", color="black", linewidth=1.8, zorder=5, label=drive.label)
-    for pose, mark, label in ((drive.start, "X", "put down here"), (drive.goal, "*", "goal")):
+def _draw_starts(axes: Any, starts: Mapping[str, Pose2], colours: Mapping[str, str]) -> None:
+    for k, (robot, pose) in enumerate(starts.items()):
         axes.plot(
-            pose.x, pose.y, mark, color="black", markersize=14, markerfacecolor="gold", zorder=6, label=label
-        )
+            pose.x, pose.y, "s", color=colours[robot], markersize=9, markeredgecolor="white", zorder=5,
+            label="start" if k == 0 else None,
+        )  # fmt: skip
+
+
+def _draw_drives(axes: Any, drives: Sequence[Drive]) -> None:
+    labelled = set()
+    for drive in drives:
+        axes.plot(*drive.positions.T, "--", color="black", linewidth=1.8, zorder=5, label=drive.label)
+        for pose, mark, label in ((drive.start, "X", "put down here"), (drive.goal, "*", "goal")):
+            if pose is None:
+                continue
+            axes.plot(
+                pose.x, pose.y, mark, color="black", markersize=14, markerfacecolor="gold", zorder=6,
+                label=None if label in labelled else label,
+            )  # fmt: skip
+            labelled.add(label)
+        if drive.robot:
+            axes.annotate(
+                drive.robot, (drive.start.x, drive.start.y), (9, 6), textcoords="offset points", fontsize=10,
+                fontweight="bold", zorder=7,
+            )  # fmt: skip

@@ -279,7 +279,11 @@ class Demo:
             f"{score.links} links ({score.false_links} false), ATE {score.ate:.3f} m"
         )
         picture = MapPicture(
-            title, places, list(whole.edges.values()), outline_of(self._control.plan()), drive
+            title,
+            places,
+            list(whole.edges.values()),
+            outline_of(self._control.plan()),
+            [drive] if drive else [],
         )
         draw_map(picture, self._options.out / "map.png")
 

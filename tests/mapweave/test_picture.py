@@ -73,7 +73,7 @@ def test_the_floor_the_landmarks_and_the_drive_are_drawn(tmp_path):
     drive = Drive(np.array([[1.0, 0.0], [2.0, 2.0], [4.0, 1.0]]), Pose2(1, 0), Pose2(4, 1), "drive of r0")
     landmarks = np.random.default_rng(0).uniform([0, -1], [6, 3], (500, 2))
     bare = drawn(tmp_path, MapPicture("a map", NODES, EDGES))
-    full = drawn(tmp_path, MapPicture("a map", NODES, EDGES, outline, drive, landmarks))
+    full = drawn(tmp_path, MapPicture("a map", NODES, EDGES, outline, [drive], landmarks))
     for colour, least in (("#f6f3ec", 0.1), ("#cfc8ba", 0.01), ("#ffd700", 1e-4)):
         assert share_of(full, colour) > least > share_of(bare, colour)
 
