@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
+from hybridmap.pose import Array
 
 Distortion = tuple[float, float, float, float, float]
 """(k1, k2, p1, p2, k3), OpenCV's order."""
@@ -23,7 +26,7 @@ class Exposure:
     """How brightness becomes grey levels.
 
     The automatic works as in small cameras: while the picture's mean is within a band around the wanted grey
-    it does nothing, outside it moves the gain towards the wanted grey with a lag. Values saturate at 0 and 255.
+    it does nothing, outside it moves the gain towards the wanted grey with a lag. Values saturate.
 
     Attributes:
         automatic: whether the gain follows the light at all.
@@ -123,7 +126,7 @@ class CameraSetup:
         return bool((np.diff(grown) > 0).all())
 
 
-def undistorted(pixels: np.ndarray, matrix: np.ndarray, lens: np.ndarray) -> np.ndarray:
+def undistorted(pixels: NDArray[Any], matrix: NDArray[Any], lens: NDArray[Any]) -> Array:
     """(N, 2) tangents of the rays that (N, 1, 2) px of the real image show.
 
     OpenCV's fixed-point iteration diverges at the border of a wide lens, so Newton's method does it, on
@@ -132,7 +135,7 @@ def undistorted(pixels: np.ndarray, matrix: np.ndarray, lens: np.ndarray) -> np.
     focal, centre = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
     wanted = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - centre) / focal
     k1, k2, p1, p2, k3 = (float(k) for k in lens)
-    rays = wanted.copy()
+    rays: Array = wanted.copy()
     for _ in range(30):
         x, y = rays.T
         r2 = x * x + y * y

@@ -8,7 +8,6 @@ as long: docs/decisions/renderer.md.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +18,7 @@ from hybridmap.camera import Camera
 from hybridmap.pose import Array
 from sim.scene import Scene, cross
 from sim.texture import Image, Texture
+from sim.warp import warped
 from sim.world import PanelSet
 
 NEAR = 0.03
@@ -101,9 +101,9 @@ class Renderer:
         optical_centre = position + rotation @ self._robot_from_camera
         # First by the balls around them: most panels of a building are behind or beside the camera.
         middles = (scene.middle - optical_centre) @ camera_from_world.T
-        inside = (middles @ self._borders.T > -scene.radius[:, None]).all(axis=1)
-        inside &= middles[:, 2] > NEAR - scene.radius
-        inside &= middles[:, 2] < FAR + scene.radius
+        distances, ahead = middles @ self._borders.T, middles[:, 2]
+        inside = (distances > -scene.radius[:, None]).all(axis=1)
+        inside &= (ahead > NEAR - scene.radius) & (ahead < FAR + scene.radius)
         index = np.flatnonzero(inside)
         corner, normal = scene.corner[index] - optical_centre, scene.normal[index]
         offsets = np.einsum("ij,ij->i", normal, corner)
@@ -115,8 +115,8 @@ class Renderer:
         rows = np.stack([cross(down, corner), cross(corner, along), normal], axis=1)
         forms = rows @ (camera_from_world.T @ self._from_pixels) / offsets[:, None, None]
         ends = np.stack([corner, corner + along, corner + down, corner + along + down], axis=1)
-        seen = ends @ (self._intrinsics @ camera_from_world).T
-        x, y, z = seen[..., 0], seen[..., 1], seen[..., 2]
+        shown = ends @ (self._intrinsics @ camera_from_world).T
+        x, y, z = shown[..., 0], shown[..., 1], shown[..., 2]
         cut = (z < NEAR).any(axis=1) | (z > FAR).any(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = x / z, y / z
@@ -127,13 +127,12 @@ class Renderer:
         by_plane = (forms[:, 2] @ self._image_corners).max(axis=1)
         with np.errstate(divide="ignore"):
             by_corners = np.where(cut, np.inf, 1.0 / z.min(axis=1))
-        nearest = np.minimum(np.minimum(by_plane, by_corners) * (1 + 1e-6), 1.0 / NEAR)
+        nearest: Array = np.minimum(np.minimum(by_plane, by_corners) * (1 + 1e-6), 1.0 / NEAR)
         left, top = np.where(cut, 0.0, np.maximum(left, 0.0)), np.where(cut, 0.0, np.maximum(top, 0.0))
         right = np.where(cut, width - 1.0, np.minimum(right, width - 1.0))
         low = np.where(cut, height - 1.0, np.minimum(low, height - 1.0))
-        visible = np.flatnonzero(
-            (left <= right) & (top <= low) & (z > NEAR).any(axis=1) & (nearest > 1 / FAR)
-        )
+        seen = (left <= right) & (top <= low) & (z > NEAR).any(axis=1) & (nearest > 1 / FAR)
+        visible = np.flatnonzero(seen)
         order = visible[np.argsort(-nearest[visible], kind="stable")]
         bounds = np.stack([top, low + 1, left, right + 1], axis=1)[order].astype(int).tolist()
         windows = [(slice(b[0], b[1]), slice(b[2], b[3])) for b in bounds]
@@ -154,9 +153,7 @@ class Renderer:
         left = np.where(filled, low, np.inf).min(axis=1)
         right = np.where(filled, high, -np.inf).max(axis=1)
         # Where a panel fills its window no pixel has to be asked whether it is inside.
-        square = (np.where(filled, low == left[:, None], True) & (~filled | (high == right[:, None]))).all(
-            axis=1
-        )
+        square = (~filled | ((low == left[:, None]) & (high == right[:, None]))).all(axis=1)
         indices = candidates.index[chosen].tolist()
         drawn = []
         for k in np.flatnonzero(rows).tolist():
@@ -223,49 +220,8 @@ class Renderer:
             centre_v = top + height // 2
         left, top, centre_v = left + columns.start, top + rows.start, centre_v + rows.start
         centre_u = left + (int(row[0]) + int(row[-1])) / 2
-        patch = _warped(texture, drawn.forms, (centre_u, centre_v), (left, top, width, height))
+        patch = warped(texture, drawn.forms, (centre_u, centre_v), (left, top, width, height))
         cv2.copyTo(patch, mask, image[top : top + height, left : left + width])
-
-
-def _warped(
-    texture: Texture, forms: Array, centre: tuple[float, float], box: tuple[int, int, int, int]
-) -> Image:
-    """A texture as it is seen in a part of the image, filtered for its size there.
-
-    Args:
-        texture: of the panel.
-        forms: (3, 3) rows p / z, q / z, 1 / z as linear forms of (u, v, 1).
-        centre: (u, v) px, where its size is taken.
-        box: left, top, width and height of the part, px.
-    """
-    (pu, pv, p1), (qu, qv, q1), (wu, wv, w1) = forms.tolist()
-    u, v = centre
-    w = wu * u + wv * v + w1
-    p, q = (pu * u + pv * v + p1) / w, (qu * u + qv * v + q1) / w
-    across = math.hypot(pu - p * wu, pv - p * wv) / abs(w) * texture.width_px
-    down = math.hypot(qu - q * wu, qv - q * wv) / abs(w) * texture.height_px
-    source = texture.level(_halvings(across, texture.width_px), _halvings(down, texture.height_px))
-    left, top, width, height = box
-    p1, q1, w1 = p1 + pu * left + pv * top, q1 + qu * left + qv * top, w1 + wu * left + wv * top
-    high, wide = source.shape
-    # Pixel centres are whole numbers, OpenCV's convention: half a texel less.
-    to_texture = np.array(
-        [
-            [wide * pu - 0.5 * wu, wide * pv - 0.5 * wv, wide * p1 - 0.5 * w1],
-            [high * qu - 0.5 * wu, high * qv - 0.5 * wv, high * q1 - 0.5 * w1],
-            [wu, wv, w1],
-        ]
-    )
-    return np.asarray(
-        cv2.warpPerspective(
-            source,
-            to_texture,
-            (width, height),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        ),
-        dtype=np.uint8,
-    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -304,9 +260,3 @@ class _Drawn:
     window: tuple[slice, slice]
     nearest: float
     edges: tuple[NDArray[np.float32], NDArray[np.float32]] | None
-
-
-def _halvings(texels_per_pixel: float, size_px: int) -> int:
-    """How often to halve a texture so that about one texel falls on one pixel."""
-    wanted = round(math.log2(max(texels_per_pixel, 1.0)))
-    return min(wanted, size_px.bit_length() - 1)

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from agent.observation import Command, Observation, RobotDescription
 from hybridmap.pose import Array, Pose2
+from sim.events import SimEvent
 from sim.floorplan import FloorPlan
+from sim.snapshot import Snapshot
 
 
 class World(Protocol):
@@ -60,6 +62,14 @@ class Simulated(Protocol):
 
     def observe(self, name: str) -> Observation:
         """What a robot senses now, with its odometry since it was asked before."""
+        ...
+
+    def apply(self, event: SimEvent, /) -> str:
+        """Let something happen between two ticks; one line for people."""
+        ...
+
+    def snapshot(self) -> Snapshot:
+        """What there is to see now from above, and the robots' last pictures."""
         ...
 
     def kidnap(self, name: str, world_from_robot: Pose2, /) -> None:
