@@ -1,0 +1,61 @@
+"""How far each robot's belief was from the truth, over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from hybridmap.node import MapId
+from mapweave.picture import colours_of
+from mapweave.trial.recording import Lost, Moment
+from mapweave.trial.trajectories import TrajectoryScore
+
+MOST_MOMENTS = 40
+"""More are not numbered: the numbers could not be read."""
+DASHES = ("-", "--", ":", "-.")
+"""Of a robot's first map, second ..."""
+
+
+def draw_errors(
+    scores: Mapping[MapId, TrajectoryScore], moments: Sequence[Moment], lost: Sequence[Lost], path: Path
+) -> None:
+    """Write a PNG: position error after the alignment of each map, with what happened meanwhile.
+
+    Args:
+        scores: of each map's trajectory.
+        moments: numbered as in the report.
+        lost: robots that were carried away.
+        path: where.
+    """
+    # Only who draws pays for matplotlib.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4.5), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    colours = colours_of(m.agent for m in scores)
+    for k, moment in enumerate(moments):
+        axes.axvline(moment.stamp_ns / 1e9, color="#cccccc", linewidth=0.8, zorder=1)
+        if len(moments) <= MOST_MOMENTS:
+            axes.annotate(
+                str(k + 1), (moment.stamp_ns / 1e9, 1.0), (0, 2), xycoords=("data", "axes fraction"),
+                textcoords="offset points", ha="center", fontsize=7, color="#888888",
+            )  # fmt: skip
+    for k, one in enumerate(lost):
+        label = "carried away" if k == 0 else None
+        axes.axvline(one.stamp_ns / 1e9, color="#c0392b", linewidth=1.2, linestyle=":", zorder=2, label=label)
+    epochs: dict[str, int] = {}
+    for map_id, score in sorted(scores.items()):
+        number = epochs[map_id.agent] = epochs.get(map_id.agent, -1) + 1
+        axes.plot(
+            score.stamps_ns / 1e9, score.errors, DASHES[number % len(DASHES)], color=colours[map_id.agent],
+            linewidth=1.3, label=f"{map_id}: {score.ate_m:.3f} m", zorder=3,
+        )  # fmt: skip
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("simulated time, s")
+    axes.set_ylabel("position error, m")
+    axes.grid(axis="y", color="#eeeeee")
+    if axes.get_legend_handles_labels()[0]:
+        figure.legend(loc="outside right upper", frameon=False, fontsize=9, title="map: ATE")
+    figure.savefig(path, format="png")
