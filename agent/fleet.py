@@ -16,7 +16,6 @@ from hybridmap.pose import Pose2
 from wire.bus import Bus, Request
 from wire.keys import Keys
 from wire.log_messages import Scalar, decode_record, encode_record
-from wire.metered import MeteredBus
 from wire.messages import (
     RouteRequest,
     decode_relocalize_answer,
@@ -24,6 +23,7 @@ from wire.messages import (
     encode_route_request,
     encode_view,
 )
+from wire.metered import MeteredBus
 
 NO_ANSWER = "no map server answered"
 
@@ -139,8 +139,14 @@ def decode_report(payload: bytes) -> AgentReport:
             node_from_robot=_posture(values, "fix_x", "fix_y", "fix_heading"),
             legs=_typed(values, "legs", int),
         )
-        numbers = (_typed(values, name, int) for name in ("stamp_ns", "epoch", "unsent", "traffic"))
-        return AgentReport(status, *numbers, linked=_typed(values, "linked", bool))
+        return AgentReport(
+            status=status,
+            stamp_ns=_typed(values, "stamp_ns", int),
+            epoch=_typed(values, "epoch", int),
+            unsent=_typed(values, "unsent", int),
+            traffic=_typed(values, "traffic", int),
+            linked=_typed(values, "linked", bool),
+        )
     except (KeyError, ValueError, InvalidValue) as error:
         raise InvalidMessage(f"agent status: {error}") from None
 

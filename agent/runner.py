@@ -74,7 +74,7 @@ class Runner:
         return bool(self._questions)
 
     def exchange(self) -> None:
-        """Ask what the last tick wanted to know. A robot does not wait for the answers; in lock-step it does."""
+        """Ask what the last tick wanted to know. A robot waits for no answer, but in lock-step."""
         for question in self._questions:
             self._fleet.ask(question)
         self._questions = ()

@@ -145,7 +145,7 @@ class Agent:
         return self.replicator.map_id
 
     def begin_anew(self) -> None:
-        """Leave a map on which the robot cannot find itself, and go on with the same mission in a fresh one."""
+        """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
         mission, old = self.pipeline.mission, self.map_id
         self._leave()
         self._begin()

@@ -27,7 +27,7 @@ class Robot(Protocol):
         ...
 
     def rendezvous(self) -> None:
-        """Simulation in lock-step: wait until all robots have finished this tick. Others have nothing to do."""
+        """In lock-step simulation: wait until all robots have finished this tick; elsewhere: nothing."""
         ...
 
     def close(self) -> None:

@@ -47,7 +47,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
     from agent.drivers.remote import RemoteRobot
-    from agent.mission import Carried, Explore, Idle
+    from agent.mission import Carried, Explore, Idle, Mission
     from mapweave.agent_process import AgentOptions, run_agent
 
     name = check_name(arguments.name)
@@ -62,12 +62,13 @@ def run(arguments: argparse.Namespace) -> int:
         robot = RemoteRobot(body, network.fleet, name)
         # Who is told to stop while it waits for its body stops waiting.
         threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
+        missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
         options = AgentOptions(
             name=name,
             data=arguments.data,
             epoch=arguments.epoch,
             fresh=arguments.fresh,
-            mission={"explore": Explore, "carried": Carried, "idle": Idle}[arguments.mission](),
+            mission=missions[arguments.mission],
             seed=arguments.seed,
             lockstep=arguments.lockstep,
             server=network.server,

@@ -32,8 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     from mapweave.demo.options import DemoOptions
+    from mapweave.demo.report import summary_table
     from mapweave.demo.run import run_demo
-    from mapweave.demo.show import summary_table
 
     options = DemoOptions(
         seed=arguments.seed,
@@ -49,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         console = Console()
         console.print(summary_table(report))
         console.print(
-            f"in {arguments.out}: map.png, report.json, merged.mapweave, and a map file of each robot"
+            f"in {arguments.out}: map.png, film.webm, report.md, report.json, merged.mapweave, "
+            "and a map file of each robot"
         )
     return 0 if report.goal.reached else 2

@@ -46,9 +46,9 @@ def _add_run(kinds: Any) -> None:
     parser = kinds.add_parser(
         "run",
         help="try a scenario",
-        description="Run a scenario with server, simulator and an agent for each robot; leave a report folder "
-        "with figures, trajectories (TUM), map, picture and film. Exit status 0: all expectations were met; "
-        "2: not; 1: it could not be run.",
+        description="Run a scenario with server, simulator and an agent for each robot; leave a report "
+        "folder with figures, trajectories (TUM), map, picture and film. Exit status 0: all expectations "
+        "were met; 2: not; 1: it could not be run.",
     )
     _add_scenario(parser)
     parser.add_argument("--seed", type=int, help="other seeds, other worlds (default: the scenario's)")
@@ -66,8 +66,8 @@ def _add_batch(kinds: Any) -> None:
     parser = kinds.add_parser(
         "batch",
         help="try a scenario with many seeds",
-        description="Run a scenario once a seed and show the median and the worst of every figure. Exit status "
-        "0: every trial met its expectations; 2: not; 1: the scenario could not be read.",
+        description="Run a scenario once a seed and show the median and the worst of every figure. Exit "
+        "status 0: every trial met its expectations; 2: not; 1: the scenario could not be read.",
     )
     _add_scenario(parser)
     parser.add_argument("--seeds", type=int, default=10, metavar="N", help="how many (default: 10)")
@@ -82,8 +82,8 @@ def _add_serve(kinds: Any) -> None:
     parser = kinds.add_parser(
         "serve",
         help="simulated bodies for agents that you start yourself",
-        description="Serve the robots of a scenario, in lock-step: time advances when every agent has sent its "
-        "command. The scenario's events do not happen by themselves.",
+        description="Serve the robots of a scenario, in lock-step: time advances when every agent has sent "
+        "its command. The scenario's events do not happen by themselves.",
     )
     _add_scenario(parser)
     parser.add_argument("--seed", type=int, help="of world, start places and faults")

@@ -17,10 +17,7 @@ class DemoOptions:
         robots: how many map; the first is kidnapped.
         rooms: along the corridor.
         out: folder for everything that is made; earlier demos in it are replaced.
-        least_explore: simulated seconds that every robot explores at least.
-        most_explore: and at most, if the maps do not join before.
-        settle: simulated seconds that the maps grow after they have joined, so that rooms are known well.
-        most_drive: simulated seconds that the lost robot may take.
+        film_every: simulated seconds between two frames of the film; 0 makes none.
         quiet: no progress on the terminal.
     """
 
@@ -28,10 +25,7 @@ class DemoOptions:
     robots: int = 3
     rooms: int = 3
     out: Path = Path("out/demo")
-    least_explore: float = 180.0
-    most_explore: float = 480.0
-    settle: float = 30.0
-    most_drive: float = 240.0
+    film_every: float = 1.0
     quiet: bool = False
 
     def __post_init__(self) -> None:

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from rich.table import Table
+
+from mapweave.trial.run import Trial
+
 
 @dataclass
 class Relocalization:
@@ -70,6 +74,46 @@ class Report:
     sim_s: float = 0.0
     real_time_factor: float = 0.0
 
+    @staticmethod
+    def of(trial: Trial) -> Report:
+        """Of a trial of the scenario `demo`."""
+        recording, figures = trial.recording, trial.figures
+        report = Report(
+            seed=recording.seed,
+            agents=list(recording.robots),
+            nodes={name: robot.nodes for name, robot in figures.robots.items()},
+            bytes_per_node=round(figures.bytes_per_node or 0.0, 1),
+            components=figures.components,
+            links=figures.links,
+            false_links=figures.false_links,
+            merged_ate_m=_rounded(figures.merged_ate_m, 4),
+            collisions=figures.collisions,
+            notes=[moment.text for moment in recording.moments if moment.trouble],
+            wall_s=round(recording.wall["whole"], 2),
+            sim_s=round(recording.sim_s, 1),
+        )
+        report.real_time_factor = round(report.sim_s / report.wall_s, 3)
+        if recording.lost:
+            lost = recording.lost[-1]
+            report.lost_robot, report.put_down_in = lost.robot, lost.room
+            report.relocalization = Relocalization(
+                found=lost.fix is not None,
+                error_m=_rounded(figures.found_error_m, 4),
+                error_deg=_rounded(figures.found_error_deg, 3),
+                seconds=_rounded(figures.found_s, 1),
+                node="" if lost.fix is None else str(lost.fix.node),
+            )
+            report.goal = Goal(
+                reached=bool(figures.reached),
+                error_m=_rounded(figures.goal_error_m, 4),
+                error_deg=_rounded(figures.goal_error_deg, 3),
+                mapped_by="" if lost.goal is None else lost.goal.agent,
+                edges=max(lost.legs - 1, 0),
+                node="" if lost.goal is None else str(lost.goal),
+                seconds=_rounded(figures.goal_s, 1),
+            )
+        return report
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return asdict(self)
@@ -99,6 +143,10 @@ class Report:
         return lines + [("note", note) for note in self.notes]
 
 
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
+
+
 def _metres(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3f} m"
 
@@ -107,3 +155,13 @@ def _outcome(good: bool, metres: float | None, degrees: float | None, seconds: f
     if metres is None or degrees is None or seconds is None:
         return "no"
     return f"{'yes' if good else 'no'}, {metres:.3f} m and {degrees:.2f} deg off after {seconds:.0f} s"
+
+
+def summary_table(report: Report) -> Table:
+    """The figures of a demo for people."""
+    table = Table(title="Three maps, one map, one lost robot found", show_header=False)
+    table.add_column(justify="right", style="bold")
+    table.add_column()
+    for name, text in report.lines():
+        table.add_row(name, text)
+    return table

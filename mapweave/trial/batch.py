@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
@@ -37,7 +37,7 @@ class BatchOptions:
     seeds: int
     out: Path
     processes: bool = True
-    settings: PipelineSettings = PipelineSettings()
+    settings: PipelineSettings = field(default_factory=PipelineSettings)
     settings_file: Path | None = None
     film: bool = False
     json: bool = False

@@ -1,5 +1,6 @@
 """Runs a scenario on a fleet, event by event. Time stands still while it looks or acts: so nothing that it
-decides depends on how quick the machine is."""
+decides depends on how quick the machine is.
+"""
 
 from __future__ import annotations
 
@@ -90,9 +91,9 @@ class Conductor:
             self.done += 1
             self._on_look(self)
 
-    def note(self, text: str) -> None:
+    def note(self, text: str, trouble: bool = False) -> None:
         """Remember that something happened now."""
-        self.moments.append(Moment(round(self.now * 1e9), text))
+        self.moments.append(Moment(round(self.now * 1e9), text, trouble))
 
     # Waiting
 
@@ -109,7 +110,7 @@ class Conductor:
                 return
             if self.now >= end - 1e-6:
                 if when.after:
-                    self.note(f"{CONDITIONS[when.after]}: not within {when.within:.0f} s")
+                    self.note(f"{CONDITIONS[when.after]}: not within {when.within:.0f} s", True)
                 return
             look = self.now + (LOOK_EVERY[when.after] if when.after and since is None else STRIDE)
             self._advance(min(due, end, look))
@@ -213,7 +214,7 @@ class Conductor:
         end = began + RECOVERY_PATIENCE
         while not self._all_well():
             if time.monotonic() > end:
-                self.note(f"not all was well again after {RECOVERY_PATIENCE:.0f} s")
+                self.note(f"not all was well again after {RECOVERY_PATIENCE:.0f} s", True)
                 return
             time.sleep(0.02)
         self.recoveries_s.append(time.monotonic() - began)
@@ -266,7 +267,7 @@ class Conductor:
                 self._stage.seed,
             )
         except NothingToShow as reason:
-            self.note(f"nobody is kidnapped: {reason}")
+            self.note(f"nobody is kidnapped: {reason}", True)
             self._plot = None
             return
         self._fleet.control.kidnap(plot.robot, plot.world_from_robot)
@@ -283,7 +284,7 @@ class Conductor:
         lost = next((one for one in reversed(self.lost) if robot in ("", one.robot)), None)
         if lost is None:
             if not robot:
-                self.note("nobody is sent: no robot was lost")
+                self.note("nobody is sent: no robot was lost", True)
                 return
             # A robot that nobody carried away is sent from where it knows itself to be.
             self._mark_lost(robot)
@@ -291,7 +292,7 @@ class Conductor:
         try:
             node = self._goal(lost, goal)
         except NothingToShow as reason:
-            self.note(f"{lost.robot} is not sent: {reason}")
+            self.note(f"{lost.robot} is not sent: {reason}", True)
             return
         lost.goal, self._sent = node, lost
         self._command(lost.robot, GoTo(node))

@@ -57,17 +57,22 @@ class Stage:
 
 
 class Fleet(Protocol):
-    """Server, simulator and agents, in lock-step. Time passes only in `advance`.
+    """Server, simulator and agents, in lock-step. Time passes only in `advance`."""
 
-    Attributes:
-        bus: the conductor's own connection to the fleet's network.
-        keys: of the fleet.
-        control: truth and intervention.
-    """
+    @property
+    def bus(self) -> Bus:
+        """The conductor's own connection to the fleet's network."""
+        ...
 
-    bus: Bus
-    keys: Keys
-    control: SimControl
+    @property
+    def keys(self) -> Keys:
+        """Of the fleet."""
+        ...
+
+    @property
+    def control(self) -> SimControl:
+        """Truth and intervention."""
+        ...
 
     def start(self) -> None:
         """Start everything; returns when every robot is there."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from hybridmap.errors import MapweaveError
+from hybridmap.errors import MapweaveError, NotConnected
 from mapweave.trial.cable import Cable
 from mapweave.trial.children import Children, free_port
 from mapweave.trial.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
@@ -51,7 +51,7 @@ class ProcessFleet:
             ["sim", "serve", str(scenario.path), "--seed", str(stage.seed), *overrides,
              "--listen", _endpoint(self._body_port), "--fleet", FLEET],
         )  # fmt: skip
-        self._until(self._sim_bus.connected, "the simulator does not come up")
+        self._until(self._simulating, "the simulator does not come up")
         for robot in stage.robots:
             self._start_agent(robot)
         self._until(lambda: self._active() == set(stage.robots), "an agent does not come up")
@@ -64,7 +64,9 @@ class ProcessFleet:
     def kill_agent(self, robot: str) -> None:
         """SIGKILL."""
         self._children.kill(robot)
-        self._until(lambda: robot not in self._active(), f"the simulator does not notice that {robot} is gone")
+        self._until(
+            lambda: robot not in self._active(), f"the simulator does not notice that {robot} is gone"
+        )
 
     def start_agent(self, robot: str) -> None:
         """Start it anew; returns when it has asked for a step."""
@@ -123,6 +125,12 @@ class ProcessFleet:
     def wall(self) -> dict[str, float]:
         """What the simulator has measured."""
         return dict(self.control.status().wall)
+
+    def _simulating(self) -> bool:
+        try:
+            return self._sim_bus.connected() and self.control.status().tick == 0
+        except NotConnected:
+            return False  # its world is not built yet
 
     def _active(self) -> set[str]:
         return {name for name, robot in self.control.status().robots.items() if robot.active}

@@ -100,10 +100,12 @@ class Moment:
     Attributes:
         stamp_ns: when, simulated.
         text: one line.
+        trouble: whether the scenario did not go as it was meant to.
     """
 
     stamp_ns: int
     text: str
+    trouble: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,8 +29,6 @@ class ServerReport:
         maps: that have come.
         components: of the merged map.
         links: between maps.
-        payload_bytes: received for changes.
-        node_puts: nodes received.
         summary: in words.
     """
 
@@ -38,8 +36,6 @@ class ServerReport:
     maps: int = 0
     components: int = 0
     links: int = 0
-    payload_bytes: int = 0
-    node_puts: int = 0
     summary: str = "nothing yet"
 
     @staticmethod
@@ -47,8 +43,13 @@ class ServerReport:
         """Read a server's status; raises InvalidMessage."""
         values = decode_record(payload)
         try:
-            numbers = (int(values[name]) for name in ("nodes", "maps", "components", "links", "bytes", "node_puts"))
-            return ServerReport(*numbers, str(values["summary"]))
+            return ServerReport(
+                nodes=int(values["nodes"]),
+                maps=int(values["maps"]),
+                components=int(values["components"]),
+                links=int(values["links"]),
+                summary=str(values["summary"]),
+            )
         except (KeyError, ValueError) as error:
             raise InvalidMessage(f"server status: {error}") from None
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from mapweave.trial.conductor import Conductor
 from mapweave.trial.disks import read_disks
 from mapweave.trial.expectations import Verdict, check
 from mapweave.trial.figures import Figures
+from mapweave.trial.filming import FilmingOptions, filming
 from mapweave.trial.fleet import Fleet, Stage
 from mapweave.trial.recording import Recording, RobotRecord, Trajectory
 from mapweave.trial.scenario import Scenario
@@ -44,7 +44,7 @@ class TrialOptions:
     seed: int
     out: Path
     processes: bool = True
-    settings: PipelineSettings = PipelineSettings()
+    settings: PipelineSettings = field(default_factory=PipelineSettings)
     settings_file: Path | None = None
     film_every: float = 1.0
     view: int | None = None
@@ -102,7 +102,8 @@ def _record(stage: Stage, options: TrialOptions, show: Show) -> Recording:
         show.stage("starting server, simulator and agents")
         fleet.start()
         started = time.monotonic()
-        camera = stack.enter_context(_filming(stage, options, fleet))
+        wanted = FilmingOptions(options.film_every or 1.0, bool(options.film_every), options.view, show.say)
+        camera = stack.enter_context(filming(stage, wanted, fleet, options.out))
 
         def look(conductor: Conductor) -> None:
             show.look(conductor)
@@ -158,38 +159,6 @@ def _fleet(stage: Stage, processes: bool) -> Fleet:
     return LocalFleet(stage)
 
 
-@contextmanager
-def _filming(stage: Stage, options: TrialOptions, fleet: Fleet) -> Iterator[Callable[[Conductor], None]]:
-    """Film and live view: whatever was asked for gets a frame whenever time stands still."""
-    if not options.film_every and options.view is None:
-        yield lambda conductor: None
-        return
-    from mapweave.trial.film import Film
-    from mapweave.trial.live import Live
-
-    with ExitStack() as stack:
-        plan = fleet.control.plan()
-        film = stack.enter_context(Film(options.out / "film.webm", plan, stage.robots))
-        live = None if options.view is None else stack.enter_context(Live(options.view, stage.scenario.name))
-        due = 0.0
-
-        def frame(conductor: Conductor) -> None:
-            nonlocal due
-            if conductor.now < due - 1e-6:
-                return
-            due = conductor.now + (options.film_every or 1.0)
-            said = {robot: _said(report.status.doing) for robot, report in conductor.agents.items()}
-            drawn = film.add(fleet.control.snapshot(), (), said)
-            if live is not None:
-                live.show(drawn)
-
-        yield frame
-
-
-def _said(doing: str) -> str:
-    return doing[:40]
-
-
 def _make_room(out: Path) -> None:
     """An empty folder; only a folder that an earlier trial has made is emptied.
 
@@ -202,5 +171,3 @@ def _make_room(out: Path) -> None:
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
     (out / OWN).write_text("This folder was made by a trial and is emptied by the next one.\n")
-
-

@@ -1,30 +1,30 @@
 """A scenario file: a world, robots, what happens to them in which order, and what shall come of it.
 
-    name = "network-cut"
-    summary = "One robot maps for a minute without a network; nothing is lost."
-    robots = 3                        # or a [[robot]] table each: name, camera, body, start, mission ...
+name = "network-cut"
+summary = "One robot maps for a minute without a network; nothing is lost."
+robots = 3                        # or a [[robot]] table each: name, camera, body, start, mission ...
 
-    [world]
-    kind = "office"                   # see docs/worlds.md; or file = "my_world.toml"
+[world]
+kind = "office"                   # see docs/worlds.md; or file = "my_world.toml"
 
-    [[events]]                        # in order; each waits for its time, then happens
-    at = 60.0                         # not before this time, s
-    do = "cut"
-    robot = "r2"
+[[events]]                        # in order; each waits for its time, then happens
+at = 60.0                         # not before this time, s
+do = "cut"
+robot = "r2"
 
-    [[events]]
-    plus = 60.0                       # so long after the event before, or after what `after` names
-    do = "restore"
-    robot = "r2"
+[[events]]
+plus = 60.0                       # so long after the event before, or after what `after` names
+do = "restore"
+robot = "r2"
 
-    [[events]]
-    after = "joined"                  # what must have come true first: see CONDITIONS
-    within = 400.0                    # ... but no longer than this after the event before, s
-    do = "wait"
+[[events]]
+after = "joined"                  # what must have come true first: see CONDITIONS
+within = 400.0                    # ... but no longer than this after the event before, s
+do = "wait"
 
-    [expect]                          # figures: see mapweave.trial.figures
-    components = 1
-    merged_ate_m = 0.1                # at most
+[expect]                          # figures: see mapweave.trial.figures
+components = 1
+merged_ate_m = 0.1                # at most
 """
 
 from __future__ import annotations
@@ -162,9 +162,7 @@ def scenario_path(given: str) -> Path:
     shipped = Path(str(_shipped() / f"{given}.toml"))
     if shipped.is_file():
         return shipped
-    raise SettingsError(
-        f"no scenario {given!r}; give a .toml file or one of {', '.join(scenario_names())}"
-    )
+    raise SettingsError(f"no scenario {given!r}; give a .toml file or one of {', '.join(scenario_names())}")
 
 
 def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:

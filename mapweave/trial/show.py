@@ -37,6 +37,10 @@ class Show:
         """Leave the last state on the terminal."""
         self._progress.stop()
 
+    def say(self, text: str) -> None:
+        """One line that stays."""
+        self._console.print(text)
+
     def stage(self, text: str) -> None:
         """What is being done beside the scenario."""
         self._progress.update(self._whole, doing=text)
