@@ -157,8 +157,8 @@ def _draw_scale(axes: Any) -> None:
     axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.plot([end - length, end], [height, height], "-", color="#222222", linewidth=4, solid_capstyle="butt")
     axes.annotate(
-        f"{length:g} m", (end - length / 2, height), (0, 4), textcoords="offset points", ha="center",
-        va="bottom", fontsize=9, color="#222222",
+        f"{length:g} m", (end - length, height), (-4, 0), textcoords="offset points", ha="right", va="center",
+        fontsize=9, color="#222222",
     )  # fmt: skip
 
 
@@ -220,4 +220,5 @@ def _draw_drives(axes: Any, drives: Sequence[Drive]) -> None:
             axes.annotate(
                 drive.robot, (drive.start.x, drive.start.y), (9, 6), textcoords="offset points", fontsize=10,
                 fontweight="bold", zorder=7,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1},
             )  # fmt: skip

@@ -175,7 +175,7 @@ def crossed(starts: Array, ends: Array, solids: Iterable[Rectangle]) -> NDArray[
         along = solid_from_world.apply(ends) - start
         half = np.array([solid.length / 2, solid.width / 2])
         # Along an axis to which it is parallel, a line is between two sides always or never.
-        parallel = along == 0.0
+        parallel = np.abs(along) < 1e-12
         step = np.where(parallel, 1.0, along)
         first, last = np.sort(np.stack([(-half - start) / step, (half - start) / step]), axis=0)
         between = np.abs(start) <= half

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from hybridmap.node import MapId
 from mapweave.picture import colours_of
 from mapweave.trial.recording import Lost, Moment
@@ -12,6 +14,8 @@ from mapweave.trial.trajectories import TrajectoryScore
 
 MOST_MOMENTS = 40
 """More are not numbered: the numbers could not be read."""
+PAUSE = 1.0
+"""s; a longer time without a posture is a gap in the line."""
 DASHES = ("-", "--", ":", "-.")
 """Of a robot's first map, second ..."""
 
@@ -48,8 +52,12 @@ def draw_errors(
     epochs: dict[str, int] = {}
     for map_id, score in sorted(scores.items()):
         number = epochs[map_id.agent] = epochs.get(map_id.agent, -1) + 1
+        seconds = score.stamps_ns / 1e9
+        # Where it did not map for a while, there is nothing to be drawn.
+        pauses = np.flatnonzero(np.diff(seconds) > PAUSE) + 1
         axes.plot(
-            score.stamps_ns / 1e9, score.errors, DASHES[number % len(DASHES)], color=colours[map_id.agent],
+            np.insert(seconds, pauses, np.nan), np.insert(score.errors, pauses, np.nan),
+            DASHES[number % len(DASHES)], color=colours[map_id.agent],
             linewidth=1.3, label=f"{map_id}: {score.ate_m:.3f} m", zorder=3,
         )  # fmt: skip
     axes.set_ylim(bottom=0.0)

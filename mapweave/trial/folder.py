@@ -19,7 +19,7 @@ from mapweave.picture import Drive, MapPicture, draw_map, outline_of
 from mapweave.scoring import MapScore, is_false, score_map, write_tum
 from mapweave.trial.error_plot import draw_errors
 from mapweave.trial.expectations import Verdict
-from mapweave.trial.figures import Figures, as_text
+from mapweave.trial.figures import Figures
 from mapweave.trial.recording import Lost, Recording, Trajectory
 from mapweave.trial.report_page import report_page
 from mapweave.trial.score import node_truth
@@ -112,10 +112,11 @@ def _map_picture(
     merged: MapScore,
 ) -> MapPicture:
     ate = "-" if figures.merged_ate_m is None else f"{figures.merged_ate_m:.3f} m"
+    recall = "-" if figures.link_recall is None else f"{figures.link_recall:.0%}"
     parts = "1 component" if merged.components == 1 else f"{merged.components} components"
     title = (
         f"{recording.scenario}, seed {recording.seed}: {figures.nodes} nodes, {parts}, {merged.links} links "
-        f"({merged.false_links} false, recall {as_text(figures.link_recall)}), ATE {ate}"
+        f"({merged.false_links} false, recall {recall}), ATE {ate}"
     )
     starts = {
         name: Pose2.from_vector(r.truth.poses[0])
