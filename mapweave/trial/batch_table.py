@@ -14,7 +14,7 @@ from rich.text import Text
 from mapweave.trial.expectations import Verdict
 from mapweave.trial.figures import MORE_IS_BETTER, Figures, as_text, kinds
 
-COUNTS_WITHOUT_WORST = frozenset({"maps", "nodes", "edges", "loops", "links", "sim_s"})
+COUNTS_WITHOUT_WORST = frozenset({"components", "maps", "nodes", "edges", "loops", "links", "sim_s"})
 """Neither more nor less of them is better: least and most are shown."""
 
 
@@ -42,7 +42,7 @@ class Attempt:
     @property
     def complaints(self) -> list[str]:
         """What was not as it should be, a line each."""
-        broken = [self.failure] if self.failure or self.figures is None else []
+        broken = [self.failure or "it was not run to its end"] if self.failure or self.figures is None else []
         return broken + [str(v) for v in self.verdicts if not v.good]
 
 
@@ -120,20 +120,27 @@ def batch_json(attempts: Sequence[Attempt]) -> dict[str, Any]:
 
 def batch_table(attempts: Sequence[Attempt], title: str = "") -> Group:
     """The whole batch for people: figures, then the failures by seed."""
-    figures = Table(title=title or None)
+    figures = Table(title=Text(title) if title else None)
     for heading in ("figure", "median", "worst", "of seed", "range", "trials"):
         figures.add_column(heading, justify="left" if heading == "figure" else "right")
     judged = {v.name: v.wanted for a in attempts for v in a.verdicts}
     for one in summarise(attempts):
         figures.add_row(
             Text(one.name, "bold" if one.name in judged else ""),
-            as_text(one.median),
-            as_text(one.worst),
+            _shown(one.name, one.median),
+            _shown(one.name, one.worst),
             as_text(one.worst_seed),
-            f"{as_text(one.least)} .. {as_text(one.most)}",
-            str(one.measured),
+            f"{_shown(one.name, one.least)} .. {_shown(one.name, one.most)}",
+            f"{one.measured} of {len(attempts)}",
         )
     failed = [a for a in attempts if not a.passed]
     lines = [Text(f"{len(attempts) - len(failed)} of {len(attempts)} passed", "bold")]
     lines += [Text(f"seed {a.seed} failed: " + "; ".join(a.complaints), "red") for a in failed]
     return Group(figures, *lines)
+
+
+def _shown(name: str, value: float | None) -> str:
+    """A figure for people; a median of flags is the share that is true."""
+    if kinds()[name] is not bool or value not in (0.0, 1.0):
+        return as_text(value)
+    return as_text(bool(value))
