@@ -15,6 +15,8 @@ from sim.texture import Image
 
 DESIGNS = 5
 """Kinds of carton in one warehouse."""
+COLUMNS = 12
+"""Of cartons that are tried on one board."""
 CHANGED = 0.35
 """Share of the cartons by which a changed rack differs from the common one."""
 
@@ -64,18 +66,20 @@ class Rack:
     ) -> None:
         """Cartons side by side on a board: (left, right, bottom, room above) in px."""
         x, right, bottom, room = shelf
-        while True:
-            design, gap, stays = int(load.integers(DESIGNS)), int(load.integers(2, 16)), load.random() < 0.9
+        for _ in range(COLUMNS):
+            design, gap, empty = int(load.integers(DESIGNS)), int(load.integers(2, 14)), load.random() < 0.06
             other, swapped = int(own.integers(DESIGNS + 1)), self.changed and own.random() < CHANGED
             if swapped:
-                design, stays = other % DESIGNS, other < DESIGNS
+                design, empty = other % DESIGNS, other == DESIGNS
             picture = carton_face(self.common, design)
-            high = min(picture.shape[0], room)
-            wide = picture.shape[1]
+            high, wide = picture.shape
+            count = int(load.integers(1, max(1, room // high) + 1))
             if x + gap + wide > right:
-                return
-            if stays:
-                canvas[bottom - high : bottom, x + gap : x + gap + wide] = picture[-high:]
+                continue  # a narrower one may fit
+            for number in range(0 if empty else count):
+                top = bottom - (number + 1) * high
+                if top >= bottom - room:
+                    canvas[top : top + high, x + gap : x + gap + wide] = picture
             x += gap + wide
 
 
@@ -99,7 +103,7 @@ def carton(rng: np.random.Generator, width_px: int, height_px: int, common: int)
 def carton_face(common: int, design: int) -> Image:
     """One side of a carton of a design: brown board, tape, a brand, handling marks, a label."""
     rng = np.random.default_rng([common, 0xCA57, design])
-    width_px, height_px = int(rng.integers(78, 150)), int(rng.integers(70, 140))
+    width_px, height_px = int(rng.integers(70, 140)), int(rng.integers(56, 115))
     board = float(rng.uniform(120, 185))
     grain = clouds(rng, width_px, height_px, 1.4)
     canvas: Image = np.clip(board + 5 * grain, 0, 255).astype(np.uint8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 
@@ -61,12 +63,28 @@ def cladding(rng: np.random.Generator, width_px: int, height_px: int, paint: flo
     shade = np.select([rib < 0.4, rib < 0.5, rib < 0.9], [1.0, 0.8, 0.93], 1.08)
     surface = paint * shade[None, :] + 4 * _seamless(clouds(rng, width_px, height_px, 1.3), across=True)
     canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
-    for _ in range(int(rng.poisson(width_px * height_px / 40_000))):
-        x, y = int(rng.integers(width_px)), int(rng.integers(height_px))
-        end = (x + int(rng.normal(0, 25)), y + int(rng.normal(0, 5)))
-        cv2.line(canvas, (x, y), end, int(rng.integers(60, 120)), 1, cv2.LINE_AA)
     plinth = int(0.25 * TEXELS_PER_METRE)
     canvas[height_px - plinth :] = concrete(rng, width_px, plinth, 0.8 * paint)
+    screws = np.flatnonzero(np.diff((rib < 0.2).astype(np.int8)) > 0)
+    for y in range(height_px - plinth - 14, 0, -int(0.6 * TEXELS_PER_METRE)):
+        for x in screws.tolist():
+            cv2.circle(canvas, (x + 28, y), 3, 60, -1, cv2.LINE_AA)
+            if rng.random() < 0.3:
+                _streak(rng, canvas, (x + 28, y + 3))
+    for _ in range(int(rng.poisson(2.5 * width_px / TEXELS_PER_METRE))):
+        # What fork lifts and trolleys leave: scuffs at the height of pallets.
+        x, y = int(rng.integers(width_px)), height_px - int(rng.uniform(0.02, 0.6) * TEXELS_PER_METRE)
+        end = (x + int(rng.normal(0, 30)), y + int(rng.normal(0, 5)))
+        grey = int(rng.choice([rng.integers(25, 70), rng.integers(200, 235)]))
+        cv2.line(canvas, (x, y), end, grey, int(rng.integers(1, 5)), cv2.LINE_AA)
+    if width_px > 90 and rng.random() < 0.5:
+        side = int(rng.integers(30, 70))
+        x, y = (
+            int(rng.integers(4, width_px - side - 4)),
+            height_px - plinth - int(rng.uniform(0.3, 1.0) * 200),
+        )
+        if y >= 0:
+            canvas[y : y + side, x : x + side] = framed_print(rng, side, side)
     return canvas
 
 
@@ -79,6 +97,28 @@ def wood(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
     )
     surface = base + 10 * long_rings + 4 * clouds(rng, width_px, height_px, 1.3)
     return np.asarray(np.clip(surface, 0, 255), np.uint8)
+
+
+def desk(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
+    """Drawers with handles and locks beside a panel with a few notes on it."""
+    canvas = wood(rng, width_px, height_px)
+    base = int(canvas.mean())
+    cv2.rectangle(canvas, (0, 0), (width_px - 1, max(4, height_px // 24)), int(0.7 * base), -1)
+    wide = min(int(0.42 * TEXELS_PER_METRE), width_px // 2)
+    left = 0 if rng.random() < 0.5 else width_px - wide
+    drawers = int(rng.integers(2, 5))
+    edges = np.linspace(height_px // 24 + 6, height_px - 10, drawers + 1).astype(int).tolist()
+    for top, bottom in itertools.pairwise(edges):
+        cv2.rectangle(canvas, (left + 4, top), (left + wide - 4, bottom - 3), int(0.55 * base), 2)
+        middle = (left + wide // 2, top + (bottom - top) // 3)
+        cv2.rectangle(canvas, (middle[0] - 20, middle[1] - 3), (middle[0] + 20, middle[1] + 3), 215, -1)
+        cv2.circle(canvas, (left + wide - 16, top + 10), 3, 225, -1, cv2.LINE_AA)
+    for _ in range(int(rng.integers(2, 6))):
+        w, h = int(rng.integers(22, 70)), int(rng.integers(18, 60))
+        if w < width_px - 8 and h < height_px - 20:
+            x, y = int(rng.integers(4, width_px - w - 2)), int(rng.integers(12, height_px - h - 2))
+            canvas[y : y + h, x : x + w] = framed_print(rng, w, h)
+    return canvas
 
 
 def cupboard(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
@@ -200,6 +240,13 @@ def _skirted(rng: np.random.Generator, canvas: Image) -> Image:
         canvas[-board:] = np.clip(78 + 5 * scuffs, 0, 255).astype(np.uint8)
         canvas[-board - 1] = 50
     return canvas
+
+
+def _streak(rng: np.random.Generator, canvas: Image, start: tuple[int, int]) -> None:
+    """Rust that has run down."""
+    x, top = start
+    for y in range(top, min(top + int(rng.integers(20, 110)), len(canvas) - 1)):
+        canvas[y, max(0, x - 1) : x + 1] = np.clip(canvas[y, max(0, x - 1) : x + 1] * 0.8, 0, 255)
 
 
 def _socket(canvas: Image, x: int, y: int) -> None:

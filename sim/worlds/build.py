@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
-from sim.floorplan import FloorPlan, Rectangle
+from sim.floorplan import FloorPlan, Rectangle, distances_to
 from sim.surface import TEXELS_PER_METRE
 from sim.texture import Painter, Texture
 from sim.world import Block, Panel, Piece, World, block_panels, upright_panel
@@ -37,6 +37,8 @@ LAMP_DROP = 0.15
 """And this far below the ceiling, m."""
 DARK = 1.5
 """Rooms smaller than this have no lamp, m^2: door openings, lit from the rooms that they join."""
+OPEN = 0.3
+"""Light comes from the next room through an edge at least so long, m."""
 QUANTUM = 2.0**-20
 """Panels are placed to a millionth of a metre: a world moved by whole metres is then drawn the same to the
 last bit, which is what makes twin rooms twins."""
@@ -115,7 +117,7 @@ class _Builder:
         self._plan = plan_of(design)
         self._low = np.array([room.low for room in design.rooms])
         self._high = np.array([room.high for room in design.rooms])
-        self._lamps = [self._light(room) for room in design.rooms]
+        self._lamps = [self._light(k) for k in range(len(design.rooms))]
         self._paints = [self._paint(room) for room in design.rooms]
 
     def world(self) -> World:
@@ -152,18 +154,25 @@ class _Builder:
             (self._design.seed, SHARED, kind, seed) if seed is not None else (self._design.seed, kind, number)
         )
 
-    def _light(self, room: Room) -> tuple[Vector, ...]:
-        """Lamps that shine into a room, in its frame: its own, or those of the rooms around."""
-        own = _lamps(room, self._design.height)
-        if own:
-            return own
-        touching = (self._low <= np.array(room.high) + 1e-6) & (self._high >= np.array(room.low) - 1e-6)
-        around = [self._design.rooms[k] for k in np.flatnonzero(touching.all(axis=1))]
-        return tuple(
+    def _light(self, number: int) -> tuple[Vector, ...]:
+        """Lamps that shine into a room, in its frame: its own, and those of the rooms it is open to."""
+        room, height = self._design.rooms[number], self._design.height
+        shine = [
             (x + other.low[0] - room.low[0], y + other.low[1] - room.low[1], z)
-            for other in around
-            for x, y, z in _lamps(other, self._design.height)
-        )
+            for k, other in enumerate(self._design.rooms)
+            if k != number and self._open(number, k)
+            for x, y, z in _lamps(other, height)
+        ]
+        return (*_lamps(room, height), *shine)
+
+    def _open(self, one: int, other: int) -> bool:
+        """Whether two rooms share an edge without a wall all along it."""
+        low = np.maximum(self._low[one], self._low[other])
+        high = np.minimum(self._high[one], self._high[other])
+        if (high - low < -1e-6).any() or (high - low).max() < OPEN:
+            return False
+        edge = low + np.linspace(0.1, 0.9, 9)[:, None] * (high - low)
+        return bool((distances_to(self._plan.walls, edge) > 1e-6).any())
 
     def _paint(self, room: Room) -> float:
         if room.paint is not None:

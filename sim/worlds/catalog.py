@@ -9,10 +9,14 @@ from typing import Any
 
 from hybridmap.errors import InvalidValue
 from sim.world import World
+from sim.worlds.arena import ArenaParameters, arena
 from sim.worlds.build import build_world
+from sim.worlds.corridor import CorridorParameters, corridor
 from sim.worlds.design import MAX_SEED, Design, within
 from sim.worlds.file import load_world
 from sim.worlds.office import OfficeParameters, office
+from sim.worlds.twins import TwinsParameters, twins
+from sim.worlds.warehouse import WarehouseParameters, warehouse
 from wire.tables import build
 
 
@@ -31,6 +35,10 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     "office": Kind(OfficeParameters, office),
+    "corridor": Kind(CorridorParameters, corridor),
+    "warehouse": Kind(WarehouseParameters, warehouse),
+    "twins": Kind(TwinsParameters, twins),
+    "arena": Kind(ArenaParameters, arena),
 }
 
 

@@ -21,7 +21,7 @@ TRIES = 8
 STOCK = (
     Furniture("cupboard", (0.0, 0.0), 1.0, 0.45, 1.7, texture="cupboard"),
     Furniture("bookshelf", (0.0, 0.0), 1.2, 0.35, 1.5, texture="bookshelf"),
-    Furniture("desk", (0.0, 0.0), 1.3, 0.65, 0.72, texture="wood"),
+    Furniture("desk", (0.0, 0.0), 1.3, 0.65, 0.72, texture="desk"),
     Furniture("crate", (0.0, 0.0), 0.5, 0.45, 0.6, texture="crate"),
 )
 """What stands in offices."""

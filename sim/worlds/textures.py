@@ -31,6 +31,7 @@ WALLS: dict[str, PaintedWall] = {
 """Painted in the colour of the room that they face."""
 PAINTERS: dict[str, Painter] = {
     "wood": surface.wood,
+    "desk": surface.desk,
     "cupboard": surface.cupboard,
     "bookshelf": surface.bookshelf,
     "crate": surface.crate,

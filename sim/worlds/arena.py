@@ -1,0 +1,55 @@
+"""An arena: one hall with prints all around, to park in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.worlds.build import plan_of
+from sim.worlds.design import THICKNESS, Design, Room, Wall, within
+from sim.worlds.furniture import STOCK, furnish
+
+HALF = THICKNESS / 2
+
+
+@dataclass(frozen=True)
+class ArenaParameters:
+    """Size of the hall.
+
+    Attributes:
+        length: from west to east, m.
+        width: from south to north, m.
+        boxes: that are wanted in it.
+    """
+
+    length: float = 8.0
+    width: float = 6.0
+    boxes: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be built.
+
+        Raises:
+            InvalidValue: a size out of range.
+        """
+        within("an arena's length", self.length, 2.0, 60.0)
+        within("an arena's width", self.width, 2.0, 60.0)
+        within("an arena's number of boxes", self.boxes, 0, 100)
+
+
+def arena(parameters: ArenaParameters, seed: int) -> Design:
+    """Design an arena; other seeds, other prints and other places of the boxes."""
+    rng = np.random.default_rng([seed, 0xA4E4A])
+    x, y = parameters.length, parameters.width
+    rooms = (Room("room 0", (0.0, 0.0), (x, y)),)
+    walls = (
+        Wall((-THICKNESS, -HALF), (x + THICKNESS, -HALF)),
+        Wall((-THICKNESS, y + HALF), (x + THICKNESS, y + HALF)),
+        Wall((-HALF, 0.0), (-HALF, y)),
+        Wall((x + HALF, 0.0), (x + HALF, y)),
+    )
+    crates = tuple(kind for kind in STOCK if kind.name == "crate")
+    plan = plan_of(Design(rooms=rooms, walls=walls))
+    boxes = furnish(rng, plan, plan.rooms[0], crates, by_wall=0, count=parameters.boxes)
+    return Design(f"arena-{seed}", seed, rooms=rooms, walls=walls, furniture=tuple(boxes))

@@ -1,0 +1,117 @@
+"""A corridor that leads back to where it began: a long loop, bare plaster between few prints and doors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.errors import InvalidValue
+from sim.worlds.design import THICKNESS, Design, Point, Poster, Room, Wall, within
+
+HALF = THICKNESS / 2
+CORNER = 0.25
+"""Nothing hangs nearer than this to a corner, m."""
+IN_FRONT = 0.05
+"""How far in front of its wall a print's place is given, m."""
+
+
+@dataclass(frozen=True)
+class CorridorParameters:
+    """Size of the ring.
+
+    Attributes:
+        length: of the floor from west to east, m.
+        width: of the floor from south to north, m.
+        breadth: of the corridor, m.
+        spacing: from the middle of one print on a wall to the next, m; on the average.
+    """
+
+    length: float = 12.0
+    width: float = 8.0
+    breadth: float = 1.8
+    spacing: float = 2.2
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be built.
+
+        Raises:
+            InvalidValue: a size out of range.
+        """
+        within("a corridor's breadth", self.breadth, 1.2, 5.0)
+        within("a corridor's length", self.length, 4.0, 100.0)
+        within("a corridor's width", self.width, 4.0, 100.0)
+        within("a corridor's spacing", self.spacing, 1.2, 20.0)
+        if min(self.length, self.width) < 2 * self.breadth + 1.0:
+            raise InvalidValue(
+                f"a ring of {self.length:g} x {self.width:g} m has no middle if its corridor is "
+                f"{self.breadth:g} m broad; make it 1 m longer and wider than twice its breadth"
+            )
+
+
+def corridor(parameters: CorridorParameters, seed: int) -> Design:
+    """Design a ring; other seeds have other prints and doors at other places, no two alike."""
+    rng = np.random.default_rng([seed, 0xC0441D04])
+    paint = int(rng.integers(150, 200))
+    x, y, b = parameters.length, parameters.width, parameters.breadth
+    rooms = (
+        Room("south", (0.0, 0.0), (x, b), paint=paint),
+        Room("east", (x - b, b), (x, y - b), paint=paint),
+        Room("north", (0.0, y - b), (x, y), paint=paint),
+        Room("west", (0.0, b), (b, y - b), paint=paint),
+    )
+    outer = [(0.0, 0.0), (x, 0.0), (x, y), (0.0, y)]
+    inner = [(b, b), (b, y - b), (x - b, y - b), (x - b, b)]
+    faces = [(ring[k], ring[(k + 1) % 4]) for ring in (outer, inner) for k in range(4)]
+    # Outer walls close their corners behind the floor; the inner ones would stand out into it.
+    walls = tuple(_behind(*face, THICKNESS if k < 4 else 0.0) for k, face in enumerate(faces))
+    posters = tuple(poster for face in faces for poster in _hang(rng, *face, parameters.spacing))
+    names = tuple(room.name for room in rooms)
+    return Design(
+        f"corridor-{seed}", seed, start_rooms=names, look_along=True,
+        rooms=rooms, walls=walls, posters=posters,
+    )  # fmt: skip
+
+
+def _behind(start: Point, end: Point, longer: float) -> Wall:
+    """The wall of a face, longer at both ends; the floor is to the left of the way from `start` to `end`."""
+    ahead = np.sign(np.array(end) - start)
+    right = np.array([ahead[1], -ahead[0]])
+    a, b = start + HALF * right - longer * ahead, end + HALF * right + longer * ahead
+    return Wall(_point(a), _point(b), texture="plaster")
+
+
+def _hang(rng: np.random.Generator, start: Point, end: Point, spacing: float) -> list[Poster]:
+    """Prints, signs and doors along a face at irregular distances."""
+    size = math.dist(start, end)
+    ahead = (np.array(end) - start) / size
+    left = np.array([-ahead[1], ahead[0]])
+    posters: list[Poster] = []
+    free, at = CORNER, float(rng.uniform(0.2, 0.9)) * spacing
+    while at < size - CORNER:
+        width, height, bottom, texture = _print(rng)
+        middle = max(at, free + width / 2)
+        if middle + width / 2 > size - CORNER:
+            break
+        place = _point(start + middle * ahead + IN_FRONT * left)
+        posters.append(Poster(place, width, height, bottom, texture))
+        free = middle + width / 2 + 0.1
+        at = middle + float(rng.uniform(0.55, 1.45)) * spacing
+    return posters
+
+
+def _print(rng: np.random.Generator) -> tuple[float, float, float, str]:
+    """Width, height, bottom (m) and texture."""
+    chance = rng.random()
+    if chance < 0.25:
+        return 0.9, 2.0, 0.0, "door"
+    if chance < 0.5:
+        width, height = rng.uniform([0.3, 0.25], [0.55, 0.4])
+        return round(float(width), 2), round(float(height), 2), round(float(rng.uniform(0.2, 0.9)), 2), "sign"
+    width, height = rng.uniform([0.45, 0.45], [1.0, 0.85])
+    return round(float(width), 2), round(float(height), 2), round(float(rng.uniform(0.1, 0.5)), 2), "print"
+
+
+def _point(point: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Point:
+    return round(float(point[0]), 3), round(float(point[1]), 3)
