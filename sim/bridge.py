@@ -46,6 +46,7 @@ class SimBridge:
         patience: float = 20.0,
         expected: int | None = None,
         farewell: float = 2.0,
+        held: bool = False,
     ) -> None:
         """Serve from now on; questions wait for `run`.
 
@@ -55,6 +56,7 @@ class SimBridge:
             fleet: which fleet.
             patience: how long the other robots wait for one that does not ask, s.
             expected: how many robots must have asked before the first tick; all if not given.
+            held: let no time pass before somebody asks for it (see SimControl.advance).
             farewell: how long `close` waits for agents that have not heard yet that the end has come, s.
         """
         keys = Keys(fleet)
@@ -66,7 +68,7 @@ class SimBridge:
         self._desk = ControlDesk(simulation, lambda: self._lockstep.active, self._wall, self._stop)
         self._changed = threading.Condition()
         self._inbox: deque[Callable[[], None]] = deque()
-        self._limit: int | None = None
+        self._limit: int | None = 0 if held else None
         self._advancing: Request | None = None
         self._stopping = False
         self._ended = False

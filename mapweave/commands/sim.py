@@ -90,6 +90,9 @@ def _add_serve(kinds: Any) -> None:
     parser.add_argument(
         "--listen", metavar="ENDPOINT", help="be reachable here, instead of connecting to the fleet's router"
     )
+    parser.add_argument(
+        "--held", action="store_true", help="let no time pass before a scenario's conductor asks for it"
+    )
     add_network(parser)
     parser.set_defaults(run=run_serve)
 
@@ -181,7 +184,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
     else:
         bus = ZenohBus(BusSettings(mode="client", endpoints=network.endpoints))
     try:
-        run_sim(bus, network.fleet, scenario, seed, stop)
+        run_sim(bus, network.fleet, scenario, seed, stop, arguments.held)
     finally:
         bus.close()
     return 0

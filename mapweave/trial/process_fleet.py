@@ -48,7 +48,7 @@ class ProcessFleet:
         self.start_server()
         self._children.start(
             "sim",
-            ["sim", "serve", str(scenario.path), "--seed", str(stage.seed), *overrides,
+            ["sim", "serve", str(scenario.path), "--seed", str(stage.seed), *overrides, "--held",
              "--listen", _endpoint(self._body_port), "--fleet", FLEET],
         )  # fmt: skip
         self._until(self._simulating, "the simulator does not come up")

@@ -38,6 +38,7 @@ from wire.messages import (
     encode_relocalize_answer,
     encode_route_answer,
 )
+from wire.metered import MeteredBus
 
 KEYS = Keys("fleet")
 MAP = MapId("r0", 1)
@@ -199,7 +200,36 @@ def test_the_fleet_hears_what_the_robot_does(link: FleetLink, other: MemoryBus) 
     other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(decode_report(sample.payload)))
     status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False, "goto", THERE, Pose2(0.1, 0, 0), 4)
     link.report(status, 123)
-    eventually(lambda: heard == [AgentReport(status, 123)])
+    eventually(lambda: heard == [AgentReport(status, 123, MAP.epoch)])
+
+
+def test_who_asks_is_told_the_state_of_now(hub: MemoryHub, other: MemoryBus) -> None:
+    """Also when nothing was published: what waits for the server, what has gone over the network."""
+    bus, waiting = MeteredBus(MemoryBus(hub)), [3]
+    link = FleetLink(bus, KEYS, MAP, unsent=lambda: waiting[0])
+
+    def asked() -> AgentReport:
+        (reply,) = other.ask(KEYS.agent_status("r0"), b"", 1.0)
+        return decode_report(reply.payload)
+
+    first = asked()
+    assert first.status.doing == "starting"
+    assert (first.unsent, first.linked, first.epoch) == (3, False, MAP.epoch)
+    status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False)
+    heard: list[bytes] = []
+    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(sample.payload))
+    link.report(status, 5, publish=False)
+    waiting[0] = 0
+    token = other.announce(KEYS.server_alive("s0"))
+    eventually(lambda: asked().linked)
+    second = asked()
+    assert (second.status, second.stamp_ns, second.unsent) == (status, 5, 0)
+    assert second.traffic > first.traffic > 0
+    token.close()
+    eventually(lambda: not asked().linked)
+    assert not heard
+    link.close()
+    bus.close()
 
 
 def test_the_agent_is_alive_until_it_goes(hub: MemoryHub, other: MemoryBus) -> None:

@@ -46,6 +46,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
         KEYS.any_server_map(): KEYS.server_map(server),
         KEYS.server_statuses(): KEYS.server_status(server),
         KEYS.servers_alive(): KEYS.server_alive(server),
+        KEYS.robot_drivers(): KEYS.robot_driver(server, one.epoch),
     }
     others = [KEYS.log(one), KEYS.mission(one.agent), KEYS.robot_describe(server), KEYS.sim_alive()]
     for pattern in keys:
@@ -65,6 +66,7 @@ def test_what_a_key_says(one: MapId, server: str) -> None:
     assert KEYS.parse_ack(KEYS.ack(server, one.agent)) == (server, one.agent)
     assert KEYS.parse_server_alive(KEYS.server_alive(server)) == server
     assert KEYS.parse_server_status(KEYS.server_status(server)) == server
+    assert KEYS.parse_robot_driver(KEYS.robot_driver(server, one.epoch)) == (server, one.epoch)
 
 
 @pytest.mark.parametrize(
