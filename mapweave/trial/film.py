@@ -67,10 +67,13 @@ class Film:
         """Append a frame, (H, W, 3) blue, green, red; it must not be changed afterwards.
 
         Raises:
-            InvalidFile: the film cannot be written, or this frame has another size than the first.
+            InvalidFile: the film cannot be written, or is finished, or this frame has another size than the
+                first.
         """
         if self._writer is None:
             self._begin(frame)
+        elif self._thread is None:
+            raise InvalidFile(f"{self.path}: the film is finished")
         if frame.shape != self._shape:
             raise InvalidFile(f"{self.path}: all frames of a film have one size")
         self._queue.put(frame)
