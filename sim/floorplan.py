@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -161,9 +161,8 @@ class FloorPlan:
         """
         regions = self.free_regions(radius)
         if room is not None:
-            box = [self.room(room)]
-            regions = [region[distances_to(box, region) <= 1e-9] for region in regions]
-        return max(regions, key=len, default=np.zeros((0, 2)))
+            return largest_part(regions, self.room(room))
+        return regions[0] if regions else np.zeros((0, 2))
 
     def random_free_pose(self, rng: np.random.Generator, radius: float, room: str | None = None) -> Pose2:
         """A reachable pose with any heading, in any room or the given one.
@@ -180,6 +179,12 @@ class FloorPlan:
         if len(points) == 0:
             raise InvalidValue(f"a disc of {radius} m fits nowhere in {room or 'the building'}")
         return random_pose(rng, points)
+
+
+def largest_part(regions: Sequence[Array], room: Rectangle) -> Array:
+    """(N, 2) m, in world: the largest of what of each region lies in a room."""
+    parts = (region[distances_to([room], region) <= 1e-9] for region in regions)
+    return max(parts, key=len, default=np.zeros((0, 2)))
 
 
 def random_pose(rng: np.random.Generator, points: NDArray[Any]) -> Pose2:

@@ -131,9 +131,10 @@ def rearrange(
         if len(moves) >= wanted:
             break
         piece = plan.furniture[index]
-        room = next((r for r in plan.rooms if r.name == plan.room_at(piece.x, piece.y)), None)
-        if room is None:
+        name = plan.room_at(piece.x, piece.y)
+        if name is None:
             continue
+        room = plan.room(name)
         others = (*plan.furniture[:index], *plan.furniture[index + 1 :])
         site = Site(replace(plan, furniture=others), room)
         for _ in range(TRIES):

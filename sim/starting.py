@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
-from sim.floorplan import FloorPlan, random_pose
+from sim.floorplan import FloorPlan, largest_part, random_pose
 
 APART = 0.65
 """Middles of two robots are never closer, m: 45 cm and a robot's radius, and what the grid rounds away."""
@@ -38,7 +38,8 @@ def spread(
         InvalidValue: so many do not fit.
     """
     rng = np.random.default_rng([seed, 0x57A27])
-    free = [plan.free_points(clearance, room) for room in rooms]
+    regions = plan.free_regions(clearance)
+    free = [largest_part(regions, plan.room(room)) for room in rooms]
     poses: list[Pose2] = []
     for robot in range(robots):
         number = robot % len(rooms)

@@ -9,20 +9,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
-from sim.floorplan import FloorPlan, Rectangle, distances_to
+from sim.floorplan import Rectangle
 from sim.surface import TEXELS_PER_METRE
 from sim.texture import Painter, Texture
 from sim.world import Block, Panel, Piece, World, block_panels, upright_panel
-from sim.worlds.design import Design, Furniture, Poster, Room, Wall, check_design
+from sim.worlds.design import DARK, Design, Furniture, Poster, Room, Wall, check_design, floor_area
+from sim.worlds.faces import BEFORE, cut_face, nearest_face, room_before
+from sim.worlds.lamps import lamps_of
+from sim.worlds.layout import plan_of
 from sim.worlds.light import Lit, Vector
 from sim.worlds.textures import NOTHING, Textures
 
-SEGMENT = 1.3
-"""Walls are papered in pieces at most this wide, m: one filter level fits a whole piece."""
 TILE = 3.0
 """Floors are laid in pieces at most this long, m."""
 OFF_WALL = 0.004
@@ -31,14 +31,6 @@ NEAR_WALL = 0.5
 """A poster's place is at most so far from its wall, m."""
 MAX_TEXELS = 2048
 """Of one texture across and down; larger surfaces are coarser."""
-LAMP_SPACING = 3.2
-"""Lamps hang about this far apart, m."""
-LAMP_DROP = 0.15
-"""And this far below the ceiling, m."""
-DARK = 1.5
-"""Rooms smaller than this have no lamp, m^2: door openings, lit from the rooms that they join."""
-OPEN = 0.3
-"""Light comes from the next room through an edge at least so long, m."""
 QUANTUM = 2.0**-20
 """Panels are placed to a millionth of a metre: a world moved by whole metres is then drawn the same to the
 last bit, which is what makes twin rooms twins."""
@@ -60,36 +52,6 @@ def build_world(design: Design, where: str = "world", folder: Path | None = None
     """
     check_design(design, where)
     return _Builder(design, where, folder or Path()).world()
-
-
-def plan_of(design: Design) -> FloorPlan:
-    """The floor plan of a design."""
-    return FloorPlan(
-        tuple(_room_rectangle(room) for room in design.rooms),
-        tuple(wall_rectangle(wall) for wall in design.walls),
-        tuple(piece_rectangle(piece) for piece in design.furniture),
-    )
-
-
-def wall_rectangle(wall: Wall) -> Rectangle:
-    """What a wall covers; upright, and exact, if its line is."""
-    (x0, y0), (x1, y1) = wall.start, wall.end
-    half = wall.thickness / 2
-    if y0 == y1:
-        return Rectangle.spanning(min(x0, x1), y0 - half, max(x0, x1), y0 + half)
-    if x0 == x1:
-        return Rectangle.spanning(x0 - half, min(y0, y1), x0 + half, max(y0, y1))
-    length, heading = math.dist(wall.start, wall.end), math.atan2(y1 - y0, x1 - x0)
-    return Rectangle((x0 + x1) / 2, (y0 + y1) / 2, length, wall.thickness, heading)
-
-
-def piece_rectangle(piece: Furniture) -> Rectangle:
-    """What a piece of furniture covers."""
-    return Rectangle(*piece.at, piece.length, piece.width, math.radians(piece.heading_deg), piece.name)
-
-
-def _room_rectangle(room: Room) -> Rectangle:
-    return Rectangle.spanning(*room.low, *room.high, room.name)
 
 
 @dataclass(frozen=True)
@@ -117,7 +79,7 @@ class _Builder:
         self._plan = plan_of(design)
         self._low = np.array([room.low for room in design.rooms])
         self._high = np.array([room.high for room in design.rooms])
-        self._lamps = [self._light(k) for k in range(len(design.rooms))]
+        self._lamps = lamps_of(design, self._plan)
         self._paints = [self._paint(room) for room in design.rooms]
 
     def world(self) -> World:
@@ -146,33 +108,13 @@ class _Builder:
             panels += self._laid(room, seeds, f"{self._where}: rooms[{number}]")
         return World(
             design.name, plan, tuple(blocks), tuple(panels), design.background, tuple(pieces),
-            design.start_rooms, design.look_along,
+            _start_rooms(design), design.look_along,
         )  # fmt: skip
 
     def _seeds(self, kind: int, number: int, seed: int | None) -> _Seeds:
         return _Seeds(
             (self._design.seed, SHARED, kind, seed) if seed is not None else (self._design.seed, kind, number)
         )
-
-    def _light(self, number: int) -> tuple[Vector, ...]:
-        """Lamps that shine into a room, in its frame: its own, and those of the rooms it is open to."""
-        room, height = self._design.rooms[number], self._design.height
-        shine = [
-            (x + other.low[0] - room.low[0], y + other.low[1] - room.low[1], z)
-            for k, other in enumerate(self._design.rooms)
-            if k != number and self._open(number, k)
-            for x, y, z in _lamps(other, height)
-        ]
-        return (*_lamps(room, height), *shine)
-
-    def _open(self, one: int, other: int) -> bool:
-        """Whether two rooms share an edge without a wall all along it."""
-        low = np.maximum(self._low[one], self._low[other])
-        high = np.minimum(self._high[one], self._high[other])
-        if (high - low < -1e-6).any() or (high - low).max() < OPEN:
-            return False
-        edge = low + np.linspace(0.1, 0.9, 9)[:, None] * (high - low)
-        return bool((distances_to(self._plan.walls, edge) > 1e-6).any())
 
     def _paint(self, room: Room) -> float:
         if room.paint is not None:
@@ -194,10 +136,7 @@ class _Builder:
             return panels
         corners = base.corners
         for first, second in ((1, 2), (2, 3), (3, 0), (0, 1)):
-            start, end = corners[first], corners[second]
-            pieces = max(1, math.ceil(float(np.linalg.norm(end - start)) / SEGMENT))
-            for k in range(pieces):
-                a, b = start + (end - start) * k / pieces, start + (end - start) * (k + 1) / pieces
+            for a, b in cut_face(corners[first], corners[second], self._low, self._high):
                 bare = upright_panel((a[0], a[1]), (b[0], b[1]), 0.0, height, BLANK)
                 panels.append(self._textured(bare, wall.texture, next(seeds), True, where))
         return panels
@@ -240,7 +179,7 @@ class _Builder:
             raise InvalidValue(f"{where}: a poster needs a texture")
         nearest, face, number = math.inf, Pose2(), -1
         for index, base in enumerate(self._plan.walls):
-            frame, reach, gap = _nearest_face(base, at)
+            frame, reach, gap = nearest_face(base, at)
             if gap < nearest:
                 nearest, face, number = gap, frame, index
                 half = reach
@@ -286,46 +225,21 @@ class _Builder:
         return self._textures[key]
 
     def _facing(self, corner: Array, along: Array, down: Array) -> int:
-        """The room that a panel faces, or -1: where one stands 5 cm in front of its middle."""
+        """The room that a panel faces, or -1."""
         normal = -np.cross(along, down)
-        point = (corner + along / 2 + down / 2 + 0.05 * normal / np.linalg.norm(normal))[:2]
-        inside = ((self._low <= point) & (point <= self._high)).all(axis=1)
-        return int(np.argmax(inside)) if inside.any() else -1
+        point = corner + along / 2 + down / 2 + BEFORE * normal / np.linalg.norm(normal)
+        return int(room_before(point[None, :2], self._low, self._high)[0])
 
 
 BLANK = Texture.plain(0)
 """On panels that have no texture yet."""
 
 
-def _nearest_face(base: Rectangle, at: NDArray[np.float64]) -> tuple[Pose2, float, float]:
-    """The face of a wall that is nearest to a point in front of it.
-
-    Returns:
-        The frame in the face's middle (x outward, y to the right as seen from outside), half the face's
-        width, and how far the point is from the wall, m; zero inside.
-    """
-    frame = Pose2(base.x, base.y, base.heading)
-    x, y = frame.inverse().apply(at)
-    beyond_x, beyond_y = abs(x) - base.length / 2, abs(y) - base.width / 2
-    gap = math.hypot(max(beyond_x, 0.0), max(beyond_y, 0.0))
-    if beyond_x > beyond_y:
-        heading, reach, half = (0.0 if x > 0 else math.pi), base.length / 2, base.width / 2
-    else:
-        heading, reach, half = math.copysign(math.pi / 2, y), base.width / 2, base.length / 2
-    return frame @ Pose2(heading=heading) @ Pose2(reach), half, gap
-
-
-def _lamps(room: Room, height: float) -> tuple[Vector, ...]:
-    """Where lamps hang, m, in the room."""
-    length, width = room.high[0] - room.low[0], room.high[1] - room.low[1]
-    if length * width < DARK:
-        return ()
-    columns, rows = (max(1, round(side / LAMP_SPACING)) for side in (length, width))
-    return tuple(
-        (length * (column + 0.5) / columns, width * (row + 0.5) / rows, height - LAMP_DROP)
-        for row in range(rows)
-        for column in range(columns)
-    )
+def _start_rooms(design: Design) -> tuple[str, ...]:
+    """As the design says; else the rooms that are called so; else all but door openings."""
+    called = tuple(room.name for room in design.rooms if room.name.startswith("room"))
+    large = tuple(room.name for room in design.rooms if floor_area(room) >= DARK)
+    return design.start_rooms or called or large
 
 
 def _exact(point: Array) -> Array:

@@ -16,6 +16,8 @@ THICKNESS = 0.12
 """Of walls, m."""
 HEIGHT = 2.3
 """Of walls, m."""
+DARK = 1.5
+"""Rooms smaller than this are door openings, m^2: no lamp hangs and no robot starts there."""
 MAX_ITEMS = 2048
 """Rooms, walls, pieces of furniture, posters: of each."""
 MAX_REACH = 1000.0
@@ -172,7 +174,8 @@ class Design:
         seed: of everything that has no seed of its own.
         height: of walls without a height of their own.
         background: grey above the walls.
-        start_rooms: names of the rooms in which robots start; by default those called "room ...".
+        start_rooms: names of the rooms in which robots start; by default those called "room ...", or if no
+            room is, all that are larger than a door opening.
         look_along: whether robots start looking along the longer side of their room.
         rooms: at least one.
         walls: solid.
@@ -230,6 +233,11 @@ def check_design(design: Design, where: str) -> None:
         raise InvalidValue(f"{where}: {total:.0f} m of walls are too many; at most {MAX_WALLS:.0f} m")
 
 
+def floor_area(room: Room) -> float:
+    """Of a room, m^2."""
+    return (room.high[0] - room.low[0]) * (room.high[1] - room.low[1])
+
+
 def within(what: str, value: float, low: float, high: float) -> None:
     """Refuse a number that is out of range.
 
@@ -250,7 +258,7 @@ def _check_rooms(design: Design, where: str) -> None:
     for name in design.start_rooms:
         if name not in names:
             raise InvalidValue(f"{where}: start_rooms: no room {name!r}; there are {', '.join(names)}")
-    area = sum((r.high[0] - r.low[0]) * (r.high[1] - r.low[1]) for r in design.rooms)
+    area = sum(map(floor_area, design.rooms))
     points = [*(p for r in design.rooms for p in (r.low, r.high))]
     points += [p for wall in design.walls for p in (wall.start, wall.end)]
     xs, ys = zip(*points, strict=True)

@@ -1,4 +1,38 @@
-"""Worlds in files."""
+"""Worlds in files: TOML that a person can write, or that is saved from a made world and then edited.
+
+    name = "flat"
+    height = 2.4                      # of the walls, m
+
+    [[rooms]]                         # where one may be; rooms that touch are open to one another
+    name = "hall"
+    low = [0.0, 0.0]                  # south-west corner, m: x to the east, y to the north
+    high = [6.0, 2.0]                 # north-east corner
+
+    [[walls]]                         # solid; along a line
+    start = [0.0, 2.05]
+    end = [6.0, 2.05]
+    thickness = 0.1
+    texture = "plaster"
+
+    [[furniture]]                     # boxes that stand on the floor
+    name = "cupboard"
+    at = [5.4, 1.7]                   # the middle
+    length = 1.0
+    width = 0.45
+    height = 1.7
+    heading_deg = 0.0                 # of its length, counter-clockwise from east
+    texture = "cupboard"
+
+    [[posters]]                       # pictures on walls
+    at = [2.0, 1.9]                   # a point in front of the wall
+    width = 0.6
+    height = 0.4
+    bottom = 0.3                      # above the floor
+    texture = "photo.jpg"             # a painter's name, or a picture beside this file
+
+All fields are those of the dataclasses in `sim.worlds.design`; what is left out keeps its default.
+`docs/worlds.md` lists them together with all textures.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +67,7 @@ def load_design(path: Path) -> Design:
         SettingsError: the file is missing, is not TOML, or has an unknown name or a value of a wrong kind.
     """
     table = read_toml(path)
+    table.setdefault("name", path.stem)
     for name, cls in ITEMS.items():
         tables = table.get(name, [])
         if not isinstance(tables, list) or not all(isinstance(one, dict) for one in tables):

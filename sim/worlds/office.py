@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.world import World
-from sim.worlds.build import build_world, plan_of
+from sim.worlds.build import build_world
 from sim.worlds.design import THICKNESS, Design, Furniture, Room, Wall, within
 from sim.worlds.furniture import STOCK, furnish
+from sim.worlds.layout import plan_of
 
 DOOR = 1.0
 """Width of doorways, m."""

@@ -1,0 +1,39 @@
+"""What the parts of a design cover on the floor."""
+
+from __future__ import annotations
+
+import math
+
+from sim.floorplan import FloorPlan, Rectangle
+from sim.worlds.design import Design, Furniture, Room, Wall
+
+
+def plan_of(design: Design) -> FloorPlan:
+    """The floor plan of a design."""
+    return FloorPlan(
+        tuple(room_rectangle(room) for room in design.rooms),
+        tuple(wall_rectangle(wall) for wall in design.walls),
+        tuple(piece_rectangle(piece) for piece in design.furniture),
+    )
+
+
+def wall_rectangle(wall: Wall) -> Rectangle:
+    """What a wall covers; upright, and exact, if its line is."""
+    (x0, y0), (x1, y1) = wall.start, wall.end
+    half = wall.thickness / 2
+    if y0 == y1:
+        return Rectangle.spanning(min(x0, x1), y0 - half, max(x0, x1), y0 + half)
+    if x0 == x1:
+        return Rectangle.spanning(x0 - half, min(y0, y1), x0 + half, max(y0, y1))
+    length, heading = math.dist(wall.start, wall.end), math.atan2(y1 - y0, x1 - x0)
+    return Rectangle((x0 + x1) / 2, (y0 + y1) / 2, length, wall.thickness, heading)
+
+
+def piece_rectangle(piece: Furniture) -> Rectangle:
+    """What a piece of furniture covers."""
+    return Rectangle(*piece.at, piece.length, piece.width, math.radians(piece.heading_deg), piece.name)
+
+
+def room_rectangle(room: Room) -> Rectangle:
+    """What a room covers."""
+    return Rectangle.spanning(*room.low, *room.high, room.name)
