@@ -12,8 +12,8 @@ from mapweave.picture import colours_of
 from mapweave.trial.recording import Lost, Moment
 from mapweave.trial.trajectories import TrajectoryScore
 
-MOST_MOMENTS = 40
-"""More are not numbered: the numbers could not be read."""
+NEAR = 0.02
+"""Moments that are nearer than this share of the time of all share one label."""
 PAUSE = 1.0
 """s; a longer time without a posture is a gap in the line."""
 DASHES = ("-", "--", ":", "-.")
@@ -39,13 +39,12 @@ def draw_errors(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     colours = colours_of(m.agent for m in scores)
-    for k, moment in enumerate(moments):
-        axes.axvline(moment.stamp_ns / 1e9, color="#cccccc", linewidth=0.8, zorder=1)
-        if len(moments) <= MOST_MOMENTS:
-            axes.annotate(
-                str(k + 1), (moment.stamp_ns / 1e9, 1.0), (0, 2), xycoords=("data", "axes fraction"),
-                textcoords="offset points", ha="center", fontsize=7, color="#888888",
-            )  # fmt: skip
+    for seconds, label in _labels(moments):
+        axes.axvline(seconds, color="#cccccc", linewidth=0.8, zorder=1)
+        axes.annotate(
+            label, (seconds, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
+            ha="center", fontsize=7, color="#888888",
+        )  # fmt: skip
     for k, one in enumerate(lost):
         label = "carried away" if k == 0 else None
         axes.axvline(one.stamp_ns / 1e9, color="#c0392b", linewidth=1.2, linestyle=":", zorder=2, label=label)
@@ -67,3 +66,15 @@ def draw_errors(
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside right upper", frameon=False, fontsize=9, title="map: ATE")
     figure.savefig(path, format="png")
+
+
+def _labels(moments: Sequence[Moment]) -> list[tuple[float, str]]:
+    """Time in s and label of the moments: `3`, or `3-5` for some that would be written over one another."""
+    near = NEAR * max((moment.stamp_ns for moment in moments), default=0)
+    labels: list[tuple[int, int, int]] = []
+    for number, moment in enumerate(moments, 1):
+        if labels and moment.stamp_ns - labels[-1][0] <= near:
+            labels[-1] = labels[-1][0], labels[-1][1], number
+        else:
+            labels.append((moment.stamp_ns, number, number))
+    return [(ns / 1e9, str(first) if first == last else f"{first}-{last}") for ns, first, last in labels]

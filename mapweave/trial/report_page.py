@@ -83,7 +83,8 @@ def report_page(
         lines += ["`pip install evo`, then, in this folder:", "", "```"]
         for truth, estimate in files.values():
             lines.append(f"evo_ape tum {truth} {estimate} --align")
-            lines.append(f"evo_rpe tum {truth} {estimate} --delta 1 --delta_unit m --pairs_from_reference")
+            rpe = f"evo_rpe tum {truth} {estimate} --delta 1 --delta_unit m --pairs_from_reference"
+            lines += [rpe, f"{rpe} --pose_relation angle_deg"]
         lines += ["```", ""]
     lines += ["## Again", ""]
     lines += ["```", f"mapweave sim run scenario.toml --seed {recording.seed}", "```", ""]

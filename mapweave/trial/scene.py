@@ -184,7 +184,7 @@ class Scene:
             self._furnished = self._bare.copy()
             self._fill(self._furnished, furniture, SOLID)
             for name, poses in zip(self._robots, self._nodes, strict=True):
-                self._draw_nodes(self._furnished, poses, _mixed(self._colours[name], 0.35))
+                self._draw_nodes(self._furnished, poses, self._colours[name])
         return self._furnished
 
     def _draw_nodes(self, frame: Frame, poses: Array, colour: Colour) -> None:
@@ -206,7 +206,7 @@ class Scene:
             trail.popleft()
         if len(trail) > 1:
             line = self._subpixels(np.array(trail)[:, 1:])
-            cv2.polylines(frame, [line], False, _mixed(self._colours[name], 0.2), 2, cv2.LINE_AA, SHIFT)
+            cv2.polylines(frame, [line], False, _mixed(self._colours[name], 0.4), 1, cv2.LINE_AA, SHIFT)
 
     def _draw_robot(self, frame: Frame, name: str, pose: Pose2) -> None:
         colour = self._colours[name]

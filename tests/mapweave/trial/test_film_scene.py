@@ -109,14 +109,13 @@ def test_trails_grow_fade_out_and_end_where_a_robot_is_carried():
     scene = Scene(PLAN, ["r0"])
     for tick in range(100):
         frame = scene.draw(snapshot(tick, {"r0": Pose2(1.0 + 0.03 * tick, 1.0)}))
-    trail = at(scene, frame, 2.0, 1.0)
-    assert trail not in (FLOOR, PAPER)
+    assert at(scene, frame, 2.0, 1.0) not in (FLOOR, PAPER)
     carried = scene.draw(snapshot(100, {"r0": Pose2(1.0, 3.0)}))
     assert at(scene, carried, 2.0, 1.0) == FLOOR
     for tick in range(101, 450):
         frame = scene.draw(snapshot(tick, {"r0": Pose2(min(1.0 + 0.02 * (tick - 101), 5.0), 3.0)}))
     assert at(scene, frame, 1.3, 3.0) == FLOOR, "older than half a minute"
-    assert at(scene, frame, 4.0, 3.0) == trail
+    assert at(scene, frame, 4.0, 3.0) not in (FLOOR, PAPER)
 
 
 def test_a_robot_that_is_seen_seldom_has_a_trail_too():

@@ -16,9 +16,11 @@ import pytest
 from hybridmap.errors import InvalidFile
 from hybridmap.hybrid_map import HybridMap
 from mapweave.trial import folder
+from mapweave.trial.error_plot import _labels
 from mapweave.trial.expectations import check, parse_expectations
 from mapweave.trial.figures import Figures
 from mapweave.trial.folder import write_folder
+from mapweave.trial.recording import Moment
 from mapweave.trial.score import score
 from wire.mapfile import read_map_file
 
@@ -73,9 +75,12 @@ def test_evo_reads_the_trajectories_and_finds_the_same_errors(written, tmp_path)
     assert ate == pytest.approx(figures.robots["r1"].trajectory_ate_m, abs=2e-6)
     page = (out / "report.md").read_text()
     assert f"evo_ape tum {files[0]} {files[1]} --align" in page
-    command = re.search(r"evo_rpe (tum r1.*)", page)[1].split()
-    rpe = evo("rpe", *command, folder=out, home=tmp_path / "another")
-    assert rpe == pytest.approx(figures.robots["r1"].rpe_m, abs=5e-6)
+    commands = re.findall(r"evo_rpe (tum r1.*)", page)
+    rpe_m, rpe_deg = (
+        evo("rpe", *command.split(), folder=out, home=tmp_path / str(k)) for k, command in enumerate(commands)
+    )
+    assert rpe_m == pytest.approx(figures.robots["r1"].rpe_m, abs=5e-6)
+    assert rpe_deg == pytest.approx(figures.robots["r1"].rpe_deg, abs=1e-3)
 
 
 def test_places_are_aligned_with_the_world(written, eventful):
@@ -107,6 +112,12 @@ def test_pictures_show_what_they_should(written):
     errors = cv2.imread(str(out / "errors.png"))
     assert errors.shape[1] > 1000
     assert (errors.min(axis=2) < 100).mean() > 0.01
+
+
+def test_moments_that_are_near_share_a_label():
+    moments = [Moment(int(s * 1e9), "") for s in (0.0, 50.0, 50.1, 51.9, 60.0, 100.0)]
+    assert _labels(moments) == [(0.0, "1"), (50.0, "2-4"), (60.0, "5"), (100.0, "6")]
+    assert _labels([]) == []
 
 
 def test_what_an_earlier_trial_left_is_gone_and_what_others_left_is_not(written):
