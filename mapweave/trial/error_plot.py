@@ -39,10 +39,10 @@ def draw_errors(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     colours = colours_of(m.agent for m in scores)
-    for seconds, label in _labels(moments):
-        axes.axvline(seconds, color="#cccccc", linewidth=0.8, zorder=1)
+    for when, numbers in _labels(moments):
+        axes.axvline(when, color="#cccccc", linewidth=0.8, zorder=1)
         axes.annotate(
-            label, (seconds, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
+            numbers, (when, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
             ha="center", fontsize=7, color="#888888",
         )  # fmt: skip
     for k, one in enumerate(lost):

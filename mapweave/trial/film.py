@@ -52,6 +52,7 @@ class Film:
         self._queue: queue.Queue[Frame | None] = queue.Queue(WAITING)
         self._writer: cv2.VideoWriter | None = None
         self._thread: threading.Thread | None = None
+        self._failure = ""
 
     def __enter__(self) -> Film:
         """Nothing more to do."""
@@ -80,13 +81,20 @@ class Film:
         self.frames += 1
 
     def close(self) -> None:
-        """Finish the film; without frames there is none. Twice is no error."""
+        """Finish the film; without frames there is none. Twice is no error.
+
+        Raises:
+            InvalidFile: OpenCV could not encode a frame.
+        """
         if self._thread is None or self._writer is None:
             return
         self._queue.put(None)
         self._thread.join()
         self._thread = None
         self._writer.release()
+        if self._failure:
+            self._beside.unlink(missing_ok=True)
+            raise InvalidFile(f"{self.path}: OpenCV cannot write it ({self._failure})")
         self._beside.replace(self.path)
 
     def _begin(self, frame: Frame) -> None:
@@ -109,8 +117,14 @@ class Film:
         self._thread.start()
 
     def _encode(self, writer: cv2.VideoWriter) -> None:
+        """Take every frame, also after a failure: who adds must never wait for ever."""
         while (frame := self._queue.get()) is not None:
-            writer.write(frame)
+            if self._failure:
+                continue
+            try:
+                writer.write(frame)
+            except cv2.error as error:
+                self._failure = str(error.err or error).strip().splitlines()[0]
 
 
 @contextmanager

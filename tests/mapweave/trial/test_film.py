@@ -103,3 +103,26 @@ def test_a_long_film_waits_for_the_encoder_and_misses_nothing(tmp_path):
         for frame in shown:
             film.add(frame)
     assert len(read(tmp_path / "film.webm")[0]) == 80
+
+
+def test_an_encoder_that_fails_is_one_line_and_holds_nobody_up(tmp_path, monkeypatch):
+    writer = cv2.VideoWriter
+
+    class Failing:
+        fourcc = writer.fourcc
+
+        def __init__(self, *arguments):
+            self.isOpened = lambda: True
+            self.release = lambda: None
+
+        def write(self, frame):
+            cv2.resize(frame, (0, 0))  # an error of OpenCV itself
+
+    monkeypatch.setattr(cv2, "VideoWriter", Failing)
+    film = Film(tmp_path / "film.webm")
+    for frame in frames(20) * 3:
+        film.add(frame)
+    with pytest.raises(InvalidFile, match="OpenCV cannot write it") as refusal:
+        film.close()
+    assert "\n" not in str(refusal.value)
+    assert list(tmp_path.iterdir()) == []
