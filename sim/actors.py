@@ -45,8 +45,8 @@ class Figure:
 
     @property
     def radius(self) -> float:
-        """Of the way that it needs, m."""
-        return self.width / 2
+        """Of the way that it needs, also where it turns, m."""
+        return math.hypot(self.length, self.width) / 2
 
 
 FIGURES = {"person": Figure(0.3, 0.45, 1.75), "box": Figure(0.4, 0.4, 0.4)}

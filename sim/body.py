@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from agent.observation import Command, Odometry, RobotDescription
 from hybridmap.pose import Array, Pose2
 from sim import surface
+from sim.camera import check_range
 from sim.floorplan import Rectangle
 from sim.physics import Physics
 from sim.texture import Texture
@@ -49,6 +50,20 @@ class BodySettings:
     motor_lag: float = 0.12
     motor_force: float = 1.5
     mass: float = 4.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no robot can be.
+
+        Raises:
+            InvalidValue: a number out of range.
+        """
+        within = {
+            "radius_error": (0.0, 0.1), "axle_error": (0.0, 0.2), "slip": (0.0, 0.3),
+            "ticks_per_turn": (8, 10**7), "motor_lag": (0.01, 2.0), "motor_force": (0.1, 20.0),
+            "mass": (1.0, 30.0),
+        }  # fmt: skip
+        for name, (low, high) in within.items():
+            check_range(f"body: {name}", getattr(self, name), low, high)
 
 
 class Body:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -91,5 +90,6 @@ def describe(fault: Fail) -> str:
     """One line for people."""
     if (fault.sensor, fault.how) == ("encoders", "spike"):
         return f"the encoders of {fault.robot} jump by {fault.size:g} m"
-    amount = f" by {fault.size:g}" if fault.size and math.isfinite(fault.size) else ""
-    return f"the {fault.sensor} of {fault.robot} fail ({fault.how}{amount}) for {fault.seconds:g} s"
+    verb = "fail" if fault.sensor.endswith("s") else "fails"
+    amount = f", {fault.size:g}" if fault.size else ""
+    return f"the {fault.sensor} of {fault.robot} {verb} ({fault.how}{amount}) for {fault.seconds:g} s"

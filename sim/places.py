@@ -19,8 +19,11 @@ STEP = 0.04
 """Legs of a path are looked at every so often, m."""
 APART = 0.45
 """Middles of two robots, or of a robot and somebody who walks, are at least so far apart, m."""
-BEARINGS = np.radians([0, 12, -12, 25, -25, 50, -50, 90, -90, 135, -135, 180])
-"""Where somebody might walk past a robot: before its camera if there is room, else beside, else behind."""
+AHEAD = tuple(math.radians(deg) for deg in (0, 12, -12, 25, -25))
+AROUND = tuple(math.radians(deg) for deg in (50, -50, 90, -90, 135, -135, 180))
+"""Directions from a robot in which somebody might walk past: before its camera if possible, else beside."""
+SLANTS = (0.0, 0.9, -0.9)
+"""Across what the robot sees if there is room, else obliquely, rad."""
 
 Points = Sequence[tuple[float, float]]
 
@@ -145,18 +148,21 @@ def past(plan: FloorPlan, rng: np.random.Generator, robot: Pose2, radius: float)
     Raises:
         InvalidValue: nobody fits anywhere near the robot.
     """
-    for shortest, nearest, farthest in ((1.2, 1.0, 2.5), (0.6, 0.8, 4.0)):
-        for bearing in BEARINGS.tolist():
-            for distance in rng.uniform(nearest, farthest, 8).tolist():
-                toward = robot.heading + bearing
-                x, y = robot.x + distance * math.cos(toward), robot.y + distance * math.sin(toward)
-                if not is_clear(plan, [(robot.x, robot.y), (x, y)], 0.02):
+    near, far = (1.0, 2.5), (0.8, 4.0)
+    for shortest, directions, (nearest, farthest) in (
+        (1.2, AHEAD, near), (0.6, AHEAD, near), (1.2, AROUND, near), (0.5, AHEAD + AROUND, far),
+    ):  # fmt: skip
+        for bearing in directions:
+            toward = robot.heading + bearing
+            for distance in rng.uniform(nearest, farthest, 6).tolist():
+                middle = robot.x + distance * math.cos(toward), robot.y + distance * math.sin(toward)
+                if not is_clear(plan, [(robot.x, robot.y), middle], 0.02):
                     continue
-                path = _longest(plan, (x, y), toward + math.pi / 2 + float(rng.uniform(-0.5, 0.5)), radius)
-                # Not straight into the robot.
-                away = sampled(path) - [robot.x, robot.y] if path else np.zeros((1, 2))
-                if np.hypot(*away.T).min() >= 0.7 and math.dist(path[0], path[-1]) >= shortest:
-                    return path if rng.random() < 0.5 else path[::-1]
+                for slant in SLANTS:
+                    angle = toward + math.pi / 2 + slant + float(rng.uniform(-0.4, 0.4))
+                    path = _longest(plan, middle, angle, radius)
+                    if path and math.dist(path[0], path[-1]) >= shortest and _misses(path, robot):
+                        return path if rng.random() < 0.5 else path[::-1]
     raise InvalidValue(f"nobody can walk near ({robot.x:.2f}, {robot.y:.2f}): there is no room")
 
 
@@ -184,6 +190,11 @@ def _longest(
             return []
         ends.append((float(points[last, 0]), float(points[last, 1])))
     return ends
+
+
+def _misses(path: Points, robot: Pose2) -> bool:
+    """Whether a path does not lead straight into a robot."""
+    return bool(np.hypot(*(sampled(path) - [robot.x, robot.y]).T).min() >= 0.7)
 
 
 def _apart(points: NDArray[np.float64], taken: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -117,7 +117,7 @@ class Renderer:
         ends = np.stack([corner, corner + along, corner + down, corner + along + down], axis=1)
         shown = ends @ (self._intrinsics @ camera_from_world).T
         x, y, z = shown[..., 0], shown[..., 1], shown[..., 2]
-        cut = (z < NEAR).any(axis=1) | (z > FAR).any(axis=1)
+        cut = np.asarray((z < NEAR).any(axis=1) | (z > FAR).any(axis=1))
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = x / z, y / z
         width, height = self.camera.width, self.camera.height

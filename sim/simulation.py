@@ -14,7 +14,6 @@ from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
 from sim import rangers
 from sim.body import body_panels
-from sim.camera import WEBCAM
 from sim.events import SimEvent
 from sim.happening import Happening
 from sim.places import starting_places
@@ -24,17 +23,10 @@ from sim.snapshot import Snapshot
 from sim.stage import SUBSTEPS, Stage
 from sim.world import World
 
-__all__ = ["TICK", "TICK_NS", "WEBCAM", "Simulation", "standard_robot"]
-
 TICK = 0.1
 """Simulated time of a tick, s."""
 TICK_NS = 100_000_000
 """Simulated time of a tick, ns."""
-
-
-def standard_robot() -> RobotDescription:
-    """What the agent of a robot without further wishes is told."""
-    return RobotSetup("r0").describe()
 
 
 class Simulation:

@@ -11,8 +11,9 @@ import pytest
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2
 from sim.renderer import Renderer
+from sim.scene import Scene
 from sim.texture import Texture
-from sim.world import Panel, PanelSet, upright_panel
+from sim.world import Panel, PanelSet, World, upright_panel
 
 CAMERA = Camera(320, 240, 277.0, 271.0, 159.5, 118.0, mount_height=0.3, mount_forward=0.07)
 COLUMNS, ROWS = 10, 8
@@ -100,6 +101,11 @@ def test_textures_stop_at_one_texel() -> None:
     assert level[0, 0] == 99
 
 
+def grey_of(panel):
+    """A grey for each panel; neighbours in number differ much."""
+    return 5 + 83 * panel % 251
+
+
 def random_panels(rng: np.random.Generator, count: int) -> PanelSet:
     """Parallelograms of different plain greys ahead of a robot, at any slant, many behind one another."""
     panels = []
@@ -108,28 +114,47 @@ def random_panels(rng: np.random.Generator, count: int) -> PanelSet:
         along, down = rng.normal(0, 0.3 * middle[0] + 0.1, (2, 3))
         if np.cross(along, down) @ middle < 0 and rng.random() < 0.7:
             along, down = down, along
-        panels.append(Panel(middle - along / 2 - down / 2, along, down, Texture.plain(10 + 8 * k)))
+        panels.append(Panel(middle - along / 2 - down / 2, along, down, Texture.plain(grey_of(k))))
     return PanelSet.of(panels)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_what_is_in_front_is_what_a_ray_meets_first(seed: int, caster) -> None:
-    """Every pixel of a world in disorder, seen by a tilted camera."""
+@pytest.mark.parametrize(("seed", "count"), [*((seed, 28) for seed in range(6)), (6, 150), (7, 150)])
+def test_what_is_in_front_is_what_a_ray_meets_first(seed: int, count: int, caster) -> None:
+    """Every pixel of a world in disorder, seen by a tilted camera; of many panels most are hidden."""
     rng = np.random.default_rng(seed)
     camera = Camera(80, 60, 60.0, 62.0, 41.0, 28.5, mount_height=0.3, mount_forward=0.1)
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))
     position = rng.uniform(-5, 5, 3)
-    panels = random_panels(rng, 28).placed(rotation, position)
+    panels = random_panels(rng, count).placed(rotation, position)
     image = Renderer(camera, 3).render(panels, rotation, position)
     v, u = np.mgrid[0:60, 0:80]
     pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
     truth = caster.cast(panels, camera, rotation, position, pixels)
-    greys = np.where(truth.panel >= 0, 10 + 8 * truth.panel, 3).reshape(60, 80)
+    greys = np.where(truth.panel >= 0, grey_of(truth.panel), 3).reshape(60, 80)
     sure = ~truth.doubtful.reshape(60, 80)
     assert sure.mean() > 0.98
     assert len(np.unique(greys)) > 5
     np.testing.assert_array_equal(image[sure], greys[sure])
+
+
+def test_a_scene_of_moved_sets_is_the_scene_of_their_places(office: World, stand) -> None:
+    """Sets that are placed later look as if they had been built there."""
+    rng = np.random.default_rng(8)
+    crates = [random_panels(rng, 6) for _ in range(3)]
+    scene = Scene([PanelSet.of(office.panels), *crates])
+    room = office.plan.rooms[1]
+    rotation, position = stand(Pose2(room.x, room.y, 0.3))
+    placed = []
+    for number, crate in enumerate(crates):
+        pose = stand(Pose2(room.x, room.y, float(rng.uniform(-1, 1))))
+        scene.place(number + 1, *pose)
+        placed.append(crate.placed(*pose))
+    whole = PanelSet.joined([PanelSet.of(office.panels), *placed])
+    images = [Renderer(CAMERA, 9).render(panels, rotation, position) for panels in (scene, whole)]
+    np.testing.assert_array_equal(*images)
+    alone = Renderer(CAMERA, 9).render(PanelSet.of(office.panels), rotation, position)
+    assert (images[0] != alone).mean() > 0.02
 
 
 def test_nothing_in_view_is_background(stand) -> None:

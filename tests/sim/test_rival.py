@@ -14,9 +14,9 @@ import numpy as np
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2
+from sim.camera import WEBCAM
 from sim.physics import Physics
 from sim.renderer import Renderer
-from sim.simulation import WEBCAM
 from sim.world import PanelSet, World
 
 

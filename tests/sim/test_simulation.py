@@ -125,6 +125,28 @@ def test_kidnap_is_not_noticed_by_the_encoders(office: World) -> None:
             assert abs(seen.odometry.turn) < 1e-3
 
 
+def test_the_solver_loses_next_to_nothing(bare: World) -> None:
+    """Ideal wheels over 9 m and three turns: where odometry says, to 1 % of what slip costs."""
+    ideal = BodySettings(radius_error=0.0, axle_error=0.0, slip=0.0)
+    legs = [
+        (0.3, 0.0, 100),
+        (0.0, 0.8, 80),
+        (0.3, 0.2, 100),
+        (0.0, -0.8, 80),
+        (0.3, -0.4, 100),
+        (0.0, 0.0, 10),
+    ]
+    with Simulation(bare, [RobotSetup("r0", body=ideal)], 1, [Pose2()]) as simulation:
+        pose = Pose2()
+        for forward, turn, ticks in legs:
+            for _ in range(ticks):
+                simulation.advance({"r0": Command(forward, turn)})
+                pose = pose @ simulation._robots["r0"].body.odometry().motion()
+        off = pose.inverse() @ simulation.truth("r0")
+    assert math.hypot(off.x, off.y) < 0.006
+    assert abs(off.heading) < math.radians(0.1)
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_commands_are_clipped(bare: World, sign: float) -> None:
     """Ten times the limit is the limit."""
