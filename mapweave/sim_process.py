@@ -13,7 +13,9 @@ PATIENCE = 60.0
 """How long the other robots wait for one that does not ask, s."""
 
 
-def run_sim(bus: Bus, fleet: str, scenario: Scenario, seed: int, stop: threading.Event, held: bool = False) -> None:
+def run_sim(
+    bus: Bus, fleet: str, scenario: Scenario, seed: int, stop: threading.Event, held: bool = False
+) -> None:
     """Serve the simulated bodies of a scenario until told to stop; `held`: time passes only when asked for.
 
     Raises:

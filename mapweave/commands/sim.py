@@ -55,8 +55,8 @@ def _add_run(kinds: Any) -> None:
     parser.add_argument("--out", type=Path, help="folder for the report (default: out/sim/NAME-SEED)")
     parser.add_argument("--no-film", action="store_true", help="make no film: a little quicker")
     parser.add_argument(
-        "--view", type=int, nargs="?", const=8765, metavar="PORT",
-        help="show the trial live at http://127.0.0.1:PORT (default port: 8765)",
+        "--view", type=int, nargs="?", const=8090, metavar="PORT",
+        help="show the trial live at http://127.0.0.1:PORT (default port: 8090)",
     )  # fmt: skip
     _add_fleet(parser)
     parser.set_defaults(run=run_one)

@@ -17,6 +17,7 @@ from mapweave.trial.live import Live
 from mapweave.trial.scene import Scene
 
 FILM = "film.webm"
+FRAMES_PER_SECOND = 10.0
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,11 @@ def filming(
         return
     with ExitStack() as stack:
         title = f"{stage.scenario.name}, seed {stage.seed}"
-        film = stack.enter_context(Film(out / FILM)) if options.film else None
+        film = stack.enter_context(Film(out / FILM, FRAMES_PER_SECOND)) if options.film else None
         live = None if options.port is None else stack.enter_context(Live(options.port, title))
         if live is not None:
             options.say(f"watch at {live.url}")
-        scene = Scene(fleet.control.plan(), stage.robots)
+        scene = Scene(fleet.control.plan(), stage.robots, title)
         places: dict[str, list[tuple[float, float, float]]] = {robot: [] for robot in stage.robots}
         due = 0.0
 

@@ -55,6 +55,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
 
             def agents():
                 return reports.agents(["r0", "r1"])
+
             for name in ("r0", "r1"):
                 children.start(
                     name, ["agent", name, "--data", str(tmp_path), "--epoch", "1", "--lockstep", *network]

@@ -34,7 +34,7 @@ robot = "r0"
 [[events]]
 do = "goto"
 robot = "r0"
-goal = "own"
+goal = "r0.1.1"
 [[events]]
 plus = 8.0
 do = "wait"

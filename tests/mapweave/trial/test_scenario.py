@@ -162,6 +162,6 @@ def test_those_that_come_with_mapweave_can_be_read_and_their_worlds_hold_their_r
 
 def test_an_unknown_name_lists_the_known_ones():
     with pytest.raises(
-        SettingsError, match="no scenario 'offices'; give a .toml file or one of agent-killed"
+        SettingsError, match=r"no scenario 'offices'; give a \.toml file or one of agent-killed"
     ):
         scenario_path("offices")
