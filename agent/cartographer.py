@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,9 +122,13 @@ class Cartographer:
         changes: list[ChangeBody] = []
         placed = self._node(anchor, tracking, changes)
         if placed is not None:
-            if self._last is not None:
+            loops = self._close_loops(placed.node)
+            if self._last is not None and self._last.evidence and loops:
+                self._settle(placed, loops)
+                changes = [NodePut(placed.node)]
+            elif self._last is not None:
                 changes.append(EdgePut(self._edge(self._last, placed, self._last.node_from_anchor)))
-            changes += self._close_loops(placed.node)
+            changes += [EdgePut(edge) for edge in loops]
             self._last = placed
             for leaf in leaves:
                 beside = self._node(leaf, tracking, changes)
@@ -216,6 +220,16 @@ class Cartographer:
         evidence = a.evidence or {"shared": float(len(shared))}
         return Edge(self._number(), a.node.id, b.node.id, a_from_b, kind, shared, evidence)
 
+    def _settle(self, placed: Placed, loops: list[Edge]) -> None:
+        """Correct where the first node after a recognition is, by the surest of its edges.
+
+        The recognition knew depths in the old node only; an edge between two nodes has them on both sides,
+        and is seldom off by as much.
+        """
+        best = min(loops, key=lambda edge: edge.evidence["sigma_xy"])
+        self.map_from_anchor = self.map.nodes[best.a].map_from_robot @ best.a_from_b
+        placed.node = replace(placed.node, map_from_robot=self.map_from_anchor)
+
     def _sober(self, moved: PoseGaussian) -> PoseGaussian:
         """A posture of the filter with the uncertainty that the filter cannot know."""
         s = self._settings
@@ -225,20 +239,19 @@ class Cartographer:
         more = np.diag([position**2, position**2, heading**2])
         return PoseGaussian(moved.mean, moved.covariance + more)
 
-    def _close_loops(self, node: Node) -> list[ChangeBody]:
+    def _close_loops(self, node: Node) -> list[Edge]:
         """Recognise places of the own map (paper, section 5): each gives a new edge."""
         s, near = self._settings, []
         for other in self.map.nodes.values():
             between = other.map_from_robot.mean.inverse() @ node.map_from_robot.mean
             reach = float(np.hypot(between.x, between.y))
-            fresh = self._last is None or other.id != self._last.node.id
-            if fresh and reach < s.loop_reach and abs(between.heading) < s.loop_turn:
+            joined = self._last is not None and other.id == self._last.node.id and not self._last.evidence
+            if not joined and reach < s.loop_reach and abs(between.heading) < s.loop_turn:
                 near.append((reach, other))
-        changes: list[ChangeBody] = []
+        edges: list[Edge] = []
         for _, other in sorted(near, key=lambda pair: pair[0])[: s.loop_tries]:
             found = register(other, node, None, self._rng)
             if found is not None and found.evidence["sigma_xy"] < s.loop_sigma:
                 posture, pairs, evidence = found.node_from_robot, found.pairs, found.evidence
-                edge = Edge(self._number(), other.id, node.id, posture, EdgeKind.LOOP, pairs, evidence)
-                changes.append(EdgePut(edge))
-        return changes
+                edges.append(Edge(self._number(), other.id, node.id, posture, EdgeKind.LOOP, pairs, evidence))
+        return edges

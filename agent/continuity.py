@@ -25,6 +25,10 @@ PATCH_PX = 11
 GRID = (6, 8)
 """Rows and columns of the image's cells, each of which gives at most one corner."""
 
+LEAST_GAIN, MOST_GAIN = 0.5, 4.0
+"""How much a light may change: a darker image has too few grey levels left to be tracked in, and one that is
+made much fainter to be like a blank wall shows as little as that."""
+
 
 class Sight(Enum):
     """What an image shows, compared with one before it."""
@@ -133,6 +137,13 @@ class Continuity:
         y = cell // GRID[1] * rows + best // columns
         corners: Array = np.stack([x, y], axis=1)[strong].astype(np.float64)
         return corners
+
+
+def relit(image: NDArray[np.uint8], like: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image as bright and as rich in contrast as another: somebody may have switched a lamp on or off."""
+    (mean, spread), (wanted, wanted_spread) = ((float(one.mean()), float(one.std())) for one in (image, like))
+    gain = min(max(wanted_spread / max(spread, 1.0), LEAST_GAIN), MOST_GAIN)
+    return cv2.convertScaleAbs(image, alpha=gain, beta=wanted - gain * mean).astype(np.uint8, copy=False)
 
 
 def turned(camera: Camera, pixels: Array, turn: float) -> Array:

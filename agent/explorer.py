@@ -120,7 +120,7 @@ class Explorer:
 
     def restart(self) -> None:
         """Begin again from where the robot is now: it was lost, and knows its posture again."""
-        self.phase = Phase.LOOKING
+        self.phase, self.detail = Phase.LOOKING, ""
         self._behaviour = self._explore()
 
     # Behaviours

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,15 +74,13 @@ def recall_all(
     return sorted(recalled, key=lambda pair: -pair[1].inliers)
 
 
-def exact_enough(posture: PoseGaussian, sure: tuple[float, float], looked: float) -> bool:
+def exact_enough(posture: PoseGaussian, sure: tuple[float, float], leniency: float = 1.0) -> bool:
     """Whether a recognition is exact enough to go on from; else another look, elsewhere, costs little.
 
     Args:
         posture: `node_from_robot`.
-        sure: standard deviations that are good enough at once, m and rad.
-        looked: rad, how far the robot has turned to look around: the longer it has looked, the less it asks
-            for, twice as much after a whole turn.
+        sure: standard deviations that are good enough, m and rad.
+        leniency: by how much they may be larger.
     """
     sigma = np.sqrt(np.diag(posture.covariance))
-    leniency = 1.0 + looked / math.tau
     return bool(max(sigma[:2]) <= sure[0] * leniency and sigma[2] <= sure[1] * leniency)

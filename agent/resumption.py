@@ -37,7 +37,8 @@ class ResumptionSettings:
         speed: m/s.
         least_features: a view with fewer cannot be recognised.
         least_views: if fewer looks had a view than this share, it has not looked around: the lens is covered.
-        sure: standard deviations up to which it believes a recognition at once, m and rad.
+        sure: standard deviations up to which it believes a recognition, m and rad. A robot that only wants to
+            drive asks for less the longer it has looked; an edge that is off bends the map for good.
         rival: another node with this share of the best one's inliers has a say too;
         apart: if it puts the robot further away than this, m, two places look the same, and neither is
             believed.
@@ -118,7 +119,6 @@ class Resumption:
         self._rng = np.random.default_rng(seed)
         self._observation: Observation | None = None
         self._odom_from_robot = Pose2()
-        self._looked = 0.0
         self._looks = self._views = 0
         self._behaviour = self._search() if drives else self._wait_to_be_carried()
 
@@ -163,11 +163,9 @@ class Resumption:
             if self._look():
                 return
             yield from self._turn(self._settings.look_turn)
-            self._looked += self._settings.look_turn
 
     def _wait_to_be_carried(self) -> Generator[Command, None, None]:
         while not self._look():
-            self._looked += self._settings.look_turn
             if self._views >= self._settings.carried_looks:
                 self.lost = True
                 self.detail = (
@@ -224,7 +222,7 @@ class Resumption:
             if also.inliers >= s.rival * recognition.inliers and here.distance(there) > s.apart:
                 self.detail = f"nodes {node.id} and {other.id} look the same"
                 return False
-        if not exact_enough(recognition.node_from_robot, s.sure, self._looked):
+        if not exact_enough(recognition.node_from_robot, s.sure):
             self.detail = f"node {node.id} is in view, but too far off"
             return False
         self.detail = f"node {node.id}: {recognition.inliers} landmarks agree"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.continuity import Continuity, ContinuitySettings, Sight, turned
+from agent.continuity import Continuity, ContinuitySettings, Sight, relit, turned
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.observation import Observation, RobotDescription
@@ -71,6 +71,7 @@ class Tracking:
         """Start with nothing in view."""
         self.history = TrackHistory()
         self._camera = description.camera
+        self._lens = lens
         self._settings = settings
         self._tracker = Tracker(lens, settings.tracker)
         self._filter = MappingFilter(
@@ -168,23 +169,35 @@ class Tracking:
 
     def _follow(self, image: NDArray[np.uint8]) -> bool:
         """Follow the tracks into an image; returns whether it is believed."""
-        before, expected = copy.copy(self._tracker), self._expected()
-        self._tracker.track(image, expected)
+        believed, moved, (way, turn) = self._believed, self._since_believed, self._settings.stale
+        if believed is None or np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn:
+            self._tracker.track(image, self._expected())
+        else:
+            sight = self._see(image, believed)
+            if sight is not Sight.SAME and self._see(relit(image, believed), believed) is Sight.SAME:
+                # The next image will be in the same light as this one really is.
+                followed, self._tracker = self._tracker, Tracker(self._lens, self._settings.tracker)
+                self._tracker.track(image)
+                self._tracker.add(followed.ids, followed.raw)
+            elif sight is not Sight.SAME:
+                self.strange += sight is Sight.STRANGE
+                self.blank += sight is Sight.BLANK
+                return False
+        self.strange = self.blank = 0
+        self._believed, self._since_believed = image, Pose2()
+        return True
+
+    def _see(self, image: NDArray[np.uint8], believed: NDArray[np.uint8]) -> Sight:
+        """Follow the tracks into an image; if it does not continue the one before, they stay behind."""
+        tracker, expected = copy.copy(self._tracker), self._expected()
+        tracker.track(image, expected)
         found = np.full(expected.shape, np.nan)
-        found[np.isin(before.ids, self._tracker.ids)] = self._tracker.pixels
-        moved, (way, turn) = self._since_believed, self._settings.stale
-        stale = np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn
-        sight = Sight.SAME
-        if self._believed is not None and not stale:
-            sight = self._continuity.compare(self._believed, image, moved.heading, expected, found)
+        found[np.isin(self._tracker.ids, tracker.ids)] = tracker.pixels
+        turn = self._since_believed.heading
+        sight = self._continuity.compare(believed, image, turn, expected, found)
         if sight is Sight.SAME:
-            self.strange = self.blank = 0
-            self._believed, self._since_believed = image, Pose2()
-            return True
-        self._tracker = before
-        self.strange += sight is Sight.STRANGE
-        self.blank += sight is Sight.BLANK
-        return False
+            self._tracker = tracker
+        return sight
 
     def _expected(self) -> Array:
         """(N, 2) px where the tracks should be now: by the filter, else by the turn alone."""
