@@ -1,4 +1,4 @@
-"""PyBullet's own camera on a world's blocks without textures: what a simulator on PyBullet pays at the least."""
+"""PyBullet's own camera on a world's blocks without textures: the least that a simulator on it pays."""
 
 from __future__ import annotations
 
@@ -21,11 +21,8 @@ class BareView:
         self._physics = p = Physics()
         for block in world.blocks:
             base, height = block.base, block.top - block.bottom
-            shape = p.createVisualShape(
-                p.GEOM_BOX,
-                halfExtents=[base.length / 2, base.width / 2, height / 2],
-                rgbaColor=[0.6, 0.6, 0.6, 1],
-            )
+            half = [base.length / 2, base.width / 2, height / 2]
+            shape = p.createVisualShape(p.GEOM_BOX, halfExtents=half, rgbaColor=[0.6, 0.6, 0.6, 1])
             p.createMultiBody(
                 0, -1, shape, [base.x, base.y, block.bottom + height / 2],
                 p.getQuaternionFromEuler([0, 0, base.heading]),
