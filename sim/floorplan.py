@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -182,8 +182,9 @@ class FloorPlan:
 
 
 def largest_part(regions: Sequence[Array], room: Rectangle) -> Array:
-    """(N, 2) m, in world: the largest of what of each region lies in a room."""
-    parts = (region[distances_to([room], region) <= 1e-9] for region in regions)
+    """(N, 2) m, in world: the largest of what of each region lies in a room, by more than `random_pose` moves it."""
+    inner = replace(room, length=max(room.length - CELL / 2, 0.0), width=max(room.width - CELL / 2, 0.0))
+    parts = (region[distances_to([inner], region) <= 1e-9] for region in regions)
     return max(parts, key=len, default=np.zeros((0, 2)))
 
 

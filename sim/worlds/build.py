@@ -19,7 +19,7 @@ from sim.world import Block, Panel, Piece, World, block_panels, upright_panel
 from sim.worlds.design import DARK, Design, Furniture, Poster, Room, Wall, check_design, floor_area
 from sim.worlds.faces import BEFORE, cut_face, nearest_face, room_before
 from sim.worlds.lamps import lamps_of
-from sim.worlds.layout import plan_of
+from sim.worlds.layout import exact, plan_of
 from sim.worlds.light import Lit, Vector
 from sim.worlds.textures import NOTHING, Textures
 
@@ -31,10 +31,6 @@ NEAR_WALL = 0.5
 """A poster's place is at most so far from its wall, m."""
 MAX_TEXELS = 2048
 """Of one texture across and down; larger surfaces are coarser."""
-QUANTUM = 2.0**-20
-"""Panels are placed to a millionth of a metre: a world moved by whole metres is then drawn the same to the
-last bit, which is what makes twin rooms twins."""
-
 ROOMS, WALLS, FURNITURE, POSTERS, PAINT, SHARED = range(6)
 """What textures' seeds are for."""
 
@@ -205,7 +201,7 @@ class _Builder:
     def _textured(self, bare: Panel, name: str, seed: tuple[int, ...], lit: bool, where: str) -> Panel:
         """A panel in its exact place, with its texture; equal textures are one object."""
         corner, right, left = (
-            _exact(v) for v in (bare.corner, bare.corner + bare.along, bare.corner + bare.down)
+            exact(v) for v in (bare.corner, bare.corner + bare.along, bare.corner + bare.down)
         )
         along, down = right - corner, left - corner
         room = self._facing(corner, along, down)
@@ -240,12 +236,6 @@ def _start_rooms(design: Design) -> tuple[str, ...]:
     called = tuple(room.name for room in design.rooms if room.name.startswith("room"))
     large = tuple(room.name for room in design.rooms if floor_area(room) >= DARK)
     return design.start_rooms or called or large
-
-
-def _exact(point: Array) -> Array:
-    """A point on the grid of panels' corners."""
-    rounded: Array = np.round(point / QUANTUM) * QUANTUM
-    return rounded
 
 
 def _vector(v: Array) -> Vector:

@@ -55,11 +55,12 @@ def corridor(parameters: CorridorParameters, seed: int) -> Design:
     rng = np.random.default_rng([seed, 0xC0441D04])
     paint = int(rng.integers(150, 200))
     x, y, b = parameters.length, parameters.width, parameters.breadth
+    # Each side has one corner, so that each is longer than it is broad.
     rooms = (
-        Room("south", (0.0, 0.0), (x, b), paint=paint),
-        Room("east", (x - b, b), (x, y - b), paint=paint),
-        Room("north", (0.0, y - b), (x, y), paint=paint),
-        Room("west", (0.0, b), (b, y - b), paint=paint),
+        Room("south", (0.0, 0.0), (x - b, b), paint=paint),
+        Room("east", (x - b, 0.0), (x, y - b), paint=paint),
+        Room("north", (b, y - b), (x, y), paint=paint),
+        Room("west", (0.0, b), (b, y), paint=paint),
     )
     outer = [(0.0, 0.0), (x, 0.0), (x, y), (0.0, y)]
     inner = [(b, b), (b, y - b), (x - b, y - b), (x - b, b)]

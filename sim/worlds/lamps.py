@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from hybridmap.pose import Array
 from sim.floorplan import FloorPlan, distances_to
 from sim.worlds.design import DARK, Design, Room, floor_area
+from sim.worlds.layout import exact
 from sim.worlds.light import Vector
 
 SPACING = 3.2
@@ -17,31 +19,25 @@ OPEN = 0.3
 
 
 def lamps_of(design: Design, plan: FloorPlan) -> list[tuple[Vector, ...]]:
-    """For each room the lamps that shine into it, in its own frame: its own, and those of rooms it is open to."""
+    """For each room the lamps that shine into it, in its frame: its own, and those of rooms it is open to."""
     own = [_hung(room, design.height) for room in design.rooms]
     lamps = []
     for number, room in enumerate(design.rooms):
         others = [k for k in _touching(design, number) if _open(design, plan, number, k)]
-        shine = [
-            (x + design.rooms[k].low[0] - room.low[0], y + design.rooms[k].low[1] - room.low[1], z)
-            for k in others
-            for x, y, z in own[k]
-        ]
-        lamps.append((*own[number], *shine))
+        shine = [own[number], *(own[k] + [*np.subtract(design.rooms[k].low, room.low), 0.0] for k in others)]
+        lamps.append(tuple((x, y, z) for x, y, z in exact(np.concatenate(shine)).tolist()))
     return lamps
 
 
-def _hung(room: Room, height: float) -> tuple[Vector, ...]:
-    """Lamps under the ceiling of a room, m, in the room; none in a door opening."""
+def _hung(room: Room, height: float) -> Array:
+    """(N, 3) m, in the room: lamps under its ceiling; none in a door opening."""
     if floor_area(room) < DARK:
-        return ()
-    length, width = room.high[0] - room.low[0], room.high[1] - room.low[1]
-    columns, rows = (max(1, round(side / SPACING)) for side in (length, width))
-    return tuple(
-        (length * (column + 0.5) / columns, width * (row + 0.5) / rows, height - DROP)
-        for row in range(rows)
-        for column in range(columns)
-    )
+        return np.zeros((0, 3))
+    size = np.subtract(room.high, room.low)
+    columns, rows = np.maximum(np.round(size / SPACING), 1).astype(int).tolist()
+    x, y = (size[axis] * (np.arange(n) + 0.5) / n for axis, n in enumerate((columns, rows)))
+    x, y = np.meshgrid(x, y)
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height - DROP)])
 
 
 def _touching(design: Design, number: int) -> list[int]:

@@ -1,11 +1,18 @@
-"""What the parts of a design cover on the floor."""
+"""Where the parts of a design are: what they cover on the floor, and to which precision."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from hybridmap.pose import Array
 from sim.floorplan import FloorPlan, Rectangle
 from sim.worlds.design import Design, Furniture, Room, Wall
+
+QUANTUM = 2.0**-20
+"""Panels and lamps are placed to a millionth of a metre: a world moved by whole metres is then drawn the same to the
+last bit, which is what makes twin rooms twins."""
 
 
 def plan_of(design: Design) -> FloorPlan:
@@ -37,3 +44,9 @@ def piece_rectangle(piece: Furniture) -> Rectangle:
 def room_rectangle(room: Room) -> Rectangle:
     """What a room covers."""
     return Rectangle.spanning(*room.low, *room.high, room.name)
+
+
+def exact(points: Array) -> Array:
+    """Points on the grid of panels and lamps."""
+    rounded: Array = np.round(points / QUANTUM) * QUANTUM
+    return rounded
