@@ -120,7 +120,7 @@ class Imager:
         moved = abs(turned) * camera.fx
         if moved <= LEAST_BLUR_PX:
             return image
-        layers = min(MOST_LAYERS, math.ceil(moved) + 1)
+        layers = min(MOST_LAYERS, max(2, math.ceil(moved)))
         intrinsics = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
         total = np.zeros(image.shape, np.uint16)
         for angle in turned * ((np.arange(layers) + 0.5) / layers - 0.5):
