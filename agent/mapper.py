@@ -141,6 +141,7 @@ class Mapper:
         self._tracking.step(observation)
         if self._tracking.carried_off:
             self.lose()
+            self._tracking.step(observation)
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
