@@ -182,7 +182,7 @@ class FloorPlan:
 
 
 def largest_part(regions: Sequence[Array], room: Rectangle) -> Array:
-    """(N, 2) m, in world: the largest of what of each region lies in a room, by more than `random_pose` moves it."""
+    """(N, 2) m, in world: the largest part of a region in a room; `random_pose` does not leave it."""
     inner = replace(room, length=max(room.length - CELL / 2, 0.0), width=max(room.width - CELL / 2, 0.0))
     parts = (region[distances_to([inner], region) <= 1e-9] for region in regions)
     return max(parts, key=len, default=np.zeros((0, 2)))

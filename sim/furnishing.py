@@ -36,14 +36,18 @@ class Site:
 
     Connections are compared within this part of the building alone: two places that are joined only by a
     way around the building count as apart, so the answer errs on the side of free floor.
+
+    Attributes:
+        regions: of floor where a robot fits, in and around the room.
     """
 
-    def __init__(self, plan: FloorPlan, room: Rectangle) -> None:
+    def __init__(self, plan: FloorPlan, room: Rectangle, most_regions: int | None = None) -> None:
         """Measure the free floor.
 
         Args:
             plan: with all that stands already.
             room: upright, of the plan.
+            most_regions: into which what a piece leaves of the floor may fall, if fewer than now.
         """
         x, y = room.length / 2 + AROUND, room.width / 2 + AROUND
         window = (room.x - x, room.y - y, room.x + x, room.y + y)
@@ -53,7 +57,9 @@ class Site:
         rooms = [r for r in plan.rooms if _near(r, near)]
         self._grid = Grid.of(rooms, self._solids, plan.bounds, window)
         self._middles = [cells for r in rooms if (cells := self._middle(r)).any()]
-        self._pockets, passages = _components(self._grid, ROBOT)[0], _components(self._grid, PASSAGE)[1]
+        self.regions = _components(self._grid, ROBOT)[0]
+        self._most = self.regions if most_regions is None else min(self.regions, most_regions)
+        passages = _components(self._grid, PASSAGE)[1]
         self._joined = [_labels(passages, cells) for cells in self._middles]
 
     def allows(self, piece: Rectangle) -> bool:
@@ -64,7 +70,8 @@ class Site:
         """The piece stands there from now on."""
         self._grid.add(piece)
         self._solids.append(piece)
-        self._pockets = _components(self._grid, ROBOT)[0]
+        self.regions = _components(self._grid, ROBOT)[0]
+        self._most = min(self._most, self.regions)
 
     def _fits(self, piece: Rectangle) -> bool:
         beyond = np.abs(piece.corners - [self.room.x, self.room.y])
@@ -74,7 +81,7 @@ class Site:
 
     def _leaves_way(self, piece: Rectangle) -> bool:
         grid = self._grid.with_box(piece)
-        if _components(grid, ROBOT)[0] > self._pockets:
+        if _components(grid, ROBOT)[0] > self._most:
             return False
         passages = _components(grid, PASSAGE)[1]
         now = [_labels(passages, cells) for cells in self._middles]
@@ -136,7 +143,8 @@ def rearrange(
             continue
         room = plan.room(name)
         others = (*plan.furniture[:index], *plan.furniture[index + 1 :])
-        site = Site(replace(plan, furniture=others), room)
+        # Where the piece stood it may have filled a corner that now must not become a trap.
+        site = Site(replace(plan, furniture=others), room, most_regions=Site(plan, room).regions)
         for _ in range(TRIES):
             place = (against_wall if rng.random() < 0.6 else standing)(rng, room, piece)
             if math.hypot(place.x - piece.x, place.y - piece.y) < AWAY:

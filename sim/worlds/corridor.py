@@ -67,7 +67,11 @@ def corridor(parameters: CorridorParameters, seed: int) -> Design:
     faces = [(ring[k], ring[(k + 1) % 4]) for ring in (outer, inner) for k in range(4)]
     # Outer walls close their corners behind the floor; the inner ones would stand out into it.
     walls = tuple(_behind(*face, THICKNESS if k < 4 else 0.0) for k, face in enumerate(faces))
-    posters = tuple(poster for face in faces for poster in _hang(rng, *face, parameters.spacing))
+    posters = tuple(
+        poster
+        for k, face in enumerate(faces)
+        for poster in _hang(rng, *face, parameters.spacing, head=b if k < 4 else 0.0)
+    )
     names = tuple(room.name for room in rooms)
     return Design(
         f"corridor-{seed}", seed, start_rooms=names, look_along=True,
@@ -83,14 +87,27 @@ def _behind(start: Point, end: Point, longer: float) -> Wall:
     return Wall(_point(a), _point(b), texture="plaster")
 
 
-def _hang(rng: np.random.Generator, start: Point, end: Point, spacing: float) -> list[Poster]:
-    """Prints, signs and doors along a face at irregular distances."""
+def _hang(rng: np.random.Generator, start: Point, end: Point, spacing: float, head: float) -> list[Poster]:
+    """Prints, signs and doors along a face at irregular distances.
+
+    Args:
+        rng: where chance comes from.
+        start: where the face begins; the floor is to its left.
+        end: where it ends.
+        spacing: of prints on the average, m.
+        head: at both ends so much of the face is what one sees down another side of the ring, m; a print
+            hangs there in any case.
+    """
     size = math.dist(start, end)
     ahead = (np.array(end) - start) / size
     left = np.array([-ahead[1], ahead[0]])
     posters: list[Poster] = []
-    free, at = CORNER, float(rng.uniform(0.2, 0.9)) * spacing
-    while at < size - CORNER:
+    free, last = CORNER, False
+    at = float(rng.uniform(0.3, 0.7) * head if head else rng.uniform(0.2, 0.9) * spacing)
+    final = size - float(rng.uniform(0.3, 0.7)) * head
+    while not last:
+        if head and at > final - 0.6 * spacing:
+            at, last = final, True
         width, height, bottom, texture = _print(rng)
         middle = max(at, free + width / 2)
         if middle + width / 2 > size - CORNER:

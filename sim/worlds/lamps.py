@@ -33,7 +33,7 @@ def _hung(room: Room, height: float) -> Array:
     """(N, 3) m, in the room: lamps under its ceiling; none in a door opening."""
     if floor_area(room) < DARK:
         return np.zeros((0, 3))
-    size = np.subtract(room.high, room.low)
+    size = exact(np.subtract(room.high, room.low))
     columns, rows = np.maximum(np.round(size / SPACING), 1).astype(int).tolist()
     x, y = (size[axis] * (np.arange(n) + 0.5) / n for axis, n in enumerate((columns, rows)))
     x, y = np.meshgrid(x, y)

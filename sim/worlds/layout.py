@@ -11,8 +11,8 @@ from sim.floorplan import FloorPlan, Rectangle
 from sim.worlds.design import Design, Furniture, Room, Wall
 
 QUANTUM = 2.0**-20
-"""Panels and lamps are placed to a millionth of a metre: a world moved by whole metres is then drawn the same to the
-last bit, which is what makes twin rooms twins."""
+"""Panels and lamps are placed to a millionth of a metre: a world moved by whole metres is then drawn the same
+to the last bit, which is what makes twin rooms twins."""
 
 
 def plan_of(design: Design) -> FloorPlan:
