@@ -169,7 +169,8 @@ def clothes(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
     for _ in range(14):
         x, y = int(rng.integers(width_px)), int(rng.integers(head, shoes))
         lean, length = int(rng.integers(-18, 19)), int(rng.integers(20, 90))
-        cv2.line(canvas, (x, y), (x + lean, y + length), float(rng.uniform(20, 130)), 2, cv2.LINE_AA)
+        shade = float(canvas[y, x] + rng.choice([-25.0, -18.0, 16.0]))
+        cv2.line(canvas, (x, y), (x + lean, y + length), shade, 2, cv2.LINE_AA)
     middle = width_px // 2
     cv2.line(canvas, (middle, waist), (middle, shoes), 12.0, 5)  # between the legs
     canvas[waist : waist + 9] = 25.0  # belt

@@ -117,7 +117,7 @@ class MoveFurniture:
     """Furniture stands elsewhere from now on.
 
     Attributes:
-        share: of the pieces.
+        share: of the pieces, more than 0.
     """
 
     share: float = 0.3
@@ -126,9 +126,9 @@ class MoveFurniture:
         """Refuse what is no share.
 
         Raises:
-            InvalidValue: it is not between 0 and 1.
+            InvalidValue: it is not above 0 and at most 1.
         """
-        check_range("move_furniture: share", self.share, 0.0, 1.0)
+        check_range("move_furniture: share", self.share, 1e-3, 1.0)
 
 
 WAYS_TO_FAIL: dict[str, dict[str, tuple[float, float, float]]] = {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import TracebackType
 
 import numpy as np
@@ -69,6 +71,7 @@ class Simulation:
             for k, (setup, place) in enumerate(zip(setups, places, strict=True))
         }
         self._happening = Happening(self._stage, self._robots, seed)
+        self._clock = re.sub(r"[^a-z0-9-]", "-", f"sim-{world.name}-{seed}".lower())[:32]
         self._wall = {"physics": 0.0, "rangers": 0.0}
         self._log: dict[str, list[Array]] = {name: [] for name in self.robots}
         self._sense()
@@ -104,8 +107,8 @@ class Simulation:
         return {**self._wall, "render": sum(robot.render_seconds for robot in self._robots.values())}
 
     def describe(self, name: str) -> RobotDescription:
-        """What the robot's agent may know of its body."""
-        return self._robot(name).description
+        """What the robot's agent may know of its body. All robots of a simulation have one clock."""
+        return replace(self._robot(name).description, clock=self._clock)
 
     def step(self, commands: Mapping[str, Command]) -> dict[str, Observation]:
         """Advance one tick and observe with every robot, in the order of their names."""
