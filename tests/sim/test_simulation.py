@@ -15,7 +15,7 @@ from agent.observation import Command
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2
 from sim.body import BodySettings
-from sim.robots import RobotSetup
+from sim.robots import RobotSetup, camera_from_table
 from sim.simulation import Simulation
 from sim.world import World
 from sim.worlds.office import make_office
@@ -270,3 +270,15 @@ def test_robots_of_the_same_name_are_refused(bare: World) -> None:
     """One line that says so."""
     with pytest.raises(InvalidValue, match="same name"):
         Simulation(bare, ["r0", "r0"], 1)
+
+
+def test_robots_differ_in_rangers_and_cameras(bare: World) -> None:
+    """Each senses with its own: also one without rangers, and pictures of another size."""
+    small = camera_from_table({"intrinsics": {"width": 160, "height": 120, "cx": 79.5, "cy": 59.5}})
+    robots = [RobotSetup("a", rangers=0), RobotSetup("b", rangers=5, camera=small), "c"]
+    with Simulation(bare, robots, 1, [Pose2(), Pose2(1.0, 0.0, 3.14), Pose2(0.0, 9.0)]) as simulation:
+        seen = simulation.step({})
+        assert [len(seen[name].proximity) for name in "abc"] == [0, 5, 16]
+        assert [seen[name].image.shape for name in "abc"] == [(240, 320), (120, 160), (240, 320)]
+        assert seen["b"].proximity[0] == pytest.approx(1.0 - 2 * 0.16, rel=0.06)
+        assert simulation.describe("b").camera == small.intrinsics
