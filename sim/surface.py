@@ -63,7 +63,7 @@ def cladding(rng: np.random.Generator, width_px: int, height_px: int, paint: flo
     shade = np.select([rib < 0.4, rib < 0.5, rib < 0.9], [1.0, 0.8, 0.93], 1.08)
     surface = paint * shade[None, :] + 4 * _seamless(clouds(rng, width_px, height_px, 1.3), across=True)
     canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
-    plinth = int(0.25 * TEXELS_PER_METRE)
+    plinth = min(int(0.25 * TEXELS_PER_METRE), height_px // 3)
     canvas[height_px - plinth :] = concrete(rng, width_px, plinth, 0.8 * paint)
     screws = np.flatnonzero(np.diff((rib < 0.2).astype(np.int8)) > 0)
     for y in range(height_px - plinth - 14, 0, -int(0.6 * TEXELS_PER_METRE)):
