@@ -42,6 +42,9 @@ class CartographerSettings:
         loop_turn: and turned by less than this, rad.
         loop_tries: at most this many, nearest first.
         loop_sigma: a loop closure known no better than this is left to the server, m.
+        loop_gate: chi-square with 3 degrees of freedom by which a loop closure may miss what the robot has
+            measured on its way from the one node to the other: places may look alike.
+        loop_floor: error of that way that its covariance does not tell of, m and rad.
     """
 
     most_landmarks: int = 150
@@ -55,6 +58,8 @@ class CartographerSettings:
     loop_turn: float = 0.7
     loop_tries: int = 4
     loop_sigma: float = 0.12
+    loop_gate: float = 25.0
+    loop_floor: tuple[float, float] = (0.05, 0.03)
 
 
 @dataclass(eq=False)
@@ -89,6 +94,7 @@ class Cartographer:
         settings: CartographerSettings,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
+        clock: str = "",
     ) -> None:
         """Start an empty map whose frame is the first anchor's, or go on with one.
 
@@ -98,11 +104,13 @@ class Cartographer:
             settings: how.
             contents: of a map that was begun.
             next_number: the first that no node or edge has ever had.
+            clock: that views are stamped by; see Node.
         """
         self.map = HybridMap(contents)
         self.map_from_anchor = HERE
         self._map_id = map_id
         self._camera = camera
+        self._clock = clock
         self._settings = settings
         self._last: Placed | None = None
         self._next_number = next_number
@@ -177,7 +185,7 @@ class Cartographer:
         if len(landmarks) < self._settings.least_landmarks:
             return None
         posture = self.map_from_anchor @ view.anchor_from_view
-        node = Node(self._number(), view.stamp_ns, posture, self._camera, landmarks)
+        node = Node(self._number(), view.stamp_ns, posture, self._camera, landmarks, self._clock)
         changes.append(NodePut(node))
         return Placed(node, tracks)
 
@@ -251,7 +259,25 @@ class Cartographer:
         edges: list[Edge] = []
         for _, other in sorted(near, key=lambda pair: pair[0])[: s.loop_tries]:
             found = register(other, node, None, self._rng)
-            if found is not None and found.evidence["sigma_xy"] < s.loop_sigma:
+            if found is None or found.evidence["sigma_xy"] >= s.loop_sigma:
+                continue
+            if self._credible(other, node, found.node_from_robot):
                 posture, pairs, evidence = found.node_from_robot, found.pairs, found.evidence
                 edges.append(Edge(self._number(), other.id, node.id, posture, EdgeKind.LOOP, pairs, evidence))
         return edges
+
+    def _credible(self, earlier: Node, later: Node, found: PoseGaussian) -> bool:
+        """Whether a recognition agrees with the robot's own way from the earlier node to the later one.
+
+        The later posture is the earlier one and the way, L = E W; so the way's covariance is
+        W = L - Ad(w^-1) E Ad(w^-1)^T. Where the map was gone on with elsewhere in between, that is not so and
+        the difference may have no meaning: what is negative of it counts as nothing.
+        """
+        way = earlier.map_from_robot.mean.inverse() @ later.map_from_robot.mean
+        ad = way.inverse().adjoint
+        grown = later.map_from_robot.covariance - ad @ earlier.map_from_robot.covariance @ ad.T
+        values, vectors = np.linalg.eigh(0.5 * (grown + grown.T))
+        grown = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        xy, heading = self._settings.loop_floor
+        spread = grown + found.covariance + np.diag([xy**2, xy**2, heading**2])
+        return PoseGaussian(found.mean, spread).mahalanobis2(way) < self._settings.loop_gate

@@ -65,7 +65,7 @@ class Mapper:
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings.tracking)
         self._cartographer = Cartographer(
-            map_id, description.camera, settings.cartographer, contents, next_number
+            map_id, description.camera, settings.cartographer, contents, next_number, description.clock
         )
         self._anchor: View | None = None
         self._leaves: list[View] = []

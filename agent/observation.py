@@ -81,6 +81,8 @@ class RobotDescription:
         max_forward: speed limit, m/s; 0 if the robot is carried and takes no commands.
         max_turn: rate limit, rad/s.
         tick: time between two observations, s.
+        clock: name of the clock that observations are stamped by, if other robots' are stamped by the same
+            (a network time to well under a second, a simulator); empty if nobody knows.
     """
 
     camera: Camera
@@ -93,3 +95,4 @@ class RobotDescription:
     max_forward: float = 0.3
     max_turn: float = 0.8
     tick: float = 0.1
+    clock: str = ""

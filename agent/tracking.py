@@ -32,7 +32,9 @@ class TrackingSettings:
         least_spread: likewise if they cover less than this share of the image's width.
         associate_px: a feature this near to a track is the same point.
         strikes: a track that the filter refuses this often in a row is given up.
-        prior_spread: sigma of a new landmark's inverse depth, as a share of the expected one.
+        prior_spread: sigma of a new landmark's inverse depth, as a share of the expected one ...
+        prior_near: ... but no less than this, 1/m: a landmark may always be as near as 1 / (2 prior_near). A
+            robot before a bare wall would else take its nearness for a slip of the wheels.
         continuity: whether an image continues the one before.
         patience: images that show other things than they should, one after the other, before the robot
             takes itself for carried off. A person who walks by is gone by then.
@@ -48,6 +50,7 @@ class TrackingSettings:
     associate_px: float = 1.5
     strikes: int = 3
     prior_spread: float = 0.6
+    prior_near: float = 1.5
     continuity: ContinuitySettings = field(default_factory=ContinuitySettings)
     patience: int = 30
     blank_patience: int = 100
@@ -157,7 +160,7 @@ class Tracking:
             pixels = view.features.pixels[new]
             chosen = even_choice(pixels, taken, room)
             inverse_depths = np.full(len(chosen), 1.0 / expected_depth)
-            sigmas = self._settings.prior_spread * inverse_depths
+            sigmas = np.maximum(self._settings.prior_spread * inverse_depths, self._settings.prior_near)
             self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
         self.remember(force=True)
 

@@ -165,7 +165,9 @@ def main() -> None:
 
 def measure(robots: list[int], seconds: float, seed: int, quiet: bool) -> dict[str, Any]:
     """All figures."""
-    many, one, parts = {}, {}, {}
+    many: dict[str, float] = {}
+    one: dict[str, float] = {}
+    parts: dict[str, dict[str, float]] = {}
     for count in track(robots, "fleets", console=Console(stderr=True, quiet=quiet)):
         for mode, make in ((many, ProcessFleet), (one, LocalFleet)):
             with tempfile.TemporaryDirectory() as folder:

@@ -152,6 +152,8 @@ class Node:
         map_from_robot: posture in the agent's own map frame.
         camera: intrinsics and mount of the camera that took the image.
         landmarks: what is in the image.
+        clock: what `stamp_ns` was read from. Times of two robots can be compared only if it is the same;
+            empty if nobody knows.
     """
 
     id: NodeId
@@ -159,6 +161,7 @@ class Node:
     map_from_robot: PoseGaussian
     camera: Camera
     landmarks: Landmarks
+    clock: str = ""
 
     @property
     def points_in_robot(self) -> Array:

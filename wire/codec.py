@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId, check_name
 from wire.landmark_codec import (
     LANDMARK_BYTES,
     MAX_LANDMARKS,
@@ -145,12 +145,15 @@ def unwrap_body(data: bytes) -> tuple[int, int, bytes]:
 
 
 def _node_fields(node: Node) -> dict[str, object]:
-    return {
+    fields: dict[str, object] = {
         "t": node.stamp_ns,
         "p": pack_posture(node.map_from_robot),
         "c": pack_camera(node.camera),
         "l": pack_landmarks(node.landmarks, node.camera),
     }
+    if node.clock:
+        fields["z"] = check_name(node.clock)
+    return fields
 
 
 def _read_node(reader: Reader, element: NodeId) -> Node:
@@ -161,6 +164,7 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
         map_from_robot=unpack_posture(reader.binary("p", MAX_BODY_BYTES)),
         camera=camera,
         landmarks=unpack_landmarks(reader.binary("l", MAX_BODY_BYTES), camera),
+        clock=reader.name("z") if reader.has("z") else "",
     )
 
 

@@ -137,6 +137,7 @@ def encode_description(description: RobotDescription) -> bytes:
             "max_turn": description.max_turn,
             "tick": description.tick,
         }
+        | ({"clock": description.clock} if description.clock else {})
     )
 
 
@@ -159,6 +160,7 @@ def decode_description(data: bytes) -> RobotDescription:
         max_forward=reader.number("max_forward", 0.0, FASTEST),
         max_turn=reader.number("max_turn", 0.0, FASTEST),
         tick=reader.number("tick", 1e-4, 3600.0),
+        clock=reader.name("clock") if reader.has("clock") else "",
     )
 
 
