@@ -89,7 +89,7 @@ class Mapper:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the last image shows nothing of what it should: no time to map."""
+        """Whether the last image shows nothing of what it should, or none comes: no time to map."""
         return self._tracking.doubtful
 
     @property
@@ -97,7 +97,9 @@ class Mapper:
         """Why, in words."""
         if self._tracking.strange:
             return "the image shows something else than a moment ago"
-        return "the image shows nothing: is it dark, or the lens covered?" if self._tracking.blank else ""
+        if self._tracking.blank:
+            return "the image shows nothing: is it dark, or the lens covered?"
+        return "the camera gives no new image" if self.doubtful else ""
 
     @property
     def anchor_from_robot(self) -> Pose2:

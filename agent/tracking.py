@@ -39,6 +39,7 @@ class TrackingSettings:
         patience: images that show other things than they should, one after the other, before the robot
             takes itself for carried off. A person who walks by is gone by then.
         blank_patience: likewise images that show nothing: somebody has switched off the light.
+        dropped: images that may be missing, one after the other, before the robot should wait for the next.
         stale: m and rad; once the wheels have moved this much, nothing can be said of an image before.
     """
 
@@ -54,6 +55,7 @@ class TrackingSettings:
     continuity: ContinuitySettings = field(default_factory=ContinuitySettings)
     patience: int = 30
     blank_patience: int = 100
+    dropped: int = 3
     stale: tuple[float, float] = (0.4, 0.5)
 
 
@@ -68,6 +70,7 @@ class Tracking:
         history: where each track was seen from.
         strange: how many images in a row were not believed because they show other things.
         blank: likewise because they show nothing.
+        missing: how many images in a row did not come, or came a second time.
     """
 
     def __init__(self, description: RobotDescription, lens: Lens, settings: TrackingSettings) -> None:
@@ -81,7 +84,7 @@ class Tracking:
             description.camera, description.axle, description.wheel_noise, settings.filter
         )
         self._continuity = Continuity(lens, description.camera, settings.tracker, settings.continuity)
-        self.strange = self.blank = 0
+        self.strange = self.blank = self.missing = 0
         self._believed: NDArray[np.uint8] | None = None
         self._since_believed = Pose2()
         self._strikes: dict[int, int] = {}
@@ -104,8 +107,8 @@ class Tracking:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the last image was not believed."""
-        return bool(self.strange or self.blank)
+        """Whether the last image was not believed, or the last images were missing."""
+        return bool(self.strange or self.blank) or self.missing > self._settings.dropped
 
     @property
     def carried_off(self) -> bool:
@@ -126,7 +129,11 @@ class Tracking:
         """Predict by the wheels, follow the tracks, correct by what they show."""
         self._filter.predict(observation.odometry)
         self._since_believed = self._since_believed @ observation.odometry.motion()
-        if observation.image is None or not self._follow(observation.image):
+        if observation.image is None or self._frozen(observation.image):
+            self.missing += self._believed is not None
+            return
+        self.missing = 0
+        if not self._follow(observation.image):
             return
         # A landmark whose track is lost stays out: what it taught is in the posture already.
         self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
@@ -169,6 +176,17 @@ class Tracking:
         moved = self._filter.reanchor()
         self.history.reanchor(moved.mean, self._tracker.ids)
         return moved
+
+    def _frozen(self, image: NDArray[np.uint8]) -> bool:
+        """Whether an image is the last one again, to the last grey level, although the wheels have moved.
+
+        Only an image with nothing in it is the same from everywhere.
+        """
+        moved = self._since_believed
+        stands = max(abs(moved.x), abs(moved.y), abs(moved.heading)) < 1e-3
+        if stands or self._believed is None or not np.array_equal(image, self._believed):
+            return False
+        return int(image.min()) < int(image.max())
 
     def _follow(self, image: NDArray[np.uint8]) -> bool:
         """Follow the tracks into an image; returns whether it is believed."""

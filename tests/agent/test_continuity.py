@@ -127,13 +127,31 @@ def test_what_passes_leaves_the_tracks_alone(walls, mapper, elsewhere, what):
     }[what]
     tracked = mapper.tracked
     watch(mapper, [between] * 9)
-    assert mapper.doubtful == (what in ("dark", "somebody", "grey"))
+    assert mapper.doubtful == (what != "dimmed")
     assert bool(mapper.doubt) == mapper.doubtful
     watch(mapper, [seen] * 2)
     assert not mapper.doubtful
     assert mapper.started
     assert mapper.tracked > 0.9 * tracked
     assert mapper.anchor_from_robot.distance(Pose2()) < 0.01
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_camera_that_hangs_stops_the_robot_and_not_its_wheels(walls, mapper, frozen):
+    """The same image again while the wheels turn is none: else it would speak against the wheels."""
+    image = walls.render(HERE) if frozen else None
+    watch(mapper, [image] * 3, forward=0.01)
+    assert not mapper.doubtful, "a dropped image now and then is nothing to stop for"
+    watch(mapper, [image] * 2, forward=0.01)
+    assert mapper.doubt == "the camera gives no new image"
+    watch(mapper, [image] * 200)
+    assert mapper.doubtful
+    assert mapper.started
+    assert mapper.anchor_from_robot.distance(Pose2(0.05)) < 1e-6
+    watch(mapper, [walls.render(HERE @ Pose2(0.05))] * 3)
+    assert not mapper.doubtful
+    assert mapper.tracked > 40
+    assert mapper.anchor_from_robot.distance(Pose2(0.05)) < 0.01
 
 
 def test_what_stays_means_that_the_robot_is_elsewhere(mapper, elsewhere):
