@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import dataclass
 
@@ -100,6 +101,7 @@ def carton(rng: np.random.Generator, width_px: int, height_px: int, common: int)
     return canvas
 
 
+@functools.lru_cache(maxsize=64)
 def carton_face(common: int, design: int) -> Image:
     """One side of a carton of a design: brown board, tape, a brand, handling marks, a label."""
     rng = np.random.default_rng([common, 0xCA57, design])
@@ -119,4 +121,5 @@ def carton_face(common: int, design: int) -> Image:
     canvas[low : low + label.shape[0], 6 : 6 + label.shape[1]] = label
     marks = sign(rng, half - 10, (height_px - low) // 2, "")
     canvas[low + 4 : low + 4 + marks.shape[0], half + 4 : half + 4 + marks.shape[1]] = marks
+    canvas.setflags(write=False)  # all racks share it
     return canvas

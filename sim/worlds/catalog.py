@@ -42,7 +42,7 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def make_design(kind: str, seed: int, /, **parameters: Any) -> Design:
+def make_design(kind: str, seed: int, **parameters: Any) -> Design:
     """Design a world.
 
     Args:
@@ -61,7 +61,7 @@ def make_design(kind: str, seed: int, /, **parameters: Any) -> Design:
     return made.design(build(made.parameters, parameters, kind), seed)
 
 
-def make_world(kind: str, seed: int, /, **parameters: Any) -> World:
+def make_world(kind: str, seed: int, **parameters: Any) -> World:
     """Build a world: see `make_design`."""
     return build_world(make_design(kind, seed, **parameters), kind)
 

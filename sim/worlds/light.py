@@ -14,9 +14,9 @@ Vector = tuple[float, float, float]
 
 AMBIENT = 0.55
 """Brightness that walls and floor throw at each other; lamps add the rest."""
-FULL = 0.14
+FULL = 0.16
 """Light at which a surface is as bright as its painter meant it: about 2 m from one lamp, 1/m^2."""
-MOST = 1.15
+MOST = 1.3
 """Right below a lamp nothing is brighter than this."""
 STEP = 0.12
 """Brightness is computed at points this far apart, and linear between, m."""
