@@ -5,11 +5,12 @@ decides depends on how quick the machine is.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from agent.fleet import AgentReport, encode_mission
 from agent.mission import Carried, Explore, GoTo, Idle, Mission
-from hybridmap.errors import NotConnected
+from hybridmap.errors import InvalidValue, NotConnected
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
@@ -26,6 +27,8 @@ LOOK_EVERY = {"joined": 5.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "gro
 """How often it is looked whether something has come true, simulated s."""
 STRIDE = 5.0
 """Time is let go on by at most this without showing progress, s."""
+HAPPEN_TRIES = 20
+"""How often an event is tried for which there is no room (nobody can walk through a robot), once a second."""
 RECOVERY_PATIENCE = 120.0
 """How long all may take to be well again after something came back, wall s."""
 
@@ -171,7 +174,7 @@ class Conductor:
             case actions.Send(robot, goal):
                 self._send(robot, goal)
             case events.Kidnap(robot):
-                self.note(fleet.control.apply(event.table))
+                self._happen(event.table)
                 self._mark_lost(robot)
             case actions.KillAgent(robot):
                 before = self.agents.get(robot)
@@ -207,7 +210,18 @@ class Conductor:
                 self.note(f"the network of {robot} is back")
                 self._recover(began)
             case _:
-                self.note(fleet.control.apply(event.table))
+                self._happen(event.table)
+
+    def _happen(self, table: Mapping[str, Any]) -> None:
+        """Something happens to the world, as soon as there is room for it."""
+        for _ in range(HAPPEN_TRIES):
+            try:
+                self.note(self._fleet.control.apply(table))
+                return
+            except InvalidValue as error:
+                reason = str(error)
+            self._advance(self.now + 1.0)
+        self.note(f"event {table['do']} did not happen within {HAPPEN_TRIES} s: {reason}", True)
 
     def _recover(self, began: float) -> None:
         """Wait, while simulated time stands still, until the server has what every robot has."""

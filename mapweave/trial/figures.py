@@ -11,7 +11,9 @@ from typing import Any
 from hybridmap.errors import InvalidFile, SettingsError
 from wire.tables import build
 
-MORE_IS_BETTER = frozenset({"link_precision", "link_recall", "real_time_factor"})
+MORE_IS_BETTER = frozenset(
+    {"link_precision", "link_recall", "explored_share", "longest_loop_m", "real_time_factor"}
+)
 """Of the measured figures; all others are errors, times and bytes: less is better."""
 
 
@@ -59,6 +61,10 @@ class Figures:
         false_edges: of these, off by more than 0.5 m or 15 degrees.
         loops: of the edges within one map, those found by recognising a place.
         false_loops: of the loops, off by more than 0.5 m or 15 degrees.
+        longest_loop_m: the longest way that a robot drove before one of its true loops was closed, m; None
+            without loops.
+        explored_share: of the floor where a robot can stand, what is within 1.5 m of a node with no wall
+            between.
         links: between maps.
         false_links: of these, off by more than 0.5 m or 15 degrees.
         link_precision: share of the links that is not false; None without links.
@@ -81,6 +87,8 @@ class Figures:
         goal_error_m: of the worst such robot, where it arrived or was given up, m.
         goal_error_deg: likewise, degrees.
         goal_s: from the kidnapping to the arrival, the worst, simulated s.
+        troubles: how often the scenario did not go as it was meant to: something had not come true in time,
+            or could not happen.
         unsaved_changes: changes in journals of robots that the server does not have.
         recovery_s: wall time from the return of a network, server or agent until all was well, the worst, s.
         bytes_per_node: bytes of changes on the wire over nodes of the merged map, edges included.
@@ -104,9 +112,12 @@ class Figures:
     false_links: int
     collisions: int
     unsaved_changes: int
+    troubles: int
     map_hash: str
     sim_s: float
     wall_s: float
+    longest_loop_m: float | None = None
+    explored_share: float | None = None
     link_precision: float | None = None
     link_recall: float | None = None
     merged_ate_m: float | None = None

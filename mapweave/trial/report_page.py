@@ -11,7 +11,8 @@ from mapweave.trial.recording import Recording
 
 GROUPS = {
     "Merged map": (
-        "components", "maps", "nodes", "edges", "false_edges", "loops", "false_loops", "links", "false_links",
+        "components", "maps", "nodes", "edges", "false_edges", "loops", "false_loops",
+        "longest_loop_m", "explored_share", "links", "false_links",
         "link_precision", "link_recall", "merged_ate_m",
     ),
     "Trajectories, by evo (the worst of all maps)": ("trajectory_ate_m", "rpe_m", "rpe_deg"),
@@ -20,7 +21,7 @@ GROUPS = {
         "goal_error_deg", "goal_s",
     ),
     "Network and disks": (
-        "unsaved_changes", "recovery_s", "bytes_per_node", "map_bytes_per_robot_minute",
+        "troubles", "unsaved_changes", "recovery_s", "bytes_per_node", "map_bytes_per_robot_minute",
         "wire_bytes_per_robot_minute", "map_hash",
     ),
     "Time": ("sim_s", "wall_s", "real_time_factor"),

@@ -14,6 +14,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, NodeId
 from hybridmap.pose import Pose2
 from mapweave.scoring import is_false, link_recall, posture_error, score_map
+from mapweave.trial.coverage import explored_share, longest_loop
 from mapweave.trial.figures import Figures, RobotFigures, measured
 from mapweave.trial.recording import Lost, Recording, RobotRecord, Trajectory
 from mapweave.trial.trajectories import score_trajectory
@@ -38,6 +39,9 @@ def score(recording: Recording) -> Figures:
     links = [e for e in whole.edges.values() if e.a.map != e.b.map]
     own = [e for e in whole.edges.values() if e.a.map == e.b.map and e.a in truth and e.b in truth]
     loops = [e for e in own if e.kind is EdgeKind.LOOP]
+    paths = {name: record.truth for name, record in recording.robots.items()}
+    stamps = {node: whole.nodes[node].stamp_ns for node in truth}
+    places = np.array([[pose.x, pose.y] for pose in truth.values()]).reshape(-1, 2)
     merged = score_map({n: (c, p.mean) for n, (c, p) in recording.merged.postures.items()}, links, truth)
     robots = {name: _score_robot(name, record, truth) for name, record in recording.robots.items()}
     falls = [_score_lost(lost, recording.robots[lost.robot].truth, truth) for lost in recording.lost]
@@ -55,6 +59,8 @@ def score(recording: Recording) -> Figures:
         false_loops=_false(loops, truth),
         links=merged.links,
         false_links=merged.false_links,
+        longest_loop_m=longest_loop(loops, truth, paths, stamps),
+        explored_share=explored_share(recording.plan, places),
         link_precision=1.0 - merged.false_links / merged.links if merged.links else None,
         link_recall=link_recall(links, truth, recording.plan.walls),
         merged_ate_m=measured(merged.ate),
@@ -72,6 +78,7 @@ def score(recording: Recording) -> Figures:
         goal_error_deg=_worst(fall.goal_error_deg for fall in goals),
         goal_s=_worst(fall.goal_s for fall in goals),
         unsaved_changes=sum(r.unsaved_changes for r in robots.values()),
+        troubles=sum(moment.trouble for moment in recording.moments),
         recovery_s=max(recording.recoveries_s, default=None),
         bytes_per_node=map_bytes / len(truth) if truth else None,
         map_bytes_per_robot_minute=map_bytes / minutes if minutes else None,

@@ -11,7 +11,8 @@ from mapweave.trial.scenario import Scenario
 SHOWN = (
     "components", "maps", "nodes", "links", "false_links", "false_edges", "merged_ate_m", "trajectory_ate_m",
     "rpe_m", "found", "found_error_m", "reached", "goal_error_m", "goal_error_deg", "collisions",
-    "unsaved_changes", "recovery_s", "bytes_per_node", "wire_bytes_per_robot_minute", "sim_s", "wall_s",
+    "unsaved_changes", "troubles", "explored_share",
+    "longest_loop_m", "recovery_s", "bytes_per_node", "wire_bytes_per_robot_minute", "sim_s", "wall_s",
     "real_time_factor",
 )  # fmt: skip
 """Of the figures; all of them are in figures.json."""

@@ -17,7 +17,7 @@ from mapweave.trial.figures import Figures
 FIGURES = Figures(
     components=1, maps=3, nodes=100, edges=120, false_edges=0, loops=5, false_loops=0, links=20,
     false_links=0,
-    collisions=0, unsaved_changes=0, map_hash="abc", sim_s=60.0, wall_s=20.0,
+    collisions=0, unsaved_changes=0, troubles=0, map_hash="abc", sim_s=60.0, wall_s=20.0,
 )  # fmt: skip
 WANTED = parse_expectations({"merged_ate_m": 0.05, "found": True})
 

@@ -66,9 +66,11 @@ def test_cut_it_breaks_and_takes_nobody_until_it_is_restored(cable):
         assert talk(one, b"hello") == b"hello"
         cable.cut()
         assert one.recv(10) == b""
-    with socket.create_connection(("127.0.0.1", cable.port), 2) as two:
-        with contextlib.suppress(ConnectionError):
-            assert talk(two, b"hello") == b""
+    with (
+        socket.create_connection(("127.0.0.1", cable.port), 2) as two,
+        contextlib.suppress(ConnectionError),
+    ):
+        assert talk(two, b"hello") == b""
     cable.restore()
     with socket.create_connection(("127.0.0.1", cable.port), 2) as three:
         assert talk(three, b"hello") == b"hello"
@@ -92,8 +94,10 @@ def test_a_bad_one_is_slow_but_loses_nothing(cable):
 def test_without_a_router_connections_end(cable):
     lonely = Cable(1, seed=0)
     try:
-        with socket.create_connection(("127.0.0.1", lonely.port), 2) as one:
-            with contextlib.suppress(ConnectionError):
-                assert one.recv(10) == b""
+        with (
+            socket.create_connection(("127.0.0.1", lonely.port), 2) as one,
+            contextlib.suppress(ConnectionError),
+        ):
+            assert one.recv(10) == b""
     finally:
         lonely.close()

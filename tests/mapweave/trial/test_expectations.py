@@ -16,7 +16,7 @@ from mapweave.trial.figures import Figures, kinds
 FIGURES = Figures(
     components=1, maps=3, nodes=100, edges=120, false_edges=0, loops=5, false_loops=0, links=20,
     false_links=1,
-    collisions=0, unsaved_changes=0, map_hash="abc", sim_s=60.0, wall_s=20.0, link_precision=0.95,
+    collisions=0, unsaved_changes=0, troubles=0, map_hash="abc", sim_s=60.0, wall_s=20.0, link_precision=0.95,
     link_recall=0.8, merged_ate_m=0.04, found=True,
 )  # fmt: skip
 

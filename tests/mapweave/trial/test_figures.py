@@ -49,7 +49,7 @@ def test_every_figure_is_explained_and_has_a_unit_where_it_needs_one(of):
     assert explained == {f.name for f in fields(of)}
     for one in fields(of):
         if "float" in str(one.type):
-            units = ("_m", "_deg", "_s", "_minute", "_per_node", "_precision", "_recall", "_factor")
+            units = ("_m", "_deg", "_s", "_minute", "_per_node", "_precision", "_recall", "_factor", "_share")
             assert one.name.endswith(units), one.name
 
 
