@@ -53,7 +53,7 @@ class CorridorParameters:
 def corridor(parameters: CorridorParameters, seed: int) -> Design:
     """Design a ring; other seeds have other prints and doors at other places, no two alike."""
     rng = np.random.default_rng([seed, 0xC0441D04])
-    paint = int(rng.integers(150, 200))
+    paint = int(rng.integers(125, 170))
     x, y, b = parameters.length, parameters.width, parameters.breadth
     # Each side has one corner, so that each is longer than it is broad.
     rooms = (
@@ -109,7 +109,7 @@ def _hang(rng: np.random.Generator, start: Point, end: Point, spacing: float, he
         if head and at > final - 0.6 * spacing:
             at, last = final, True
         width, height, bottom, texture = _print(rng)
-        middle = max(at, free + width / 2)
+        middle = max(min(at, size - CORNER - width / 2), free + width / 2)
         if middle + width / 2 > size - CORNER:
             break
         place = _point(start + middle * ahead + IN_FRONT * left)

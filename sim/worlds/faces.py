@@ -43,7 +43,7 @@ def cut_face(start: Array, end: Array, low: Array, high: Array) -> list[tuple[Ar
     way = end - start
     size = float(np.linalg.norm(way))
     front = start + BEFORE * np.array([way[1], -way[0]]) / size
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         crossings = np.concatenate([(low - front) / way, (high - front) / way]).ravel()
     inner = crossings[(crossings > 0.0) & (crossings < 1.0)]
     borders = np.concatenate([[0.0], np.unique(inner), [1.0]])

@@ -12,9 +12,9 @@ from sim.texture import Image, Painter
 
 Vector = tuple[float, float, float]
 
-AMBIENT = 0.55
+AMBIENT = 0.65
 """Brightness that walls and floor throw at each other; lamps add the rest."""
-FULL = 0.16
+FULL = 0.15
 """Light at which a surface is as bright as its painter meant it: about 2 m from one lamp, 1/m^2."""
 MOST = 1.3
 """Right below a lamp nothing is brighter than this."""

@@ -438,6 +438,17 @@ def test_there_is_enough_to_see(name: str) -> None:
     assert np.quantile(counts, 0.15) >= 30
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_print_hangs_at_every_end_of_the_ring(seed: int) -> None:
+    """Where one looks to when driving along a side: on both ends of all four outer walls."""
+    posters = np.array([poster.at for poster in make_design("corridor", seed).posters])
+    x, y = 12.0, 8.0
+    for corner in ((0.0, 0.0), (x, 0.0), (x, y), (0.0, y)):
+        near = np.abs(posters - corner)
+        assert ((near[:, 0] < 0.06) & (near[:, 1] < 1.8)).any()
+        assert ((near[:, 1] < 0.06) & (near[:, 0] < 1.8)).any()
+
+
 def test_the_corridor_is_sparse_but_not_empty() -> None:
     """Along the corridor there is always something in view, and much less than in an office."""
     counts = feature_counts("corridor", 8, along=True)

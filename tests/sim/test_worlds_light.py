@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sim.texture import Texture
@@ -88,6 +88,7 @@ POINT = st.tuples(NUMBER, NUMBER)
 ROOMS = st.lists(st.tuples(NUMBER, NUMBER, st.floats(0.1, 5.0), st.floats(0.1, 5.0)), min_size=1, max_size=4)
 
 
+@example((0.0, 0.0), (1.0, 1e-310), [(0.5, -1.0, 1.0, 2.0)])
 @given(POINT, POINT, ROOMS)
 def test_faces_are_cut_where_the_room_changes(
     start: tuple[float, float], end: tuple[float, float], rooms: list[tuple[float, float, float, float]]
