@@ -67,7 +67,7 @@ class Agent:
 
     def __init__(
         self,
-        description: RobotDescription,
+        describe: Callable[[], RobotDescription],
         bus: Bus,
         keys: Keys,
         settings: PipelineSettings,
@@ -78,7 +78,7 @@ class Agent:
         """Open the journal and join the fleet.
 
         Args:
-            description: of the body.
+            describe: asks the body what it is, once the disk has turned out to be good.
             bus: to the fleet; stays the caller's.
             keys: of the fleet.
             settings: of the pipeline.
@@ -89,7 +89,6 @@ class Agent:
         Raises:
             MapweaveError: the journal cannot be used; one line says why.
         """
-        self._description = description
         self._bus = MeteredBus(bus)
         self._keys = keys
         self._settings = replace(settings, seed=options.seed)
@@ -98,8 +97,9 @@ class Agent:
         self._say = say
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
-        maps = self.journal.maps()
         try:
+            self._description = describe()
+            maps = self.journal.maps()
             if maps and not options.fresh:
                 self._resume(maps[-1])
             else:
@@ -204,8 +204,9 @@ def run_agent(
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
     console = Console(stderr=True)
-    with _progress(console, options) as show:
-        agent = Agent(robot.describe(), bus, keys, settings, options, show, console.print)
+    show = _progress(console, options)
+    agent = Agent(robot.describe, bus, keys, settings, options, show, console.print)
+    with show:
         try:
             agent.run(robot, stop)
         finally:

@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         name=check_name(arguments.name or fallback),
         data=arguments.data,
         epoch=arguments.epoch,
+        fresh=True,  # a recording begins where it began, not where another has ended
         mission=Carried(),
         server=network.server,
         total=len(robot),

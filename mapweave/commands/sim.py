@@ -22,7 +22,11 @@ def add_to(commands: Any) -> None:
     _add_run(kinds)
     _add_batch(kinds)
     _add_serve(kinds)
-    listing = kinds.add_parser("list", help="the scenarios that come with Mapweave")
+    listing = kinds.add_parser(
+        "list",
+        help="the scenarios that come with Mapweave",
+        description="Names and summaries. The files are a good start for your own: see docs/scenarios.md.",
+    )
     listing.set_defaults(run=run_list)
 
 

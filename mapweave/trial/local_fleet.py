@@ -112,8 +112,9 @@ class LocalFleet:
             server=SERVER,
         )
         self._agents[robot] = Agent(
-            simulation.describe(robot), bus, self.keys, stage.settings, options, say=self._log.append
-        )
+            lambda: simulation.describe(robot), bus, self.keys, stage.settings, options,
+            say=self._log.append,
+        )  # fmt: skip
 
     def kill_server(self) -> None:
         """Drop the server and its bus."""

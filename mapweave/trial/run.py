@@ -21,9 +21,14 @@ from mapweave.trial.recording import Recording, RobotRecord, Trajectory
 from mapweave.trial.scenario import Scenario
 from mapweave.trial.score import score
 from mapweave.trial.show import Show
+from sim.places import starting_places
 
-OWN = "mapweave-trial"
-"""A file of this name marks a folder as a trial's: only such a folder is emptied."""
+OWN = ".mapweave-trial"
+"""A file of this name marks a folder as a trial's: only there folders are taken away."""
+FOLDERS = ("agents", "server", "logs")
+FILES = (
+    "*.tum", "*.mapweave", "figures.json", "report.*", "map.png", "errors.png", "film.webm", "scenario.toml",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,8 @@ def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
     """
     from mapweave.trial.folder import write_folder
 
+    # A world that cannot be built shall be one line, before anything has been started.
+    starting_places(scenario.world(options.seed), scenario.robots, options.seed)
     _make_room(options.out)
     stage = Stage(scenario, options.seed, options.out, options.settings, options.settings_file)
     with Show(scenario.name, stage.robots, len(scenario.events), options.quiet) as show:
@@ -160,14 +167,18 @@ def _fleet(stage: Stage, processes: bool) -> Fleet:
 
 
 def _make_room(out: Path) -> None:
-    """An empty folder; only a folder that an earlier trial has made is emptied.
+    """Take away what an earlier trial left in the folder, and nothing else.
 
     Raises:
-        SettingsError: there is something else in it.
+        SettingsError: folders stand there that no trial has made.
     """
-    if out.is_dir() and any(out.iterdir()):
-        if not (out / OWN).is_file():
-            raise SettingsError(f"{out}: is not empty and holds no earlier trial; choose another --out")
-        shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
-    (out / OWN).write_text("This folder was made by a trial and is emptied by the next one.\n")
+    taken = [name for name in FOLDERS if (out / name).exists()]
+    if taken and not (out / OWN).is_file():
+        raise SettingsError(f"{out / taken[0]}: was made by no earlier trial; choose another --out")
+    for name in taken:
+        shutil.rmtree(out / name)
+    for pattern in FILES:
+        for old in out.glob(pattern):
+            old.unlink()
+    (out / OWN).write_text("A trial made the files beside this one; the next trial takes them away.\n")

@@ -19,7 +19,20 @@ from mapweave.cli import main, parser
 from wire.mapfile import MapFile, write_map_file
 
 CAMERA = "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
-COMMANDS = ["demo", "server", "sim", "agent", "map", "map show", "replay", "relocalize"]
+COMMANDS = [
+    "demo",
+    "server",
+    "sim",
+    "sim run",
+    "sim batch",
+    "sim serve",
+    "sim list",
+    "agent",
+    "map",
+    "map show",
+    "replay",
+    "relocalize",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -120,7 +133,13 @@ def test_map_files(tmp_path, capfd):
 
 def test_settings(tmp_path, capfd, recording):
     path = tmp_path / "robot.toml"
-    for command in (["agent", "r0"], ["server"], ["sim"], ["replay", recording, "--offline"]):
+    for command in (
+        ["agent", "r0"],
+        ["server"],
+        ["sim", "run", "office"],
+        ["sim", "serve", "office"],
+        ["replay", recording, "--offline"],
+    ):
         assert "no such file" in complaint(capfd, *command, "--settings", path.with_name("none.toml"))
         path.write_text("[netwrok]")
         assert "did you mean 'network'?" in complaint(capfd, *command, "--settings", path)
@@ -189,21 +208,81 @@ def test_names_that_cannot_stand_in_a_key(name, capfd, recording, nobody, tmp_pa
 @pytest.mark.parametrize("endpoint", ["localhost", "tcp/localhost", "http/a:1", "tcp/:1", "tcp/a b:1"])
 def test_endpoints(endpoint, capfd, recording, tmp_path):
     picture = recording / "images" / "0.png"
-    for command in (["agent", "r0"], ["sim"], ["relocalize", picture], ["replay", recording]):
+    for command in (
+        ["agent", "r0"],
+        ["sim", "serve", "office"],
+        ["relocalize", picture],
+        ["replay", recording],
+    ):
         assert "endpoint" in complaint(capfd, *command, "--connect", endpoint)
     assert "endpoint" in complaint(capfd, "server", "--listen", endpoint, "--data", tmp_path)
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["sim", "--robots", "0"], ["sim", "--robots", "17"], ["sim", "--rooms", "2"], ["sim", "--seed", "-1"],
-     ["demo", "--robots", "1"], ["demo", "--rooms", "99"], ["demo", "--seed", "-1"]],
-)  # fmt: skip
-def test_numbers_out_of_range(arguments, capfd, nobody, tmp_path):
-    rest = ["--connect", nobody] if arguments[0] == "sim" else ["--out", tmp_path]
-    said = complaint(capfd, *arguments, *rest)
-    assert arguments[1] in said
-    assert arguments[2] in said
+    ["--robots=1", "--rooms=99", "--seed=-1"],
+)
+def test_demos_out_of_range(arguments, capfd, tmp_path):
+    said = complaint(capfd, "demo", arguments, "--out", tmp_path)
+    assert arguments.replace("=", " ") in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["office", "--seed", "-1"], "--seed -1: use 0 or more"),
+        (["office", "--set", "robots=0"], "robots must be a whole number, 1 to 16"),
+        (["office", "--set", "robots=17"], "robots must be a whole number, 1 to 16"),
+        (["office", "--set", "world.rooms=0"], "rooms"),
+        (["office", "--set", "world.kind=castle"], "no kind of world 'castle'"),
+        (["office", "--set", "robots"], "write key=value"),
+        (["ofice"], "no scenario 'ofice'"),
+        (["nowhere.toml"], "nowhere.toml: no such file"),
+    ],
+)
+def test_scenarios_that_cannot_be_run(arguments, words, capfd, nobody, tmp_path):
+    for what in (["run", "--out", tmp_path / "out"], ["serve", "--connect", nobody]):
+        assert words in complaint(capfd, "sim", what[0], *arguments, *what[1:])
+    assert not (tmp_path / "out" / "agents").exists()
+
+
+def test_a_batch_names_its_failures(capfd, tmp_path):
+    path = tmp_path / "two.toml"
+    path.write_text(
+        'robots = 1\n[world]\nkind = "arena"\n[[events]]\nat = 1.0\ndo = "wait"\n[expect]\nnodes = 77\n'
+    )
+    arguments = ["sim", "batch", path, "--seeds", 2, "--first", 4, "--one-process", "--out", tmp_path / "out"]
+    assert main([str(a) for a in arguments]) == 2
+    said = capfd.readouterr()
+    assert "seed 4: nodes is" in said.err
+    assert "seed 5: nodes is" in said.err
+    assert main([str(a) for a in [*arguments, "--json"]]) == 2
+    found = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+    assert found == json.loads((tmp_path / "out" / "batch.json").read_text())
+    assert "seeds" in complaint(capfd, "sim", "batch", path, "--seeds", 0)
+
+
+def test_a_trial_prints_one_json_object(capfd, tmp_path):
+    path = tmp_path / "one.toml"
+    path.write_text(
+        'robots = 1\n[world]\nkind = "arena"\n[[events]]\nat = 1.0\ndo = "wait"\n[expect]\ncollisions = 0\n'
+    )
+    arguments = [
+        "sim",
+        "run",
+        str(path),
+        "--one-process",
+        "--out",
+        str(tmp_path / "out"),
+        "--json",
+        "--seed",
+        "9",
+    ]
+    assert main(arguments) == 0
+    printed = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+    assert (printed["passed"], printed["seed"], printed["scenario"]) == (True, 9, "one")
+    assert printed["figures"]["sim_s"] == 1.0
+    assert json.loads((tmp_path / "out" / "figures.json").read_text())["figures"] == printed["figures"]
 
 
 def test_an_epoch_out_of_range(capfd, recording, tmp_path):
