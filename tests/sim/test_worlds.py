@@ -433,7 +433,7 @@ def feature_counts(name: str, poses: int, along: bool) -> np.ndarray:
 @pytest.mark.parametrize("name", ["warehouse", "twins", "arena"])
 def test_there_is_enough_to_see(name: str) -> None:
     """From almost everywhere; for offices see their own test."""
-    counts = feature_counts(name, 5, along=False)
+    counts = feature_counts(name, 4, along=False)
     assert np.median(counts) >= 120
     assert np.quantile(counts, 0.15) >= 30
 
@@ -451,7 +451,7 @@ def test_a_print_hangs_at_every_end_of_the_ring(seed: int) -> None:
 
 def test_the_corridor_is_sparse_but_not_empty() -> None:
     """Along the corridor there is always something in view, and much less than in an office."""
-    counts = feature_counts("corridor", 8, along=True)
+    counts = feature_counts("corridor", 6, along=True)
     assert counts.min() >= 15
     assert np.median(counts) < 0.7 * np.median(feature_counts("office", 4, along=False))
 
@@ -489,7 +489,7 @@ def test_negative_seeds_are_refused() -> None:
 def test_unusual_sizes_can_be_built(kind: str) -> None:
     """Or are refused in one line; and a robot can start there."""
     for name in parameter_names(kind):
-        for value in (1, 2.5, 12, 60.0, True):
+        for value in (1, 2.5, 40.0, True):
             try:
                 world = make_world(kind, 1, **{name: value})
             except MapweaveError:
