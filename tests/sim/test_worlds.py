@@ -226,7 +226,7 @@ def test_sixteen_robots_can_start(name: str, seed: int) -> None:
             assert abs(across) < math.sin(0.16)
 
 
-@pytest.mark.parametrize("name", ["twins", "small warehouse", "corridor"])
+@pytest.mark.parametrize("name", ["twins", "small warehouse"])
 def test_too_many_robots_are_told_how_many_fit(name: str) -> None:
     """And so many do fit."""
     world = world_of(name, 1)
