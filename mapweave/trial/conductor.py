@@ -277,7 +277,7 @@ class Conductor:
                 self._truth_of(HybridMap(merged.changes)),
                 self._fleet.control.plan(),
                 (robot,) if robot else self._stage.robots,
-                [r.world_from_robot for r in status.robots.values()],
+                {name: one.world_from_robot for name, one in status.robots.items()},
                 self._stage.seed,
             )
         except NothingToShow as reason:

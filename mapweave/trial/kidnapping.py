@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from hybridmap.errors import MapweaveError
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
-from sim.floorplan import FloorPlan
+from sim.floorplan import FloorPlan, Rectangle
 
 CLEARANCE = 0.32
 """m from walls and furniture where the robot is put down: it must be able to turn."""
@@ -20,6 +20,12 @@ NEAR = 0.6
 """m from some node that the room's own robot has made: the place is mapped."""
 FAR = 2.0
 """m; a goal is worth a drive."""
+BODY = 0.16
+"""Half the width of a robot that stands in the way, m."""
+ROOM = 0.26
+"""Half the width of what a robot drives through, m."""
+NEARBY = 0.25
+"""A robot may stand or park this near to where it can drive, m."""
 LEAST_LANDMARKS = 30
 """A goal is a place with a view."""
 
@@ -53,10 +59,12 @@ def plan_kidnapping(
     truth: Mapping[NodeId, Pose2],
     plan: FloorPlan,
     robots: tuple[str, ...],
-    occupied: list[Pose2],
+    standing: Mapping[str, Pose2],
     seed: int,
 ) -> Kidnapping:
     """Choose a robot, a room that only another robot has mapped, a place in it, and a third robot's node.
+
+    The others stand where they stand: a goal to which they leave no way is none, as for any driver.
 
     Args:
         merged: all nodes.
@@ -64,7 +72,7 @@ def plan_kidnapping(
         truth: where each node really is.
         plan: of the world.
         robots: all names.
-        occupied: where the robots are now; nobody is put on top of another.
+        standing: where the robots are now; nobody is put on top of another.
         seed: of the choice.
 
     Raises:
@@ -89,11 +97,30 @@ def plan_kidnapping(
         raise NothingToShow(
             "no room is known to one robot alone, with a goal of a third that the merged map joins to it"
         )
-    robot, room, host, goals = plots[int(rng.integers(len(plots)))]
-    place = _place(rng, plan, [truth[n] for n in rooms[room][host]], occupied)
-    if place is None:
-        raise NothingToShow(f"no free place near the nodes in {room}")
-    return Kidnapping(robot, room, host, place, goals[int(rng.integers(len(goals)))])
+    for number in rng.permutation(len(plots)):
+        robot, room, host, goals = plots[int(number)]
+        place = _place(rng, plan, [truth[n] for n in rooms[room][host]], list(standing.values()))
+        if place is None:
+            continue
+        way = _way(plan, [pose for name, pose in standing.items() if name != robot], place)
+        reached = [goal for goal in goals if way(truth[goal])]
+        if reached:
+            return Kidnapping(robot, room, host, place, reached[int(rng.integers(len(reached)))])
+    raise NothingToShow("no free place near the nodes of such a room, from which the others leave a way")
+
+
+def _way(plan: FloorPlan, others: Sequence[Pose2], start: Pose2) -> Callable[[Pose2], bool]:
+    """Tells whether a robot can get from a place to another around robots that stand still."""
+    bodies = tuple(Rectangle(o.x, o.y, 2 * BODY, 2 * BODY, o.heading) for o in others)
+    regions = FloorPlan(plan.rooms, plan.walls, (*plan.furniture, *bodies)).free_regions(ROOM)
+
+    def region(pose: Pose2) -> int | None:
+        gaps = [float(np.hypot(*(points - [pose.x, pose.y]).T).min()) for points in regions]
+        nearest = int(np.argmin(gaps)) if gaps else None
+        return nearest if nearest is not None and gaps[nearest] < NEARBY else None
+
+    here = region(start)
+    return lambda goal: here is not None and region(goal) == here
 
 
 def choose_goal(

@@ -1,4 +1,4 @@
-"""A fleet to which everything happens that a scenario knows: afterwards nothing is lost and nothing is false."""
+"""A fleet to which everything happens that a scenario knows: afterwards nothing is lost, nothing is false."""
 
 from __future__ import annotations
 

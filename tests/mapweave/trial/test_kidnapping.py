@@ -57,7 +57,9 @@ def plot(
 ):
     merged, joined, truth = a_map(where or EACH_ITS_ROOM, landmarks)
     joined |= components or {}
-    return plan_kidnapping(merged, joined, truth, PLAN, robots, list(occupied), seed), truth
+    return plan_kidnapping(
+        merged, joined, truth, PLAN, robots, {f"r{k}": pose for k, pose in enumerate(occupied)}, seed
+    ), truth
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -97,7 +99,7 @@ def test_with_two_robots_the_goal_may_be_ones_own():
 
 
 def test_a_goal_in_the_corridor_is_the_last_resort():
-    found, truth = plot({"r0": [(2, 3)], "r1": [(6, 3)], "r2": [(10, 1)]}, seed=1)
+    found, truth = plot({"r0": [(2, 3)], "r1": [(6, 3)], "r2": [(10, 1)]}, robots=("r0", "r1"))
     goal = truth[found.goal]
     assert found.goal.agent == "r2"
     assert PLAN.room_at(goal.x, goal.y) == "corridor"
@@ -121,7 +123,7 @@ def test_what_cannot_be_shown_is_said(case):
 
 def test_a_room_without_a_free_place_is_said():
     everywhere = [Pose2(x, y) for x in np.arange(0, 12.2, 0.5) for y in np.arange(2, 6.2, 0.5)]
-    with pytest.raises(NothingToShow, match="no free place near the nodes in room"):
+    with pytest.raises(NothingToShow, match="no free place near the nodes of such a room"):
         plot(occupied=everywhere)
 
 
@@ -129,5 +131,24 @@ def test_nodes_without_truth_play_no_part():
     merged, components, truth = a_map(EACH_ITS_ROOM)
     stranger = replace(next(iter(merged.nodes.values())), id=NodeId("r2", 1, 50))
     merged.apply(NodePut(stranger))
-    found = plan_kidnapping(merged, components, truth, PLAN, ("r0", "r1", "r2"), [], 3)
+    found = plan_kidnapping(merged, components, truth, PLAN, ("r0", "r1", "r2"), {}, 3)
     assert found.goal in truth
+
+
+def test_a_goal_that_the_others_cut_off_is_none():
+    """r0 stands in the only gap between the two halves of a hall: nobody is sent through it."""
+    hall = FloorPlan(
+        (
+            Rectangle.spanning(0, 0, 4, 4, "room 0"),
+            Rectangle.spanning(4, 0, 8, 4, "room 1"),
+        ),
+        (Rectangle.spanning(3.95, 0, 4.05, 1.6), Rectangle.spanning(3.95, 2.4, 4.05, 4)),
+    )
+    merged, components, truth = a_map({"r0": [(1, 1), (2, 2)], "r1": [(6, 1), (6, 3)]})
+    robots = ("r0", "r1")
+    aside = {"r0": Pose2(1, 3), "r1": Pose2(7, 3)}
+    found = plan_kidnapping(merged, components, truth, hall, robots, aside, 3)
+    assert found.robot in robots
+    in_the_gap = {name: Pose2(4.0, 2.0) for name in ("r0", "r1")}
+    with pytest.raises(NothingToShow, match="leave a way"):
+        plan_kidnapping(merged, components, truth, hall, robots, in_the_gap, 3)

@@ -1,4 +1,4 @@
-"""The scenarios that come with Mapweave, each with a seed that nothing was developed with, in real processes."""
+"""The scenarios that come with Mapweave, with a seed that nothing was developed with, in real processes."""
 
 from __future__ import annotations
 
