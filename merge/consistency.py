@@ -56,10 +56,12 @@ class Sorted:
     Attributes:
         kept: mutually consistent and enough, or nothing.
         refused: the others, with reasons.
+        rivals: two sets that contradict each other and are supported alike, if that is why nothing is kept.
     """
 
     kept: tuple[Link, ...]
     refused: tuple[RefusedLink, ...]
+    rivals: tuple[tuple[Link, ...], ...] = ()
 
     @property
     def weight(self) -> int:
@@ -121,9 +123,11 @@ def sort_links(
     kept = [links[k] for k in best]
     reason = _too_little(kept, s)
     rival = _rival(agree, weights, best, s)
-    support = int(weights[best].sum())
-    if not reason and rival * s.dominance > support:
-        reason = f"ambiguous: {support} landmarks support one way of joining, {rival} another"
+    support, against_it = int(weights[best].sum()), int(weights[rival].sum())
+    rivals: tuple[tuple[Link, ...], ...] = ()
+    if not reason and against_it * s.dominance > support:
+        reason = f"ambiguous: {support} landmarks support one way of joining, {against_it} another"
+        rivals = tuple(kept), tuple(links[k] for k in rival)
     for k, link in enumerate(links):
         if k not in best:
             against = f"contradicts {len(best)} links with {support} landmarks between the same maps"
@@ -133,6 +137,7 @@ def sort_links(
     return Sorted(
         () if reason else tuple(kept),
         tuple(sorted(refused, key=lambda refusal: refusal.pair)),
+        rivals,
     )
 
 
@@ -166,6 +171,8 @@ def best_clique(agree: NDArray[np.bool_], weights: NDArray[np.int64], exact: int
         exact: up to this N the answer is the best; beyond, grown greedily from each link.
     """
     n = len(weights)
+    if agree[np.triu_indices(n, 1)].all():
+        return list(range(n))
     if n <= exact:
         graph: nx.Graph = nx.Graph()
         for k in range(n):
@@ -191,14 +198,12 @@ def best_clique(agree: NDArray[np.bool_], weights: NDArray[np.int64], exact: int
 
 def _rival(
     agree: NDArray[np.bool_], weights: NDArray[np.int64], best: list[int], s: ConsistencySettings
-) -> int:
-    """Weight of the best set among the links that agree with less than half of the kept ones."""
+) -> list[int]:
+    """The best set among the links that agree with less than half of the kept ones."""
     others = np.setdiff1d(np.arange(len(weights)), best)
     others = others[agree[others][:, best].mean(axis=1) < 0.5] if best else others
-    if len(others) == 0:
-        return 0
     clique = best_clique(agree[np.ix_(others, others)], weights[others], s.exact)
-    return int(weights[others[clique]].sum())
+    return [int(k) for k in others[clique]]
 
 
 def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:

@@ -5,8 +5,8 @@ that takes the one room for the other, robots that were in both at the same time
 
 Nodes say where a robot was when; in between it is somewhere about the straight line. So what is known of a
 moment is not a distance but a chance that the two bodies were clear of each other after all. If nothing but
-their bodies keeps two robots apart, this chance is how likely a true merge makes what was measured, as a share
-of how likely a false one makes it (but for the ground that a body takes). The odds of moments that are
+their bodies keeps two robots apart, this chance is how likely a true merge makes what was measured, as a
+share of how likely a false one makes it (but for the ground that a body takes). The odds of moments that are
 independent multiply, and a true merge drives their product beyond N with a chance of at most 1/N, however
 often it is looked at (Ville's inequality; Grünwald et al., "Safe testing", 2024).
 """

@@ -1,15 +1,13 @@
-"""Fragments: the connected pieces of the maps before anything is joined."""
+"""Fragments: pieces of map that hold together by themselves."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 
-import networkx as nx
-
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from merge.posegraph import Measurement, PoseGraph, solve_graph
+from hybridmap.node import NodeId
+from merge.links import RefusedLink
+from merge.posegraph import Measurement, PoseGraph
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,12 +17,14 @@ class Fragment:
     Attributes:
         name: the smallest id in it.
         graph: solved postures; the smallest id is held at its own posture.
-        measurements: the edges.
+        measurements: the edges that are believed.
+        refused: loops of the robot's own that are not.
     """
 
     name: NodeId
     graph: PoseGraph
     measurements: tuple[Measurement, ...]
+    refused: tuple[RefusedLink, ...] = ()
 
     @property
     def nodes(self) -> tuple[NodeId, ...]:
@@ -34,32 +34,6 @@ class Fragment:
     def __len__(self) -> int:
         """How many nodes."""
         return len(self.graph.nodes)
-
-
-def fragments_of(maps: Mapping[MapId, HybridMap]) -> list[Fragment]:
-    """Cut maps into connected pieces, each solved by itself, in the order of names.
-
-    Args:
-        maps: by id. Edges whose ends are not both nodes of the same map are not theirs to say and are left
-            out: maps are joined by links alone.
-    """
-    found = []
-    for map_id in sorted(maps):
-        one = maps[map_id]
-        own = [edge for edge in one.edges.values() if edge.a in one.nodes and edge.b in one.nodes]
-        graph: nx.Graph = nx.Graph()
-        graph.add_nodes_from(one.nodes)
-        graph.add_edges_from((edge.a, edge.b) for edge in own if edge.a != edge.b)
-        for piece in nx.connected_components(graph):
-            name = min(piece)
-            measurements = tuple(
-                Measurement(edge.a, edge.b, edge.a_from_b)
-                for edge in sorted(own, key=lambda edge: edge.id)
-                if edge.a in piece and edge.a != edge.b
-            )
-            solved = solve_graph(name, one.nodes[name].map_from_robot.mean, measurements)
-            found.append(Fragment(name, solved, measurements))
-    return sorted(found, key=lambda fragment: fragment.name)
 
 
 def fragment_by_node(fragments: Collection[Fragment]) -> dict[NodeId, Fragment]:

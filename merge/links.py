@@ -73,12 +73,14 @@ class RefusedLink:
         b: the greater id.
         reason: in words.
         link: the geometry that was found, or None if not even that.
+        edge: the robot's own edge that says so, if it was the robot that joined them.
     """
 
     a: NodeId
     b: NodeId
     reason: str
     link: Link | None = None
+    edge: EdgeId | None = None
 
     @property
     def pair(self) -> tuple[NodeId, NodeId]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from hybridmap.change import EdgePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -72,11 +73,16 @@ class MergedMap:
         )
 
     def union(self) -> HybridMap:
-        """All nodes and edges of all maps in one graph, with the links as edges."""
+        """All nodes and edges of all maps in one graph, with the links as edges.
+
+        Loops of a robot's own that were refused are left out: nobody shall drive them.
+        """
         whole = HybridMap()
+        false = {refusal.edge for refusal in self.refused}
         for map_id in sorted(self.maps):
             for body in self.maps[map_id].contents():
-                whole.apply(body)
+                if not (isinstance(body, EdgePut) and body.edge.id in false):
+                    whole.apply(body)
         for link in self.links:
             edge = link.edge()
             whole.edges[edge.id] = edge

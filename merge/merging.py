@@ -1,28 +1,28 @@
 """Maps and verified links become a merged map: the whole of the merge after verification, as one function.
 
-1. Maps are cut into pieces that their own edges connect.
+1. Maps are cut into pieces that their own edges connect; a robot's own loops must agree with its way.
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
 3. Pieces are joined, best supported first. Links that would join what is joined already must agree with it.
 4. Each component is optimised; a link that then strains more than it should is refused, worst first.
+5. Where two robots would have been at the same place at the same time, the links that make them so are
+   refuted, and it goes on at 2 with the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-import networkx as nx
-import numpy as np
-
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Array
-from hybridmap.pose_arrays import PoseGaussians
-from merge.consistency import ConsistencySettings, Sorted, group_links, sort_links
-from merge.fragments import Fragment, fragment_by_node, fragments_of
-from merge.links import Link, RefusedLink, refuse
+from hybridmap.node import MapId
+from merge.consistency import ConsistencySettings, group_links
+from merge.cutting import fragments_of
+from merge.exclusion import ExclusionSettings
+from merge.groups import LinkGroup
+from merge.joining import Solver, join, optimise
+from merge.links import Link, RefusedLink
 from merge.merged import MergedMap, Placement
-from merge.posegraph import Measurement, PoseGraph, solve_graph
+from merge.refutation import Refutation
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,12 @@ class MergeSettings:
 
     Attributes:
         consistency: when links are believed.
+        exclusion: when two robots would have been in one place.
         strain: chi-square with 3 degrees of freedom above which an optimised link is refused.
     """
 
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
+    exclusion: ExclusionSettings = field(default_factory=ExclusionSettings)
     strain: float = 25.0
 
 
@@ -56,18 +58,31 @@ def merge_maps(
         The merged map. It does not depend on the order of maps, links or nodes.
     """
     s = settings or MergeSettings()
-    fragments = fragments_of(maps)
-    by_node = fragment_by_node(fragments)
+    fragments = fragments_of(maps, s.consistency, s.strain)
+    solver = Solver(fragments)
+    by_node = solver.by_node
+    refutation = Refutation(maps, solver, s.consistency, s.exclusion)
     present = [link for link in links if link.a in by_node and link.b in by_node]
     refusals = [r for r in refused if r.a in by_node and r.b in by_node]
-    groups: dict[tuple[NodeId, NodeId], Sorted] = {}
-    for (first, second), group in group_links(present, by_node).items():
-        groups[first, second] = sort_links(group, by_node[first], by_node[second], s.consistency)
-        refusals += groups[first, second].refused
-    kept, more = _join(fragments, by_node, groups, s)
-    refusals += more
-    solved, kept, more = _optimise(fragments, by_node, kept, s)
-    refusals += more
+    refusals += [r for fragment in fragments for r in fragment.refused]
+    groups = {
+        (first, second): LinkGroup.of(
+            group, by_node[first], by_node[second], s.consistency, refutation.verdict
+        )
+        for (first, second), group in group_links(present, by_node).items()
+    }
+    # Each round refutes a link at least, so there is a last one.
+    while True:
+        kept, unjoined = join(solver, {key: group.sorted for key, group in groups.items()}, s.consistency)
+        solved, kept, strained = optimise(solver, kept, s.strain)
+        impossible = refutation.impossible(groups, solved, kept)
+        if not impossible:
+            break
+        for key, reason in impossible.items():
+            groups[key] = groups[key].without(
+                groups[key].sorted.kept, reason, s.consistency, refutation.verdict
+            )
+    refusals += [r for group in groups.values() for r in group.refused] + unjoined + strained
     postures = {
         node: Placement(number, posture)
         for number, graph in enumerate(solved)
@@ -81,93 +96,3 @@ def merge_maps(
         postures,
         tuple(solved),
     )
-
-
-def _join(
-    fragments: Sequence[Fragment],
-    by_node: Mapping[NodeId, Fragment],
-    groups: Mapping[tuple[NodeId, NodeId], Sorted],
-    s: MergeSettings,
-) -> tuple[list[Link], list[RefusedLink]]:
-    """Join pieces by their groups of links, best supported first; later ones must agree with earlier ones."""
-    joined: nx.Graph = nx.Graph()
-    joined.add_nodes_from(fragment.name for fragment in fragments)
-    kept: list[Link] = []
-    closing: list[Sorted] = []
-    ranked = sorted(groups.items(), key=lambda item: (-item[1].weight, item[0]))
-    for (first, second), group in ranked:
-        if not group.kept:
-            continue
-        if first == second or not nx.has_path(joined, first, second):
-            joined.add_edge(first, second)
-            kept += group.kept
-        else:
-            closing.append(group)
-    refusals: list[RefusedLink] = []
-    for group in closing:
-        solved = {graph.anchor: graph for graph in _solve(fragments, by_node, kept)}
-        graph = next(g for g in solved.values() if group.kept[0].a in g.nodes)
-        good = _strains(group.kept, graph, s) < s.consistency.gate
-        kept += [link for link, fits in zip(group.kept, good, strict=True) if fits]
-        refusals += [
-            refuse(link, "contradicts better supported links by way of other maps")
-            for link, fits in zip(group.kept, good, strict=True)
-            if not fits
-        ]
-    return kept, refusals
-
-
-def _strains(links: Sequence[Link], graph: PoseGraph, s: MergeSettings) -> Array:
-    """(N,) how far links that are not in the graph are from it, chi-square with 3 degrees of freedom."""
-    floor = np.diag([s.consistency.floor_xy**2] * 2 + [s.consistency.floor_heading**2])
-    measured = PoseGaussians(
-        np.stack([link.a_from_b.mean.vector for link in links]),
-        np.stack([link.a_from_b.covariance + floor for link in links]),
-    )
-    back = graph.relative([link.b for link in links], [link.a for link in links])
-    return (measured @ back).distances2()
-
-
-def _optimise(
-    fragments: Sequence[Fragment], by_node: Mapping[NodeId, Fragment], links: list[Link], s: MergeSettings
-) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
-    """Optimise; refuse the worst link as long as one strains too much."""
-    refusals: list[RefusedLink] = []
-    while True:
-        solved = _solve(fragments, by_node, links)
-        place = {node: graph for graph in solved for node in graph.nodes}
-        worst, most = None, s.strain
-        for link in links:
-            relative = place[link.a].pose(link.a).inverse() @ place[link.b].pose(link.b)
-            strain = Measurement(link.a, link.b, link.a_from_b)
-            d = (link.a_from_b.mean.inverse() @ relative).vector
-            value = float(d @ np.linalg.solve(strain.covariance, d))
-            if value > most:
-                worst, most = link, value
-        if worst is None:
-            return solved, links, refusals
-        links = [link for link in links if link is not worst]
-        refusals.append(
-            refuse(worst, f"strains the joined map: {most**0.5:.1f} standard deviations from where it ended")
-        )
-
-
-def _solve(
-    fragments: Sequence[Fragment], by_node: Mapping[NodeId, Fragment], links: Sequence[Link]
-) -> list[PoseGraph]:
-    """Each component optimised, largest first, then by name."""
-    joined: nx.Graph = nx.Graph()
-    joined.add_nodes_from(fragment.name for fragment in fragments)
-    joined.add_edges_from((by_node[link.a].name, by_node[link.b].name) for link in links)
-    by_name = {fragment.name: fragment for fragment in fragments}
-    solved = []
-    for names in nx.connected_components(joined):
-        anchor = min(names)
-        inside = [link for link in links if by_node[link.a].name in names]
-        if not inside:
-            solved.append(by_name[anchor].graph)
-            continue
-        measurements = [m for name in sorted(names) for m in by_name[name].measurements]
-        measurements += [Measurement(link.a, link.b, link.a_from_b, robust=True) for link in inside]
-        solved.append(solve_graph(anchor, by_name[anchor].graph.pose(anchor), measurements))
-    return sorted(solved, key=lambda graph: (-len(graph.nodes), graph.anchor))

@@ -1,0 +1,153 @@
+"""Pieces of map and sorted groups of links become components with optimised postures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import networkx as nx
+import numpy as np
+
+from hybridmap.node import NodeId
+from hybridmap.pose import Array
+from hybridmap.pose_arrays import PoseGaussians, compose_poses, inverse_poses
+from merge.consistency import ConsistencySettings, Sorted
+from merge.fragments import Fragment, fragment_by_node
+from merge.links import Link, RefusedLink, refuse
+from merge.posegraph import LEAST_SIGMAS, Measurement, PoseGraph, solve_graph
+
+Groups = Mapping[tuple[NodeId, NodeId], Sorted]
+"""Sorted links by the names of the two fragments between which they are."""
+
+
+class Solver:
+    """Optimises the components that links make of fragments, each set of links only once."""
+
+    def __init__(self, fragments: Sequence[Fragment]) -> None:
+        """Take the fragments."""
+        self.fragments = fragments
+        self.by_node = fragment_by_node(fragments)
+        self._by_name = {fragment.name: fragment for fragment in fragments}
+        self._solved: dict[tuple[tuple[NodeId, NodeId], ...], PoseGraph] = {}
+
+    def solve(self, links: Sequence[Link]) -> list[PoseGraph]:
+        """Each component, largest first, then by name.
+
+        Args:
+            links: at most one between two nodes.
+        """
+        joined: nx.Graph = nx.Graph()
+        joined.add_nodes_from(self._by_name)
+        joined.add_edges_from((self.by_node[link.a].name, self.by_node[link.b].name) for link in links)
+        anchors = {name: min(names) for names in nx.connected_components(joined) for name in names}
+        inside: dict[NodeId, list[Link]] = {}
+        for link in links:
+            inside.setdefault(anchors[self.by_node[link.a].name], []).append(link)
+        solved = [
+            self._component([n for n in self._by_name if anchors[n] == anchor], inside[anchor])
+            if anchor in inside
+            else self._by_name[anchor].graph
+            for anchor in sorted(set(anchors.values()))
+        ]
+        return sorted(solved, key=lambda graph: (-len(graph.nodes), graph.anchor))
+
+    def _component(self, names: Sequence[NodeId], links: Sequence[Link]) -> PoseGraph:
+        key = tuple(sorted(link.canonical().pair for link in links))
+        if key not in self._solved:
+            anchor = min(names)
+            measurements = [m for name in names for m in self._by_name[name].measurements]
+            measurements += [Measurement(link.a, link.b, link.a_from_b, robust=True) for link in links]
+            start = self._by_name[anchor].graph.pose(anchor)
+            self._solved[key] = solve_graph(anchor, start, measurements)
+        return self._solved[key]
+
+
+def join(solver: Solver, groups: Groups, s: ConsistencySettings) -> tuple[list[Link], list[RefusedLink]]:
+    """Join pieces by their groups of links, best supported first; later ones must agree with earlier ones.
+
+    Returns:
+        The links that join, and those that were refused here.
+    """
+    joined: nx.Graph = nx.Graph()
+    joined.add_nodes_from(fragment.name for fragment in solver.fragments)
+    kept: list[Link] = []
+    closing: list[Sorted] = []
+    ranked = sorted(groups.items(), key=lambda item: (-item[1].weight, item[0]))
+    for (first, second), group in ranked:
+        if not group.kept:
+            continue
+        if first == second or not nx.has_path(joined, first, second):
+            joined.add_edge(first, second)
+            kept += group.kept
+        else:
+            closing.append(group)
+    refusals: list[RefusedLink] = []
+    for group in closing:
+        graph = next(g for g in solver.solve(kept) if group.kept[0].a in g.rows)
+        good = _misfits(group.kept, graph, s) < s.gate
+        kept += [link for link, fits in zip(group.kept, good, strict=True) if fits]
+        refusals += [
+            refuse(link, "contradicts better supported links by way of other maps")
+            for link, fits in zip(group.kept, good, strict=True)
+            if not fits
+        ]
+    return kept, refusals
+
+
+def _misfits(links: Sequence[Link], graph: PoseGraph, s: ConsistencySettings) -> Array:
+    """(N,) how far links that are not in the graph are from it, chi-square with 3 degrees of freedom."""
+    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+    measured = PoseGaussians(
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance + floor for link in links]),
+    )
+    back = graph.relative([link.b for link in links], [link.a for link in links])
+    return (measured @ back).distances2()
+
+
+def optimise(
+    solver: Solver, links: Sequence[Link], strain: float
+) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
+    """Optimise; refuse the worst link as long as one strains too much.
+
+    It never cuts a piece off: a link that is all that holds two pieces together has no strain.
+
+    Args:
+        solver: of the fragments.
+        links: that join them.
+        strain: chi-square with 3 degrees of freedom above which a link is refused.
+
+    Returns:
+        The components, the links that are kept, and those that were refused.
+    """
+    left = list(links)
+    refusals: list[RefusedLink] = []
+    while True:
+        solved = solver.solve(left)
+        strains = _strains(left, solved)
+        if strains.max(initial=0.0) <= strain:
+            return solved, left, refusals
+        worst = int(strains.argmax())
+        off = float(strains[worst]) ** 0.5
+        reason = f"strains the joined map: {off:.1f} standard deviations from where it ended"
+        refusals.append(refuse(left.pop(worst), reason))
+
+
+def _strains(links: Sequence[Link], solved: Sequence[PoseGraph]) -> Array:
+    """(N,) how far optimised links are from where they ended, chi-square with 3 degrees of freedom."""
+    if not links:
+        return np.zeros(0)
+    starts = np.cumsum([0, *(len(graph.nodes) for graph in solved)])
+    rows = {
+        node: start + k
+        for start, graph in zip(starts, solved, strict=False)
+        for node, k in graph.rows.items()
+    }
+    means = np.concatenate([graph.means for graph in solved])
+    a, b = (means[[rows[node] for node in nodes]] for nodes in zip(*(x.pair for x in links), strict=True))
+    measured = PoseGaussians(
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance for link in links]) + np.diag(LEAST_SIGMAS**2),
+    )
+    off = compose_poses(inverse_poses(measured.means), compose_poses(inverse_poses(a), b))
+    out: Array = (off * np.linalg.solve(measured.covariances, off[:, :, None])[:, :, 0]).sum(axis=1)
+    return out
