@@ -6,6 +6,7 @@ does not.
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +45,18 @@ class TrajectoryScore:
     errors: Array
 
 
+def require_evo() -> None:
+    """Find out whether evo is there, before anything takes minutes.
+
+    Raises:
+        SettingsError: it is not installed.
+    """
+    try:
+        importlib.import_module("evo.core")
+    except ImportError:
+        raise SettingsError("scoring needs evo: pip install 'mapweave[eval]'") from None
+
+
 def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore:
     """Compare one map's trajectory with the truth.
 
@@ -58,10 +71,8 @@ def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore
         InvalidValue: no time that both know.
         SettingsError: evo is not installed.
     """
-    try:
-        from evo.core import filters, metrics, sync
-    except ImportError:
-        raise SettingsError("scoring needs evo: pip install 'mapweave[eval]'") from None
+    require_evo()
+    from evo.core import filters, metrics, sync
 
     try:
         true, believed = sync.associate_trajectories(
