@@ -50,7 +50,7 @@ class ExclusionSettings:
     """
 
     least_apart: float = 0.2
-    doubt: float = 1e-4
+    doubt: float = 1e-3
     least_witnesses: int = 3
     sigmas: float = 2.0
     longest_gap: float = 5.2
@@ -198,7 +198,7 @@ def clash_of(
     if len(close) == 0:
         return None
     shift = s.sigmas * _posture_sigmas(graph, first, second, one.nearest[close], two.nearest[close])
-    clear = _chances_clear(apart[close], shift, (one.spreads + two.spreads)[close], s.least_apart)
+    clear = chances_clear(apart[close], shift, (one.spreads + two.spreads)[close], s.least_apart)
     # A body takes this share of the neighbourhood; without it many moments would prove anything.
     free = 1.0 - (s.least_apart / s.neighbourhood) ** 2
     odds = np.where(distances < s.neighbourhood, free, 1.0)
@@ -241,7 +241,7 @@ LEAST_SPREAD = 0.01
 """Nobody's place is known better than this, m."""
 
 
-def _chances_clear(apart: Array, shift: Array, spreads: Array, least_apart: float) -> Array:
+def chances_clear(apart: Array, shift: Array, spreads: Array, least_apart: float) -> Array:
     """(K,) chances that two robots are at least so far apart after all.
 
     Args:
