@@ -9,19 +9,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from agent.fleet import AgentReport, encode_mission
-from agent.mission import Carried, Explore, GoTo, Idle, Mission
+from agent.mission import Carried, Explore, Idle, Mission
 from hybridmap.errors import InvalidValue, NotConnected
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2
 from mapweave.trial import actions
 from mapweave.trial.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage
-from mapweave.trial.kidnapping import Kidnapping, NothingToShow, choose_goal, plan_kidnapping
-from mapweave.trial.recording import Fix, Lost, Moment
+from mapweave.trial.losing import Losing
+from mapweave.trial.recording import Lost, Moment
 from mapweave.trial.reports import Reports
 from mapweave.trial.scenario import CONDITIONS, LONGEST, ScenarioEvent, When
 from sim import events
-from wire.mapfile import MapFile, unpack_map_file
+from wire.mapfile import MapFile
 
 LOOK_EVERY = {"joined": 5.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "grown": 1.0}
 """How often it is looked whether something has come true, simulated s."""
@@ -40,7 +37,6 @@ class Conductor:
 
     Attributes:
         moments: what was done and noticed.
-        lost: robots that were carried away.
         recoveries_s: wall time that each return took.
         now: simulated time, s.
         done: how many events have happened.
@@ -69,7 +65,6 @@ class Conductor:
         self._stride = min(stride, STRIDE)
         self.reports = Reports(fleet.bus, fleet.keys)
         self.moments: list[Moment] = []
-        self.lost: list[Lost] = []
         self.recoveries_s: list[float] = []
         self.now = 0.0
         self.done = 0
@@ -77,8 +72,7 @@ class Conductor:
         self.agents: dict[str, AgentReport] = {}
         self._alive = set(stage.robots)
         self._cut: set[str] = set()
-        self._sent: Lost | None = None
-        self._plot: Kidnapping | None = None
+        self._losing = Losing(stage, fleet, self._command, self.note)
         self._grown: tuple[str, int] = ("", 0)
 
     def run(self) -> None:
@@ -93,6 +87,15 @@ class Conductor:
             self._act(event)
             self.done += 1
             self._on_look(self)
+
+    @property
+    def lost(self) -> list[Lost]:
+        """Robots that were carried away, or sent."""
+        return self._losing.lost
+
+    def merged(self) -> MapFile:
+        """The server's merged map; see Losing.merged."""
+        return self._losing.merged()
 
     def note(self, text: str, trouble: bool = False) -> None:
         """Remember that something happened now."""
@@ -128,17 +131,7 @@ class Conductor:
 
     def _look(self) -> None:
         self.agents = self.reports.agents(sorted(self._alive - self._cut))
-        for lost in self.lost:
-            report = self.agents.get(lost.robot)
-            if report is None or report.stamp_ns <= lost.stamp_ns:
-                continue
-            status = report.status
-            if lost.fix is None and status.fix_node is not None and status.mission == "goto":
-                lost.fix = Fix(report.stamp_ns, status.fix_node, status.node_from_robot)
-            if lost.arrived_ns is None and status.mission == "goto":
-                lost.legs = max(lost.legs, status.legs)
-                if status.finished and lost is self._sent:
-                    lost.arrived_ns = report.stamp_ns
+        self._losing.look(self.agents)
         self._on_look(self)
 
     def _true(self, condition: str) -> bool:
@@ -152,7 +145,8 @@ class Conductor:
             case "found":
                 return bool(self.lost) and self.lost[-1].fix is not None
             case "arrived":
-                return self._sent is not None and self._sent.arrived_ns is not None
+                sent = self._losing.sent
+                return sent is not None and sent.arrived_ns is not None
             case _:
                 robot, nodes = self._grown
                 return robot in self.agents and self.agents[robot].status.nodes > nodes
@@ -170,12 +164,12 @@ class Conductor:
                     self._command(name, MISSIONS[mission])
                 self.note(f"{', '.join(names)}: {mission}")
             case actions.Abduct(robot):
-                self._abduct(robot)
+                self._losing.abduct(robot)
             case actions.Send(robot, goal):
-                self._send(robot, goal)
+                self._losing.send(robot, goal)
             case events.Kidnap(robot):
                 self._happen(event.table)
-                self._mark_lost(robot)
+                self._losing.mark(robot)
             case actions.KillAgent(robot):
                 before = self.agents.get(robot)
                 self._grown = (robot, before.status.nodes if before is not None else 0)
@@ -251,87 +245,6 @@ class Conductor:
         if not replies or replies[0].error:
             why = replies[0].error if replies else "no answer"
             raise NotConnected(f"agent {robot} did not take its mission: {why}")
-
-    # Losing and sending
-
-    def merged(self) -> MapFile:
-        """The server's merged map, with everything in it that has come.
-
-        Raises:
-            NotConnected: it does not hand it out.
-        """
-        replies = self._fleet.bus.ask(self._fleet.keys.server_map(SERVER), b"", 120.0)
-        for reply in replies:
-            if not reply.error:
-                return unpack_map_file(reply.payload)
-        why = replies[0].error if replies else "no answer"
-        raise NotConnected(f"the map server did not hand out the merged map: {why}")
-
-    def _abduct(self, robot: str) -> None:
-        merged = self.merged()
-        status = self._fleet.control.status()
-        try:
-            self._plot = plot = plan_kidnapping(
-                HybridMap(merged.changes),
-                {node: component for node, (component, _) in merged.postures.items()},
-                self._truth_of(HybridMap(merged.changes)),
-                self._fleet.control.plan(),
-                (robot,) if robot else self._stage.robots,
-                {name: one.world_from_robot for name, one in status.robots.items()},
-                self._stage.seed,
-            )
-        except NothingToShow as reason:
-            self.note(f"nobody is kidnapped: {reason}", True)
-            self._plot = None
-            return
-        self._fleet.control.kidnap(plot.robot, plot.world_from_robot)
-        self.note(f"{plot.robot} is put down in {plot.room}, which only {plot.host} has mapped")
-        self._mark_lost(plot.robot)
-
-    def _mark_lost(self, robot: str) -> None:
-        status = self._fleet.control.status()
-        pose = status.robots[robot].world_from_robot
-        room = self._fleet.control.plan().room_at(pose.x, pose.y) or "nowhere"
-        self.lost.append(Lost(robot, room, status.stamp_ns, pose))
-
-    def _send(self, robot: str, goal: str) -> None:
-        lost = next((one for one in reversed(self.lost) if robot in ("", one.robot)), None)
-        if lost is None:
-            if not robot:
-                self.note("nobody is sent: no robot was lost", True)
-                return
-            # A robot that nobody carried away is sent from where it knows itself to be.
-            self._mark_lost(robot)
-            lost = self.lost[-1]
-        try:
-            node = self._goal(lost, goal)
-        except NothingToShow as reason:
-            self.note(f"{lost.robot} is not sent: {reason}", True)
-            return
-        lost.goal, self._sent = node, lost
-        self._command(lost.robot, GoTo(node))
-        self.note(f"{lost.robot} shall go to {node}")
-
-    def _goal(self, lost: Lost, goal: str) -> NodeId:
-        if goal not in ("foreign", "own"):
-            return NodeId.parse(goal)
-        if goal == "foreign" and self._plot is not None and self._plot.robot == lost.robot:
-            return self._plot.goal
-        merged = self.merged()
-        whole = HybridMap(merged.changes)
-        components = {node: component for node, (component, _) in merged.postures.items()}
-        return choose_goal(
-            whole, components, self._truth_of(whole), lost.robot, lost.world_from_robot,
-            goal == "foreign", self._stage.seed,
-        )  # fmt: skip
-
-    def _truth_of(self, whole: HybridMap) -> dict[NodeId, Pose2]:
-        truth: dict[NodeId, Pose2] = {}
-        for robot in self._stage.robots:
-            nodes = [node for node in whole.nodes.values() if node.id.agent == robot]
-            poses = self._fleet.control.truth_at(robot, [node.stamp_ns for node in nodes])
-            truth.update(zip([node.id for node in nodes], poses, strict=True))
-        return truth
 
 
 def _in_words(event: ScenarioEvent) -> str:
