@@ -95,6 +95,7 @@ class Cartographer:
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
         clock: str = "",
+        radius: float = 0.0,
     ) -> None:
         """Start an empty map whose frame is the first anchor's, or go on with one.
 
@@ -105,12 +106,14 @@ class Cartographer:
             contents: of a map that was begun.
             next_number: the first that no node or edge has ever had.
             clock: that views are stamped by; see Node.
+            radius: of the robot, m.
         """
         self.map = HybridMap(contents)
         self.map_from_anchor = HERE
         self._map_id = map_id
         self._camera = camera
         self._clock = clock
+        self._radius = radius
         self._settings = settings
         self._last: Placed | None = None
         self._next_number = next_number
@@ -185,7 +188,9 @@ class Cartographer:
         if len(landmarks) < self._settings.least_landmarks:
             return None
         posture = self.map_from_anchor @ view.anchor_from_view
-        node = Node(self._number(), view.stamp_ns, posture, self._camera, landmarks, self._clock)
+        node = Node(
+            self._number(), view.stamp_ns, posture, self._camera, landmarks, self._clock, self._radius
+        )
         changes.append(NodePut(node))
         return Placed(node, tracks)
 

@@ -154,6 +154,8 @@ class Node:
         landmarks: what is in the image.
         clock: what `stamp_ns` was read from. Times of two robots can be compared only if it is the same;
             empty if nobody knows.
+        radius: of the robot's footprint, m: two robots are never nearer to each other than both of theirs. 0
+            if nobody knows.
     """
 
     id: NodeId
@@ -162,6 +164,7 @@ class Node:
     camera: Camera
     landmarks: Landmarks
     clock: str = ""
+    radius: float = 0.0
 
     @property
     def points_in_robot(self) -> Array:

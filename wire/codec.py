@@ -30,6 +30,7 @@ from wire.landmark_codec import (
 )
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 
+MAX_RADIUS_MM = 100_000
 MAX_BODY_BYTES = MAX_LANDMARKS * LANDMARK_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 MAX_SHARED = MAX_LANDMARKS
@@ -153,7 +154,15 @@ def _node_fields(node: Node) -> dict[str, object]:
     }
     if node.clock:
         fields["z"] = check_name(node.clock)
+    if node.radius:
+        fields["r"] = _millimetres(node.radius)
     return fields
+
+
+def _millimetres(radius: float) -> int:
+    if not 0.0 <= radius <= MAX_RADIUS_MM / 1000.0:
+        raise InvalidValue(f"node: a robot's radius of {radius} m is out of range")
+    return round(radius * 1000.0)
 
 
 def _read_node(reader: Reader, element: NodeId) -> Node:
@@ -165,6 +174,7 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
         camera=camera,
         landmarks=unpack_landmarks(reader.binary("l", MAX_BODY_BYTES), camera),
         clock=reader.name("z") if reader.has("z") else "",
+        radius=reader.integer("r", 0, MAX_RADIUS_MM) / 1000.0 if reader.has("r") else 0.0,
     )
 
 

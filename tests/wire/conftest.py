@@ -63,8 +63,9 @@ def landmarks(draw: st.DrawFn, camera: Camera, most: int = 40) -> Landmarks:
 def nodes(draw: st.DrawFn) -> Node:
     camera = draw(cameras())
     stamp_ns = draw(st.integers(0, 2**63 - 1))
+    radius = draw(st.integers(0, 5000)) / 1000.0
     clock = draw(st.sampled_from(["", "utc", "sim-office-7"]))
-    return Node(draw(node_ids), stamp_ns, draw(postures()), camera, draw(landmarks(camera)), clock)
+    return Node(draw(node_ids), stamp_ns, draw(postures()), camera, draw(landmarks(camera)), clock, radius)
 
 
 @st.composite

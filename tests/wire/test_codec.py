@@ -47,6 +47,7 @@ def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject) ->
     assert isinstance(body, NodePut)
     back = body.node
     assert (back.id, back.stamp_ns, back.camera) == (node.id, node.stamp_ns, node.camera)
+    assert (back.clock, back.radius) == (node.clock, node.radius)
     assert_close(back.map_from_robot, node.map_from_robot)
     old, new = node.landmarks, back.landmarks
     assert len(old) == len(new)
