@@ -1,5 +1,7 @@
 """The merger: order of arrival, better knowledge, and answers that follow the maps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -126,6 +128,22 @@ def test_reading_a_store_gives_the_same_as_living_through_it(scene: Scene, merge
         other.apply(map_id, body)
     assert other.counters.verified == 0
     assert same(merger.merged(), other.merged())
+
+
+@pytest.mark.parametrize(("clock", "joined"), [("net", False), ("", True)])
+def test_robots_that_would_walk_through_each_other_are_not_joined(clock: str, joined: bool) -> None:
+    """Two robots do the same at the same time in two rooms that look the same: only their clock can tell."""
+    rng = np.random.default_rng(4)
+    one = room(0, 0, 5, 4, 600, rng)
+    merger = Merger()
+    for map_id, world_from_room in ((A, Pose2()), (B, Pose2(10, 0, 0))):
+        stops = [world_from_room @ Pose2(2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.5 * k) for k in range(12)]
+        nodes, edges = take_map(one.moved(world_from_room), map_id, stops, rng)
+        for body in [*(NodePut(replace(n, clock=clock)) for n in nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    merged = merger.merged()
+    assert merged.joined(A, B) == joined
+    assert any("same place at the same time" in r.reason for r in merged.refused) != joined
 
 
 def relocalizer(merger: Merger) -> Relocalizer:

@@ -173,7 +173,7 @@ def error(merged: MergedMap, truth: Truth) -> float:
 
 
 def test_twins_that_a_third_map_joins_come_apart_at_the_weakest_links() -> None:
-    """Robot c came later and saw b's room: b and c are truly linked, a and c falsely, and a and b not at all."""
+    """Robot c came later into the room of b, and is taken to have been in that of a as well."""
     twins = Twins(1)
     rng = np.random.default_rng(5)
     stops = [stop @ Pose2(0.05, 0.0, 0.0) for stop in list(twins.truth_b.values())[:30]]
