@@ -33,7 +33,7 @@ class ExclusionSettings:
 
     Attributes:
         least_apart: centres of two robots are never nearer than this, m: with a camera and two driven wheels
-            none is narrower. Where the robots are known to be larger, say so: it tells much more.
+            none is narrower. Nodes that name the robots' radii tell more.
         doubt: chance at most that a true merge is refused, ever.
         least_witnesses: independent moments (see `window`) that must make the merge half as likely each.
         sigmas: the postures of the two are first moved apart by as many standard deviations, since what is
@@ -71,11 +71,13 @@ class Trail:
         clock: not empty.
         nodes: N, in the order of their stamps.
         times: (N,) s, ascending.
+        radius: of the robot, m; 0 if not all nodes tell.
     """
 
     clock: str
     nodes: tuple[NodeId, ...]
     times: Array
+    radius: float = 0.0
 
     @property
     def agent(self) -> str:
@@ -125,7 +127,8 @@ def trails_of(nodes: Collection[Node]) -> tuple[Trail, ...]:
     for clock, known in sorted(by_clock.items()):
         known.sort(key=lambda node: (node.stamp_ns, node.id))
         times = np.array([node.stamp_ns for node in known]) / NANOSECONDS
-        trails.append(Trail(clock, tuple(node.id for node in known), times))
+        radius = min(node.radius for node in known)
+        trails.append(Trail(clock, tuple(node.id for node in known), times, radius))
     return tuple(trails)
 
 
@@ -191,16 +194,17 @@ def clash_of(
     one, two = (
         _stay(trail, graph.means[graph.index(trail.nodes), :2], times, s) for trail in (first, second)
     )
+    least_apart = max(s.least_apart, first.radius + second.radius)
     known = one.known & two.known
     apart = two.places - one.places
     distances = np.hypot(apart[:, 0], apart[:, 1])
-    close = np.flatnonzero(known & (distances < s.least_apart))
+    close = np.flatnonzero(known & (distances < least_apart))
     if len(close) == 0:
         return None
     shift = s.sigmas * _posture_sigmas(graph, first, second, one.nearest[close], two.nearest[close])
-    clear = chances_clear(apart[close], shift, (one.spreads + two.spreads)[close], s.least_apart)
+    clear = chances_clear(apart[close], shift, (one.spreads + two.spreads)[close], least_apart)
     # A body takes this share of the neighbourhood; without it many moments would prove anything.
-    free = 1.0 - (s.least_apart / s.neighbourhood) ** 2
+    free = 1.0 - (least_apart / s.neighbourhood) ** 2
     odds = np.where(distances < s.neighbourhood, free, 1.0)
     odds[close] = free / clear
     witness = np.floor(times[known] / s.window).astype(np.int64)
