@@ -249,9 +249,9 @@ class Pipeline:
     def _status(self, warning: str) -> Status:
         doing, detail, finished = "idle", "no mission", False
         match self._mission:
-            case Explore() | Carried() if self._resumption is not None:
+            case Explore() | Carried() if self._mapper.astray:
                 doing = "lost" if self.lost else "looking for a place of its own map"
-                detail = self._resumption.detail
+                detail = "" if self._resumption is None else self._resumption.detail
             case Explore() | Carried() if self._mapper.doubtful:
                 doing, detail = "standing still", self._mapper.doubt
             case Explore() if self._explorer is not None:

@@ -1,21 +1,26 @@
-"""Taking up a map again: look around, and away from here, until a place of the own map is recognised."""
+"""Taking up a map again: look around, and away from here, until the own map is recognised.
+
+A false edge folds the map for good, so a recognition counts once another one agrees with it, see
+`agent/agreement.py`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from agent.agreement import AgreementSettings, Sighting, agree
 from agent.observation import Command, Observation, RobotDescription
 from agent.recall import exact_enough, recall_all
 from agent.room import room
 from agent.vision.sift import Features, Sift
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node
-from hybridmap.pose import Array, Pose2
+from hybridmap.pose import Array, Pose2, wrap_angle
 from hybridmap.recognition import Recognition
 
 REMEMBERED = 600
@@ -30,18 +35,20 @@ class ResumptionSettings:
         look_turn: between two looks, rad.
         turn_rate: of that turn, rad/s.
         still: seconds that it stands still before a look.
-        turns: whole turns at the first place, and at each further one.
+        turns: whole turns at the first place, and at each further one; one where anything is recognised.
         places: how many places it looks around at.
-        move: the most that it drives to the next place, m.
+        move: the most that it drives to the next place, m: toward a node that it has recognised though not
+            well enough, else to where there is room.
         least_move: with less room than this it stays, m.
         speed: m/s.
         least_features: a view with fewer cannot be recognised.
         least_views: if fewer looks had a view than this share, it has not looked around: the lens is covered.
-        sure: standard deviations up to which it believes a recognition, m and rad. A robot that only wants to
-            drive asks for less the longer it has looked; an edge that is off bends the map for good.
+        sure: standard deviations up to which it goes on from a recognition, m and rad. A robot that only
+            wants to drive asks for less the longer it has looked.
+        vague: one that is this many times less exact may still agree with an exact one.
         rival: another node with this share of the best one's inliers has a say too;
-        apart: if it puts the robot further away than this, m, two places look the same, and neither is
-            believed.
+        apart: if it puts the robot further away than this, m, two places look the same, and neither counts.
+        agreement: when two looks agree.
         carried_pause: seconds between two looks of a robot that somebody else moves.
         carried_looks: how often such a robot looks in vain before it counts as lost.
     """
@@ -57,8 +64,10 @@ class ResumptionSettings:
     least_features: int = 8
     least_views: float = 0.25
     sure: tuple[float, float] = (0.03, 0.018)
+    vague: float = 3.0
     rival: float = 0.5
     apart: float = 0.5
+    agreement: AgreementSettings = field(default_factory=AgreementSettings)
     carried_pause: float = 0.5
     carried_looks: int = 120
 
@@ -82,7 +91,8 @@ class Resumption:
     """Finds a robot on its own map: one that was started anew, has navigated, or was carried off.
 
     Attributes:
-        found: the place that was recognised in the last observation; None until then.
+        found: the place that was recognised in the last observation, after another one that agrees; None
+            until then.
         lost: whether it has tried everything in vain.
         detail: what it does and why, in words.
         seen: `odom_from_robot` and readings of the rangers, (K,) m, while it looked around; the wheels' own
@@ -119,6 +129,10 @@ class Resumption:
         self._rng = np.random.default_rng(seed)
         self._observation: Observation | None = None
         self._odom_from_robot = Pose2()
+        self._way = self._turned = 0.0
+        self._sightings: list[Sighting] = []
+        self._hint: tuple[int, Pose2] | None = None
+        self._look_again: Pose2 | None = None
         self._looks = self._views = 0
         self._behaviour = self._search() if drives else self._wait_to_be_carried()
 
@@ -130,7 +144,9 @@ class Resumption:
     def step(self, observation: Observation) -> Command:
         """One tick: returns what the wheels shall do. Once `found` is set there is nothing more to do."""
         self._observation = observation
-        self._odom_from_robot = self._odom_from_robot @ observation.odometry.motion()
+        odometry = observation.odometry
+        self._odom_from_robot = self._odom_from_robot @ odometry.motion()
+        self._way, self._turned = self._way + abs(odometry.forward), self._turned + abs(odometry.turn)
         self.seen.append((self._odom_from_robot, observation.proximity))
         return next(self._behaviour)
 
@@ -140,7 +156,7 @@ class Resumption:
         s = self._settings
         place = 1
         while self.found is None and not self.lost:
-            self._looks = self._views = 0
+            self._looks, self._views, self._hint = 0, 0, None
             yield from self._look_around(s.turns[0] if place == 1 else s.turns[1])
             if self.found is not None:
                 break
@@ -150,28 +166,27 @@ class Resumption:
             self.lost = place >= s.places or not (yield from self._move())
             place += 1
         if self.lost:
-            self.detail = (
-                f"cannot find itself on its own map of {len(self._map.nodes)} nodes: nothing was recognised "
-                f"at {place - 1} place{'s' if place > 2 else ''}"
-            )
+            self.detail = self._verdict(f"at {place - 1} place{'s' if place > 2 else ''}")
         while True:
             yield Command()
 
     def _look_around(self, turns: int) -> Generator[Command, None, None]:
+        start = self._turned
         for _ in range(math.ceil(turns * math.tau / self._settings.look_turn)):
             yield from self._wait(self._settings.still)
-            if self._look():
+            whole = (self._turned - start) / math.tau
+            if self._look() or whole >= (turns if self._hint is None else 1):
                 return
-            yield from self._turn(self._settings.look_turn)
+            again, self._look_again = self._look_again, None
+            if again is None:
+                yield from self._turn(self._settings.look_turn)
+            else:
+                yield from self._turn(wrap_angle(again.heading - self._odom_from_robot.heading))
 
     def _wait_to_be_carried(self) -> Generator[Command, None, None]:
         while not self._look():
             if self._views >= self._settings.carried_looks:
-                self.lost = True
-                self.detail = (
-                    f"cannot find itself on its own map of {len(self._map.nodes)} nodes: nothing was "
-                    f"recognised in {self._views} images"
-                )
+                self.lost, self.detail = True, self._verdict(f"in {self._views} images")
                 break
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
             yield from self._wait(self._settings.carried_pause)
@@ -179,17 +194,25 @@ class Resumption:
             yield Command()
 
     def _move(self) -> Generator[Command, None, bool]:
-        """Drive to where the rangers see most room; returns whether there was any."""
+        """Drive a little to look from elsewhere; returns whether there was room."""
         s = self._settings
-        bearings = self._description.ranger_bearings
-        free = [room(self._description, self._now.proximity, bearing, 0.0) for bearing in bearings]
-        if not free or max(free) < s.least_move:
+        ways = [
+            (min(room(self._description, self._now.proximity, bearing, 0.0), s.move), bearing)
+            for bearing in self._description.ranger_bearings
+        ]
+        way, direction = max(ways, key=lambda one: one[0], default=(0.0, 0.0))
+        if self._hint is not None:
+            _, odom_from_node = self._hint
+            node = self._odom_from_robot.inverse() @ odom_from_node
+            toward = math.atan2(node.y, node.x)
+            near = min(room(self._description, self._now.proximity, toward, 0.0), math.hypot(node.x, node.y))
+            if near >= s.least_move:
+                way, direction = min(near, s.move), toward
+        if way < s.least_move:
             return False
-        direction = bearings[int(np.argmax(free))]
         self.detail = "moving on to look from elsewhere"
         yield from self._turn(math.remainder(direction, math.tau))
         start = self._odom_from_robot
-        way = min(max(free), s.move)
         for _ in range(math.ceil(2.0 * way / s.speed / self._description.tick)):
             left = way - start.distance(self._odom_from_robot)
             if left < 0.02 or room(self._description, self._now.proximity, 0.0, 0.0) < 0.02:
@@ -216,18 +239,33 @@ class Resumption:
             self.detail = f"none of {len(self._map.nodes)} nodes is recognised"
             return False
         node, recognition = recalled[0]
+        if self._hint is None or recognition.inliers > self._hint[0]:
+            odom_from_node = self._odom_from_robot @ recognition.node_from_robot.mean.inverse()
+            self._hint = recognition.inliers, odom_from_node
         here = node.map_from_robot.mean @ recognition.node_from_robot.mean
         for other, also in recalled[1:]:
             there = other.map_from_robot.mean @ also.node_from_robot.mean
             if also.inliers >= s.rival * recognition.inliers and here.distance(there) > s.apart:
                 self.detail = f"nodes {node.id} and {other.id} look the same"
                 return False
-        if not exact_enough(recognition.node_from_robot, s.sure):
+        exact = exact_enough(recognition.node_from_robot, s.sure)
+        if not exact_enough(recognition.node_from_robot, s.sure, s.vague):
             self.detail = f"node {node.id} is in view, but too far off"
             return False
-        self.detail = f"node {node.id}: {recognition.inliers} landmarks agree"
-        self.found = Found(node, features, recognition)
-        return True
+        self.detail = f"node {node.id}: {recognition.inliers} landmarks agree; another view must, too"
+        sighting = Sighting(here, self._odom_from_robot, self._way, self._turned, exact)
+        agreeing = [earlier for earlier in self._sightings if agree(earlier, sighting, s.agreement)]
+        self._sightings.append(sighting)
+        if exact and agreeing:
+            self.found = Found(node, features, recognition)
+        elif not exact:
+            self._look_again = next((one.odom_from_robot for one in agreeing if one.exact), None)
+        return self.found is not None
+
+    def _verdict(self, where: str) -> str:
+        """Why it is lost, in words."""
+        what = "no two views agreed" if self._sightings else "nothing was recognised"
+        return f"cannot find itself on its own map of {len(self._map.nodes)} nodes: {what} {where}"
 
     def _wait(self, seconds: float) -> Generator[Command, None, None]:
         for _ in range(max(1, round(seconds / self._description.tick))):
