@@ -14,17 +14,14 @@ often it is looked at (Ville's inequality; Grünwald et al., "Safe testing", 202
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.node import Node, NodeId
 from hybridmap.pose import Array
 from merge.posegraph import PoseGraph
-
-NANOSECONDS = 1e9
+from merge.trails import Trail, TrailSettings, stay
 
 
 @dataclass(frozen=True)
@@ -32,57 +29,27 @@ class ExclusionSettings:
     """When two robots contradict each other's postures.
 
     Attributes:
-        least_apart: centres of two robots are never nearer than this, m: with a camera and two driven wheels
-            none is narrower. Nodes that name the robots' radii tell more.
+        least_apart: centres of two robots are never nearer than this, m, unless both tell their radii: with
+            a camera and two driven wheels few are narrower.
         doubt: chance at most that a true merge is refused, ever.
         least_witnesses: independent moments (see `window`) that must make the merge half as likely each.
         sigmas: the postures of the two are first moved apart by as many standard deviations, since what is
             wrong with them is wrong at all moments alike.
-        longest_gap: between two nodes that are further apart in time nobody knows where the robot was, s.
-        longest_way: nor if they are further apart, m.
-        along: how far ahead or behind on the line between two nodes a robot may be midway, as a share of the
-            line, standard deviation: it stops and goes.
-        aside: the same to the side of the line.
-        clock_error: of two robots with the same clock, s.
         step: moments between nodes are looked at as often as this, s.
         window: moments within as much time are one witness, s.
-        neighbourhood: robots that are further apart than this speak neither for nor against, m.
+        neighbourhood: robots that are further apart than as many least distances speak neither for nor
+            against.
+        trail: how well it is known where a robot is between two nodes.
     """
 
     least_apart: float = 0.2
     doubt: float = 1e-3
     least_witnesses: int = 3
     sigmas: float = 2.0
-    longest_gap: float = 5.2
-    longest_way: float = 1.0
-    along: float = 0.15
-    aside: float = 0.05
-    clock_error: float = 0.05
     step: float = 0.5
     window: float = 2.0
-    neighbourhood: float = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Trail:
-    """When a robot was at which node, by one clock.
-
-    Attributes:
-        clock: not empty.
-        nodes: N, in the order of their stamps.
-        times: (N,) s, ascending.
-        radius: of the robot, m; 0 if not all nodes tell.
-    """
-
-    clock: str
-    nodes: tuple[NodeId, ...]
-    times: Array
-    radius: float = 0.0
-
-    @property
-    def agent(self) -> str:
-        """Whose it is."""
-        return self.nodes[0].agent
+    neighbourhood: float = 5.0
+    trail: TrailSettings = field(default_factory=TrailSettings)
 
 
 @dataclass(frozen=True)
@@ -117,59 +84,6 @@ class Clash:
         )
 
 
-def trails_of(nodes: Collection[Node]) -> tuple[Trail, ...]:
-    """The trails of one robot's nodes, one a clock; nodes whose clock nobody knows are left out."""
-    by_clock: dict[str, list[Node]] = {}
-    for node in nodes:
-        if node.clock:
-            by_clock.setdefault(node.clock, []).append(node)
-    trails = []
-    for clock, known in sorted(by_clock.items()):
-        known.sort(key=lambda node: (node.stamp_ns, node.id))
-        times = np.array([node.stamp_ns for node in known]) / NANOSECONDS
-        radius = min(node.radius for node in known)
-        trails.append(Trail(clock, tuple(node.id for node in known), times, radius))
-    return tuple(trails)
-
-
-@dataclass(frozen=True, eq=False)
-class _Stay:
-    """Where a robot was at some moments.
-
-    Attributes:
-        known: (T,) whether anybody knows.
-        places: (T, 2) m, in the component's frame.
-        spreads: (T, 2, 2) m^2, because the robot wanders between its nodes.
-        nearest: (T,) index of the node of the trail that is nearest in time.
-    """
-
-    known: NDArray[np.bool_]
-    places: Array
-    spreads: Array
-    nearest: NDArray[np.int64]
-
-
-def _stay(trail: Trail, places: Array, times: Array, s: ExclusionSettings) -> _Stay:
-    """Where a robot with nodes at `places`, (N, 2) m, was at `times`, (T,) s."""
-    before = np.clip(np.searchsorted(trail.times, times, side="right") - 1, 0, max(len(places) - 2, 0))
-    after = np.minimum(before + 1, len(places) - 1)
-    gaps = np.maximum(trail.times[after] - trail.times[before], 1e-9)
-    lines = places[after] - places[before]
-    lengths = np.hypot(lines[:, 0], lines[:, 1])
-    share = np.clip((times - trail.times[before]) / gaps, 0.0, 1.0)
-    at_node = (share == 0.0) | (share == 1.0)
-    known = (times >= trail.times[0]) & (times <= trail.times[-1])
-    known &= at_node | ((gaps <= s.longest_gap) & (lengths <= s.longest_way))
-    bow = 4.0 * share * (1.0 - share) * lengths
-    ahead = lines / np.maximum(lengths, 1e-9)[:, None]
-    along2 = (s.along * bow) ** 2 + (s.clock_error * lengths / gaps) ** 2
-    aside2 = (s.aside * bow) ** 2
-    outer = ahead[:, :, None] * ahead[:, None, :]
-    spreads = (along2 - aside2)[:, None, None] * outer + aside2[:, None, None] * np.eye(2)
-    nearest = np.where(share < 0.5, before, after)
-    return _Stay(known, places[before] + share[:, None] * lines, spreads, nearest)
-
-
 def clash_of(
     graph: PoseGraph, first: Trail, second: Trail, settings: ExclusionSettings | None = None
 ) -> Clash | None:
@@ -192,32 +106,73 @@ def clash_of(
     times = np.unique(np.concatenate([first.times, second.times, grid]))
     times = times[(times >= start) & (times <= end)]
     one, two = (
-        _stay(trail, graph.means[graph.index(trail.nodes), :2], times, s) for trail in (first, second)
+        stay(trail, graph.means[graph.index(trail.nodes), :2], times, s.trail) for trail in (first, second)
     )
-    least_apart = max(s.least_apart, first.radius + second.radius)
+    told = first.radius > 0.0 and second.radius > 0.0
+    least_apart = first.radius + second.radius if told else s.least_apart
     known = one.known & two.known
     apart = two.places - one.places
     distances = np.hypot(apart[:, 0], apart[:, 1])
     close = np.flatnonzero(known & (distances < least_apart))
     if len(close) == 0:
         return None
+    spreads = (one.spreads + two.spreads)[close]
+    meeting = _Meeting(times, known, distances, close, least_apart)
+    # Covariances cost more than all the rest: they are asked for only if the postures as they are clash.
+    clear = chances_clear(apart[close], np.zeros(len(close)), spreads, least_apart)
+    if not meeting.refuses(clear, s):
+        return None
     shift = s.sigmas * _posture_sigmas(graph, first, second, one.nearest[close], two.nearest[close])
-    clear = chances_clear(apart[close], shift, (one.spreads + two.spreads)[close], least_apart)
-    # A body takes this share of the neighbourhood; without it many moments would prove anything.
-    free = 1.0 - (least_apart / s.neighbourhood) ** 2
-    odds = np.where(distances < s.neighbourhood, free, 1.0)
-    odds[close] = free / clear
-    witness = np.floor(times[known] / s.window).astype(np.int64)
-    _, seat, counts = np.unique(witness, return_inverse=True, return_counts=True)
-    # Moments of one window hang together: the mean of their odds is fair whatever ties them, a product not.
-    evidence = np.log(np.bincount(seat, odds[known]) / counts)
-    if (evidence > math.log(2.0)).sum() < s.least_witnesses or evidence.sum() < -math.log(s.doubt):
+    clear = chances_clear(apart[close], shift, spreads, least_apart)
+    if not meeting.refuses(clear, s):
         return None
     worst = close[np.argmin(distances[close])]
     return Clash(
         first.agent, second.agent, first.clock, len(close), float(distances[worst]), float(times[worst]),
-        float(evidence.sum()),
+        float(meeting.evidence(clear, s).sum()),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Meeting:
+    """Moments of two robots.
+
+    Attributes:
+        times: (T,) s.
+        known: (T,) whether both are known to be somewhere.
+        distances: (T,) m, between them.
+        close: (K,) indices of moments when they are too near.
+        least_apart: what is too near, m.
+    """
+
+    times: Array
+    known: NDArray[np.bool_]
+    distances: Array
+    close: NDArray[np.int64]
+    least_apart: float
+
+    def evidence(self, clear: Array, s: ExclusionSettings) -> Array:
+        """(W,) logarithms of the odds against the merge that each window of time gives.
+
+        Args:
+            clear: (K,) chances that they were clear of each other after all in the moments that are close.
+            s: how long a window is.
+        """
+        # A body takes this share of the neighbourhood; without it many moments would prove anything.
+        free = 1.0 - s.neighbourhood**-2
+        odds = np.where(self.distances < s.neighbourhood * self.least_apart, free, 1.0)
+        odds[self.close] = free / clear
+        windows = np.floor(self.times[self.known] / s.window).astype(np.int64)
+        _, seat, counts = np.unique(windows, return_inverse=True, return_counts=True)
+        # Moments of one window hang together: the mean of their odds is fair all the same, a product is not.
+        out: Array = np.log(np.bincount(seat, odds[self.known]) / counts)
+        return out
+
+    def refuses(self, clear: Array, s: ExclusionSettings) -> bool:
+        """Whether that is enough to refuse a merge."""
+        evidence = self.evidence(clear, s)
+        witnesses = int((evidence > math.log(2.0)).sum())
+        return witnesses >= s.least_witnesses and float(evidence.sum()) >= -math.log(s.doubt)
 
 
 def _posture_sigmas(
@@ -246,7 +201,7 @@ LEAST_SPREAD = 0.01
 
 
 def chances_clear(apart: Array, shift: Array, spreads: Array, least_apart: float) -> Array:
-    """(K,) chances that two robots are at least so far apart after all.
+    """(K,) chances that two robots are clear of each other after all.
 
     Args:
         apart: (K, 2) m, from the one to the other.

@@ -10,11 +10,12 @@ import networkx as nx
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from merge.consistency import ConsistencySettings
-from merge.exclusion import Clash, ExclusionSettings, Trail, clash_of, trails_of
+from merge.exclusion import Clash, ExclusionSettings, clash_of
 from merge.groups import LinkGroup
 from merge.joining import Solver
 from merge.links import Link
 from merge.posegraph import PoseGraph
+from merge.trails import Trail, trails_of
 
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, smaller first."""

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hybridmap.camera import Camera
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from merge.exclusion import Clash, ExclusionSettings, Trail, chances_clear, clash_of, trails_of
+from merge.exclusion import Clash, ExclusionSettings, chances_clear, clash_of
 from merge.posegraph import PoseGraph
+from merge.trails import Trail, trails_of
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 
@@ -57,12 +58,15 @@ def apart(a: Walk, b: Walk) -> Array:
     return np.hypot(*(a.truth[:n] - b.truth[:n]).T)
 
 
-def trails(a: Walk, b: Walk, clocks: tuple[str, str] = ("net", "net"), agents: str = "ab") -> list[Trail]:
+def trails(
+    a: Walk, b: Walk, clocks: tuple[str, str] = ("net", "net"), agents: str = "ab",
+    radii: tuple[float, float] = (0.0, 0.0),
+) -> list[Trail]:  # fmt: skip
     found = []
     for k, walk in enumerate((a, b)):
         nodes = [
             Node(NodeId(agents[k], k, i), round(time * 1e9), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
-                 Landmarks.empty(), clocks[k])
+                 Landmarks.empty(), clocks[k], radii[k])
             for i, time in enumerate(walk.times)
         ]  # fmt: skip
         found += trails_of(nodes)
@@ -173,6 +177,22 @@ def test_robots_that_nearly_touch_all_the_time_seldom_look_like_a_clash() -> Non
             b.moved(np.array([0.02, 0.0]))
         refused += clash_of(graph(a, b, rng), *trails(a, b), s) is not None
     assert refused <= 10
+
+
+def test_robots_that_tell_how_large_they_are_are_kept_apart_by_that() -> None:
+    """Two that pass at 0.25 m: small ones may, large ones cannot, and one that does not tell may be small."""
+    rng = np.random.default_rng(8)
+    a = Walk(rng)
+    b = Walk(rng, way=a.way + np.array([0.25, 0.0]) + rng.normal(0, 0.03, a.way.shape))
+    b.times = a.times
+    whole = graph(a, b, rng)
+    found = clash_of(whole, *trails(a, b, radii=(0.2, 0.2)))
+    assert found is not None and found.nearest > 0.15
+    for radii in ((0.04, 0.04), (0.0, 0.0), (0.4, 0.0)):
+        assert clash_of(whole, *trails(a, b, radii=radii)) is None
+    tiny = ExclusionSettings(least_apart=0.4)
+    assert clash_of(whole, *trails(a, b, radii=(0.04, 0.04)), tiny) is None
+    assert clash_of(whole, *trails(a, b), tiny) is not None
 
 
 def test_chances_against_many_draws() -> None:
