@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.ekf.triangulation import triangulate
+from agent.observation import RobotDescription
 from agent.tracking import Tracking
 from agent.view import View
-from hybridmap.camera import Camera
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.ranges import Ranges
 from hybridmap.recognition import Recognition, register
 
 TURN_ONLY = 0.15
@@ -90,30 +91,25 @@ class Cartographer:
     def __init__(
         self,
         map_id: MapId,
-        camera: Camera,
+        description: RobotDescription,
         settings: CartographerSettings,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
-        clock: str = "",
-        radius: float = 0.0,
     ) -> None:
         """Start an empty map whose frame is the first anchor's, or go on with one.
 
         Args:
             map_id: of the map.
-            camera: that takes the views.
+            description: of the robot.
             settings: how.
             contents: of a map that was begun.
             next_number: the first that no node or edge has ever had.
-            clock: that views are stamped by; see Node.
-            radius: of the robot, m.
         """
         self.map = HybridMap(contents)
         self.map_from_anchor = HERE
         self._map_id = map_id
-        self._camera = camera
-        self._clock = clock
-        self._radius = radius
+        self._description = description
+        self._camera = description.camera
         self._settings = settings
         self._last: Placed | None = None
         self._next_number = next_number
@@ -188,9 +184,9 @@ class Cartographer:
         if len(landmarks) < self._settings.least_landmarks:
             return None
         posture = self.map_from_anchor @ view.anchor_from_view
-        node = Node(
-            self._number(), view.stamp_ns, posture, self._camera, landmarks, self._clock, self._radius
-        )
+        d = self._description
+        ranges = Ranges.around(view.proximity, d.ranger_bearings, d.ranger_reach, d.radius)
+        node = Node(self._number(), view.stamp_ns, posture, d.camera, landmarks, d.clock, d.radius, ranges)
         changes.append(NodePut(node))
         return Placed(node, tracks)
 

@@ -64,10 +64,7 @@ class Mapper:
         self._lens = Lens(description)
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings.tracking)
-        self._cartographer = Cartographer(
-            map_id, description.camera, settings.cartographer, contents, next_number, description.clock,
-            description.radius,
-        )  # fmt: skip
+        self._cartographer = Cartographer(map_id, description, settings.cartographer, contents, next_number)
         self._anchor: View | None = None
         self._leaves: list[View] = []
 

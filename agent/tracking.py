@@ -151,7 +151,7 @@ class Tracking:
     def take(self, observation: Observation, features: Features, anchor_from_view: PoseGaussian) -> View:
         """Make a view of an image that was just tracked, and tell which of its features are tracks."""
         tracks = associate(features, self._tracker.ids, self._tracker.raw, self._settings.associate_px)
-        return View(observation.stamp_ns, anchor_from_view, features, tracks)
+        return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity)
 
     def follow(self, view: View, expected_depth: float) -> None:
         """Make tracks of a view's features that have none, and give the filter an even choice of them."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,14 @@ class View:
         anchor_from_view: posture relative to the anchor view; identity for the anchor itself.
         features: its features.
         tracks: (N,) id of the track of each feature, -1 where it has none.
+        proximity: (K,) m, free distances from the robot's edge at that time.
     """
 
     stamp_ns: int
     anchor_from_view: PoseGaussian
     features: Features
     tracks: NDArray[np.int64]
+    proximity: Array = field(default_factory=lambda: np.zeros(0))
 
 
 def associate(features: Features, ids: NDArray[np.int64], raw: Array, within_px: float) -> NDArray[np.int64]:

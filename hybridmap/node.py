@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, PoseGaussian
+from hybridmap.ranges import Ranges
 
 CODE_BYTES = 16
 """Bytes of one compact descriptor: 32 dimensions of 4 bits, see hybridmap.descriptor."""
@@ -156,6 +157,7 @@ class Node:
             empty if nobody knows.
         radius: of the robot's footprint, m: two robots are never nearer to each other than both of theirs. 0
             if nobody knows.
+        ranges: what the proximity sensors saw from there at that time; empty if it has none.
     """
 
     id: NodeId
@@ -165,6 +167,7 @@ class Node:
     landmarks: Landmarks
     clock: str = ""
     radius: float = 0.0
+    ranges: Ranges = field(default_factory=Ranges)
 
     @property
     def points_in_robot(self) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.errors import InvalidMessage, InvalidValue
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId, check_name
+from hybridmap.ranges import Ranges
 from wire.landmark_codec import (
     LANDMARK_BYTES,
     MAX_LANDMARKS,
@@ -29,6 +30,7 @@ from wire.landmark_codec import (
     unpack_posture,
 )
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+from wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
 
 MAX_RADIUS_MM = 100_000
 MAX_BODY_BYTES = MAX_LANDMARKS * LANDMARK_BYTES + 2048
@@ -156,6 +158,8 @@ def _node_fields(node: Node) -> dict[str, object]:
         fields["z"] = check_name(node.clock)
     if node.radius:
         fields["r"] = _millimetres(node.radius)
+    if len(node.ranges):
+        fields["g"] = pack_ranges(node.ranges)
     return fields
 
 
@@ -175,6 +179,7 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
         landmarks=unpack_landmarks(reader.binary("l", MAX_BODY_BYTES), camera),
         clock=reader.name("z") if reader.has("z") else "",
         radius=reader.integer("r", 0, MAX_RADIUS_MM) / 1000.0 if reader.has("r") else 0.0,
+        ranges=unpack_ranges(reader.binary("g", MAX_RANGE_BYTES)) if reader.has("g") else Ranges(),
     )
 
 

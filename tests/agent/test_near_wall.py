@@ -10,7 +10,7 @@ import pytest
 from agent import cartographer
 from agent.cartographer import Cartographer, CartographerSettings
 from agent.mapper import Mapper
-from agent.observation import Command
+from agent.observation import Command, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.change import NodePut
 from hybridmap.node import Landmarks, MapId, Node, NodeId
@@ -55,7 +55,11 @@ def test_a_loop_must_agree_with_the_way_there(monkeypatch, off, closed):
     back = PoseGaussian.from_sigmas(along.mean.inverse() @ Pose2(0.4, 0.1, 0.1), 0.05, 0.02)
     later = earlier @ along @ back
     made = Cartographer(
-        MapId("r0", 1), CAMERA, CartographerSettings(), [NodePut(node(1, earlier))], next_number=2
+        MapId("r0", 1),
+        RobotDescription(camera=CAMERA),
+        CartographerSettings(),
+        [NodePut(node(1, earlier))],
+        next_number=2,
     )
     way = earlier.mean.inverse() @ later.mean
     found = PoseGaussian.from_sigmas(Pose2(way.x - off, way.y, way.heading), 0.02, 0.005)

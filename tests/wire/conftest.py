@@ -14,6 +14,7 @@ from hybridmap.camera import Camera
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.ranges import Ranges
 
 # Examples run on machines that are busy with other things.
 settings.register_profile("mapweave", deadline=None)
@@ -60,12 +61,30 @@ def landmarks(draw: st.DrawFn, camera: Camera, most: int = 40) -> Landmarks:
 
 
 @st.composite
+def ranges(draw: st.DrawFn) -> Ranges:
+    count = draw(st.integers(0, 20))
+    random = np.random.default_rng(draw(seeds))
+    reach = draw(st.integers(100, 10_000)) / 1000.0
+    distances = np.where(random.random(count) < 0.5, reach, random.uniform(0, reach, count))
+    return Ranges(random.uniform(-3.1, 3.1, count), distances, reach) if count else Ranges()
+
+
+@st.composite
 def nodes(draw: st.DrawFn) -> Node:
     camera = draw(cameras())
     stamp_ns = draw(st.integers(0, 2**63 - 1))
     radius = draw(st.integers(0, 5000)) / 1000.0
     clock = draw(st.sampled_from(["", "utc", "sim-office-7"]))
-    return Node(draw(node_ids), stamp_ns, draw(postures()), camera, draw(landmarks(camera)), clock, radius)
+    return Node(
+        draw(node_ids),
+        stamp_ns,
+        draw(postures()),
+        camera,
+        draw(landmarks(camera)),
+        clock,
+        radius,
+        draw(ranges()),
+    )
 
 
 @st.composite

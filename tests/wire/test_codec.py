@@ -47,7 +47,11 @@ def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject) ->
     assert isinstance(body, NodePut)
     back = body.node
     assert (back.id, back.stamp_ns, back.camera) == (node.id, node.stamp_ns, node.camera)
-    assert (back.clock, back.radius) == (node.clock, node.radius)
+    assert (back.clock, back.radius, len(back.ranges)) == (node.clock, node.radius, len(node.ranges))
+    assert np.abs(back.ranges.bearings - node.ranges.bearings).max(initial=0.0) <= 0.6e-4
+    assert np.abs(back.ranges.distances - node.ranges.distances).max(initial=0.0) <= node.ranges.reach / 500
+    nothing = node.ranges.distances >= node.ranges.reach
+    assert (back.ranges.distances[nothing] == back.ranges.reach).all()
     assert_close(back.map_from_robot, node.map_from_robot)
     old, new = node.landmarks, back.landmarks
     assert len(old) == len(new)

@@ -1,0 +1,47 @@
+"""Ranges on the wire."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.ranges import Ranges
+from wire.range_codec import pack_ranges, unpack_ranges
+
+
+@given(st.binary(max_size=80))
+def test_any_bytes_are_ranges_or_refused_and_encode_to_themselves(data):
+    try:
+        ranges = unpack_ranges(data)
+    except InvalidMessage:
+        return
+    assert unpack_ranges(pack_ranges(ranges)).distances == pytest.approx(ranges.distances)
+    assert (ranges.distances <= ranges.reach).all()
+
+
+def test_sixteen_sensors_cost_fifty_bytes():
+    ranges = Ranges.around(np.full(16, 3.0), tuple(np.arange(16) * np.pi / 8), 3.0, 0.16)
+    assert len(pack_ranges(ranges)) == 50
+    back = unpack_ranges(pack_ranges(ranges))
+    assert back.reach == pytest.approx(3.16)
+    assert (back.distances == back.reach).all()
+    turned = np.exp(1j * back.bearings) - np.exp(1j * ranges.bearings)
+    assert np.abs(turned).max() < 1e-4
+
+
+def test_a_robot_without_sensors_says_nothing():
+    assert len(Ranges.around(np.zeros(0), (), 0.0, 0.16)) == 0
+    assert len(Ranges.around(np.zeros(3), (0.0,), 1.0, 0.16)) == 0
+
+
+@pytest.mark.parametrize(
+    ("bearings", "distances", "reach"),
+    [([0.0], [], 1.0), ([0.0], [2.0], 1.0), ([0.0], [-0.1], 1.0), ([np.nan], [0.5], 1.0), ([0.0], [np.nan], 1.0),
+     ([0.0], [0.5], 1e3), ([[0.0]], [[0.5]], 1.0)],
+)  # fmt: skip
+def test_what_does_not_belong_together_is_refused(bearings, distances, reach):
+    with pytest.raises(InvalidValue):
+        Ranges(np.array(bearings), np.array(distances), reach)

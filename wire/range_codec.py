@@ -1,0 +1,49 @@
+"""Ranges as packed bytes: 3 a sensor.
+
+reach     uint16    mm, from the robot's middle
+bearings  K int16   1e-4 rad, within half a turn
+distances K uint8   255: nothing in reach; else that share of 254 of the reach
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.ranges import MOST, Ranges
+
+MAX_RANGE_BYTES = 2 + 3 * MOST
+BEARING_STEP = 1e-4
+
+
+def pack_ranges(ranges: Ranges) -> bytes:
+    """Encode."""
+    reach_mm = round(ranges.reach * 1000)
+    bearings = np.remainder(np.asarray(ranges.bearings) + math.pi, math.tau) - math.pi
+    share = np.asarray(ranges.distances) / max(ranges.reach, 1e-9)
+    steps = np.where(share >= 1.0 - 1e-6, 255, np.minimum(np.rint(share * 254), 254))
+    return (
+        np.uint16(reach_mm).tobytes()
+        + np.rint(bearings / BEARING_STEP).astype("<i2").tobytes()
+        + steps.astype(np.uint8).tobytes()
+    )
+
+
+def unpack_ranges(data: bytes) -> Ranges:
+    """Decode.
+
+    Raises:
+        InvalidMessage: it is no packed ranges.
+    """
+    if len(data) < 2 or (len(data) - 2) % 3:
+        raise InvalidMessage(f"ranges: {len(data)} bytes are none")
+    count = (len(data) - 2) // 3
+    reach = int(np.frombuffer(data, "<u2", 1)[0]) / 1000.0
+    bearings = np.frombuffer(data, "<i2", count, 2).astype(np.float64) * BEARING_STEP
+    steps = np.frombuffer(data, np.uint8, count, 2 + 2 * count).astype(np.float64)
+    try:
+        return Ranges(bearings, np.where(steps == 255, reach, steps / 254 * reach), reach)
+    except InvalidValue as error:
+        raise InvalidMessage(str(error)) from None
