@@ -26,6 +26,8 @@ STRIDE = 5.0
 """Time is let go on by at most this without showing progress, s."""
 HAPPEN_TRIES = 20
 """How often an event is tried for which there is no room (nobody can walk through a robot), once a second."""
+ABDUCT_TRIES, ABDUCT_PAUSE = 8, 10.0
+"""How often a kidnapping is tried, and how long the robots explore on in between, simulated s."""
 RECOVERY_PATIENCE = 120.0
 """How long all may take to be well again after something came back, wall s."""
 
@@ -164,7 +166,7 @@ class Conductor:
                     self._command(name, MISSIONS[mission])
                 self.note(f"{', '.join(names)}: {mission}")
             case actions.Abduct(robot):
-                self._losing.abduct(robot)
+                self._abduct(robot)
             case actions.Send(robot, goal):
                 self._losing.send(robot, goal)
             case events.Kidnap(robot):
@@ -205,6 +207,22 @@ class Conductor:
                 self._recover(began)
             case _:
                 self._happen(event.table)
+
+    def _abduct(self, robot: str) -> None:
+        """Kidnap a robot; where those that stand idle are in the way, they first explore on for a while."""
+        for _ in range(ABDUCT_TRIES):
+            reason = self._losing.abduct(robot)
+            if not reason:
+                return
+            idle = [name for name, agent in self.agents.items() if agent.status.mission == "idle"]
+            self.note(f"nobody can be kidnapped now, {', '.join(idle) or 'nobody'} explores on: {reason}")
+            for name in idle:
+                self._command(name, Explore())
+            self._advance(self.now + ABDUCT_PAUSE)
+            for name in idle:
+                self._command(name, Idle())
+            self._advance(self.now + 1.0)
+        self.note(f"nobody is kidnapped: {reason}", True)
 
     def _happen(self, table: Mapping[str, Any]) -> None:
         """Something happens to the world, as soon as there is room for it."""

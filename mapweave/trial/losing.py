@@ -73,8 +73,12 @@ class Losing:
         why = replies[0].error if replies else "no answer"
         raise NotConnected(f"the map server did not hand out the merged map: {why}")
 
-    def abduct(self, robot: str) -> None:
-        """Put a robot, or one that the seed chooses, into a room that only one other has mapped."""
+    def abduct(self, robot: str) -> str:
+        """Put a robot, or one that the seed chooses, into a room that only one other has mapped.
+
+        Returns:
+            Why that cannot be done now; empty if it is done.
+        """
         merged = self.merged()
         status = self._fleet.control.status()
         try:
@@ -88,12 +92,12 @@ class Losing:
                 self._stage.seed,
             )
         except NothingToShow as reason:
-            self._note(f"nobody is kidnapped: {reason}", True)
             self._plot = None
-            return
+            return str(reason)
         self._fleet.control.kidnap(plot.robot, plot.world_from_robot)
         self._note(f"{plot.robot} is put down in {plot.room}, which only {plot.host} has mapped", False)
         self.mark(plot.robot)
+        return ""
 
     def mark(self, robot: str) -> None:
         """A robot was carried to where it is now."""

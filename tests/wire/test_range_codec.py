@@ -39,7 +39,8 @@ def test_a_robot_without_sensors_says_nothing():
 
 @pytest.mark.parametrize(
     ("bearings", "distances", "reach"),
-    [([0.0], [], 1.0), ([0.0], [2.0], 1.0), ([0.0], [-0.1], 1.0), ([np.nan], [0.5], 1.0), ([0.0], [np.nan], 1.0),
+    [([0.0], [], 1.0), ([0.0], [2.0], 1.0), ([0.0], [-0.1], 1.0),
+     ([np.nan], [0.5], 1.0), ([0.0], [np.nan], 1.0),
      ([0.0], [0.5], 1e3), ([[0.0]], [[0.5]], 1.0)],
 )  # fmt: skip
 def test_what_does_not_belong_together_is_refused(bearings, distances, reach):
