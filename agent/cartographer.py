@@ -185,7 +185,9 @@ class Cartographer:
             return None
         posture = self.map_from_anchor @ view.anchor_from_view
         d = self._description
-        ranges = Ranges.around(view.proximity, d.ranger_bearings, d.ranger_reach, d.radius)
+        ranges = Ranges()
+        if d.ranges_see_robots:
+            ranges = Ranges.around(view.proximity, d.ranger_bearings, d.ranger_reach, d.radius)
         node = Node(self._number(), view.stamp_ns, posture, d.camera, landmarks, d.clock, d.radius, ranges)
         changes.append(NodePut(node))
         return Placed(node, tracks)

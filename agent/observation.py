@@ -78,6 +78,8 @@ class RobotDescription:
         wheel_noise: standard deviation of a wheel's way, as a share of the way: sigma of the paper.
         ranger_bearings: (K,) rad, directions of the proximity sensors, 0 ahead, positive to the left.
         ranger_reach: the rangers' maximum, m.
+        ranges_see_robots: whether the rangers are low enough to see other robots of the fleet. Then what they
+            saw goes with every node, and a merge under which robots should have seen each other is refused.
         max_forward: speed limit, m/s; 0 if the robot is carried and takes no commands.
         max_turn: rate limit, rad/s.
         tick: time between two observations, s.
@@ -96,3 +98,4 @@ class RobotDescription:
     max_turn: float = 0.8
     tick: float = 0.1
     clock: str = ""
+    ranges_see_robots: bool = False

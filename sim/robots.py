@@ -76,6 +76,7 @@ class RobotSetup:
             ranger_reach=self.ranger_reach if self.rangers else 0.0,
             max_forward=self.max_forward,
             max_turn=self.max_turn,
+            ranges_see_robots=True,
         )
 
 

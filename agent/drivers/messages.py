@@ -138,6 +138,7 @@ def encode_description(description: RobotDescription) -> bytes:
             "tick": description.tick,
         }
         | ({"clock": description.clock} if description.clock else {})
+        | ({"ranges_see_robots": True} if description.ranges_see_robots else {})
     )
 
 
@@ -161,6 +162,7 @@ def decode_description(data: bytes) -> RobotDescription:
         max_turn=reader.number("max_turn", 0.0, FASTEST),
         tick=reader.number("tick", 1e-4, 3600.0),
         clock=reader.name("clock") if reader.has("clock") else "",
+        ranges_see_robots=reader.has("ranges_see_robots") and reader.any("ranges_see_robots") is True,
     )
 
 
