@@ -1,6 +1,6 @@
 """Answers whoever scores a run: truth and intervention. Robots and servers never ask here.
 
-One question on the key `sim/control`, a MessagePack map with the operation's name in `op`; `sim.control` asks.
+One question on the key `sim/control`, a MessagePack map with the operation in `op`; `sim.control` asks.
 """
 
 from __future__ import annotations
