@@ -58,6 +58,23 @@ def test_in_the_dark_there_is_nothing(walls, continuity):
     assert continuity.compare(seen, relit(dark, seen), 0.0, NOTHING, NOTHING) is not Sight.SAME
 
 
+def test_nor_is_there_in_a_dazzled_camera(walls, continuity):
+    seen = walls.render(HERE)
+    dazzled = np.clip(seen.astype(int) * 8, 0, 255).astype(np.uint8)
+    assert len(np.unique(dazzled)) > 10, "there is still something in it"
+    assert continuity.compare(seen, dazzled, 0.0, NOTHING, NOTHING) is Sight.BLANK
+
+
+def test_the_same_wall_from_further_back_is_not_the_same(walls, continuity):
+    """Less than half of what was in view is found where it should be."""
+    expected = np.random.default_rng(0).uniform([20, 20], [300, 220], (40, 2))
+    found = expected.copy()
+    found[16:] = np.nan
+    assert continuity.compare(walls.render(HERE), walls.render(HERE), 0.0, expected, found) is Sight.STRANGE
+    found[:28] = expected[:28] + 10.0
+    assert continuity.compare(walls.render(HERE), walls.render(HERE), 0.0, expected, found) is Sight.SAME
+
+
 def test_between_two_blank_walls_nothing_can_be_told(continuity):
     rng = np.random.default_rng(0)
     one, two = (np.clip(rng.normal(128, 2, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2))

@@ -14,6 +14,7 @@ from agent.kept import Kept
 from agent.mission import Explore, GoTo
 from agent.observation import Command
 from agent.pipeline import Pipeline
+from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from sim.simulation import Simulation
@@ -148,8 +149,16 @@ def test_an_agent_that_was_killed_goes_on_with_its_map(
 
 def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, Pose2]]) -> None:
     life, _ = again
-    kept = Kept.of(life.journal, MapId(ROBOT, 1))
-    assert [encode_body(b) for b in kept.contents] == [encode_body(b) for b in life.pipeline.map.contents()]
+    kept, now = HybridMap(Kept.of(life.journal, MapId(ROBOT, 1)).contents), life.pipeline.map
+    assert list(kept.nodes) == list(now.nodes)
+    assert list(kept.edges) == list(now.edges)
+    for number, node in now.nodes.items():
+        # The disk keeps single precision.
+        assert kept.nodes[number].map_from_robot.mean.distance(node.map_from_robot.mean) < 1e-5
+        assert np.array_equal(kept.nodes[number].landmarks.codes, node.landmarks.codes)
+    for number, edge in now.edges.items():
+        assert (kept.edges[number].a, kept.edges[number].b) == (edge.a, edge.b)
+        assert kept.edges[number].a_from_b.mean.distance(edge.a_from_b.mean) < 1e-5
 
 
 def test_resuming_again_is_the_same_to_the_last_bit(
