@@ -138,7 +138,8 @@ class Explorer:
             else:
                 yield from self._look_around()
             self.places.append(self._position)
-            path = self._next_place()
+            been = np.array(self.places + self._avoid)
+            path = next_place(self._floor, self._position, been, s.reach, s.sight, s.spacing)
             if not path:
                 break
             yield from self._travel(path)
@@ -266,13 +267,6 @@ class Explorer:
             self.detail = f"{distance:.1f} m to the next corner"
             speed = min(s.travel_speed, max(0.6 * distance, 0.05)) * max(0.0, 1.0 - abs(error) / 0.5)
             yield Command(speed, float(np.clip(1.5 * error, -s.turn_rate, s.turn_rate)))
-
-    # Decisions
-
-    def _next_place(self) -> list[Array]:
-        """Corners of the way to the place from which most is still to be seen; empty if there is none."""
-        s, been = self._settings, np.array(self.places + self._avoid)
-        return next_place(self._floor, self._position, been, s.reach, s.sight, s.spacing)
 
     # Small things
 

@@ -38,14 +38,7 @@ READ_AT_ONCE = 256
 
 
 class Entry(NamedTuple):
-    """One change of a log, damaged or not.
-
-    Attributes:
-        sequence: its number in the log.
-        element: the node or edge that it is about.
-        put: whether it puts, or retires.
-        body: None if the disk has damaged it.
-    """
+    """One change of a log: which node or edge it puts, or retires, and its body; None if that is damaged."""
 
     sequence: int
     element: NodeId
