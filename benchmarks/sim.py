@@ -5,7 +5,7 @@
 For each number of robots a fleet explores an office with the full pipeline at 10 Hz and 320 x 240: agents,
 journals, replication and map server, in lock-step, once in processes (as `mapweave sim run` does by default)
 and once in one process. Starting the processes is not counted. `share` tells where the time of the fleet in
-one process goes, measured on one thread. The renderer is timed beside PyBullet's bare `getCameraImage` of the
+one process goes. The renderer is timed beside PyBullet's bare `getCameraImage` of the
 same views, without any texture: the floor that a simulator on PyBullet pays at the least.
 """
 
@@ -33,7 +33,6 @@ from agent.replication import Replicator
 from agent.vision.sift import Sift
 from agent.vision.tracker import Tracker
 from benchmarks.bare_view import BareView
-from mapweave.trial import local_fleet
 from mapweave.trial.fleet import TICKS_PER_SECOND, Fleet, Stage
 from mapweave.trial.local_fleet import LocalFleet
 from mapweave.trial.process_fleet import ProcessFleet
@@ -109,13 +108,9 @@ def metered() -> Iterator[dict[str, float]]:
 
 
 def shares(robots: int, seed: int, seconds: float) -> dict[str, float]:
-    """Share of the wall time by part, on one thread; `rest` is what an agent does beside, and the loop."""
-    threads, local_fleet.THREADS = local_fleet.THREADS, 1
-    try:
-        with tempfile.TemporaryDirectory() as folder, metered() as spent:
-            wall = time_fleet(LocalFleet(stage_of(robots, seed, Path(folder))), seconds)
-    finally:
-        local_fleet.THREADS = threads
+    """Share of the wall time by part; `rest` is what an agent does beside, and the loop."""
+    with tempfile.TemporaryDirectory() as folder, metered() as spent:
+        wall = time_fleet(LocalFleet(stage_of(robots, seed, Path(folder))), seconds)
     found = {part: round(time_spent / wall, 4) for part, time_spent in spent.items()}
     return {**found, "rest": round(1.0 - sum(found.values()), 4)}
 

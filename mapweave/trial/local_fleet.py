@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -22,9 +21,6 @@ from wire.bus import Request
 from wire.keys import Keys
 from wire.log_messages import encode_record
 from wire.memory import Faults, MemoryBus, MemoryHub
-
-THREADS = 2
-"""OpenCV and numpy let go of the interpreter for long enough that two are quicker than one."""
 
 
 class LocalFleet:
@@ -46,7 +42,6 @@ class LocalFleet:
         self._thinking = 0.0
         self._asking = 0.0
         self._log: list[str] = []
-        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="robots")
 
     def start(self) -> None:
         """Build the world, start the server, then the agents."""
@@ -78,7 +73,8 @@ class LocalFleet:
             simulation.advance(self._commands)
             began = time.perf_counter()
             names = list(self._agents)
-            self._commands = dict(zip(names, self._pool.map(self._tick, names), strict=True))
+            # One after the other: on two threads they took as long, for the interpreter runs one at a time.
+            self._commands = dict(zip(names, map(self._tick, names), strict=True))
             asked = time.perf_counter()
             for agent in self._agents.values():
                 if agent.runner.curious:
@@ -158,7 +154,6 @@ class LocalFleet:
         self.kill_server()
         if self._simulation is not None:
             self._simulation.close()
-        self._pool.shutdown()
         self.bus.close()
         self._write_log(self._stage.out / "logs")
 
