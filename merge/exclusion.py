@@ -9,6 +9,8 @@ their bodies keeps two robots apart, this chance is how likely a true merge make
 share of how likely a false one makes it (but for the ground that a body takes). The odds of moments that are
 independent multiply, and a true merge drives their product beyond N with a chance of at most 1/N, however
 often it is looked at (Ville's inequality; Grünwald et al., "Safe testing", 2024).
+
+Bodies are also seen: what `merge.sight` makes of it is multiplied with this.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array
+from merge.draws import DRAWS, drawn
 from merge.posegraph import PoseGraph
+from merge.sight import Looking, SightSettings, errors_in_common, looking, none_wrong, odds_against
 from merge.trails import Trail, TrailSettings, stay
 
 
@@ -40,6 +44,7 @@ class ExclusionSettings:
         neighbourhood: robots that are further apart than as many least distances speak neither for nor
             against.
         trail: how well it is known where a robot is between two nodes.
+        sight: what robots should have seen of each other.
     """
 
     least_apart: float = 0.2
@@ -50,20 +55,22 @@ class ExclusionSettings:
     window: float = 2.0
     neighbourhood: float = 5.0
     trail: TrailSettings = field(default_factory=TrailSettings)
+    sight: SightSettings = field(default_factory=SightSettings)
 
 
 @dataclass(frozen=True)
 class Clash:
-    """Two robots that would have been at the same place at the same time.
+    """Two robots that would have been at the same place at the same time, or would have seen each other.
 
     Attributes:
-        first: agent.
+        first: agent; the one that would have seen the other.
         second: another one.
         clock: that says so.
-        moments: how many moments they would have been too near.
+        moments: how many moments they would have been too near, or seen each other.
         nearest: how near they would have been, m.
         time: when that was, s.
         evidence: natural logarithm of the odds against the merge.
+        where: the first would have seen the second, in words; empty if they would have been in one place.
     """
 
     first: str
@@ -73,10 +80,17 @@ class Clash:
     nearest: float
     time: float
     evidence: float
+    where: str = ""
 
     @property
     def reason(self) -> str:
         """In words."""
+        if self.where:
+            return (
+                f"{self.first} would have seen {self.second} {self.nearest:.1f} m {self.where} "
+                f"at {self.time:.1f} s of clock {self.clock}; its sensors saw nothing there, "
+                f"{self.moments} such moments"
+            )
         return (
             f"{self.first} and {self.second} would have been at the same place at the same time: "
             f"{self.nearest:.2f} m apart at {self.time:.1f} s of clock {self.clock}, "
@@ -114,22 +128,30 @@ def clash_of(
     apart = two.places - one.places
     distances = np.hypot(apart[:, 0], apart[:, 1])
     close = np.flatnonzero(known & (distances < least_apart))
-    if len(close) == 0:
+    seen = looking(graph, first, second, two, times) + looking(graph, second, first, one, times)
+    if len(close) == 0 and len(seen) == 0:
         return None
     spreads = (one.spreads + two.spreads)[close]
-    meeting = _Meeting(times, known, distances, close, least_apart)
+    meeting = _Meeting(times, known, distances, close, seen, least_apart)
     # Covariances cost more than all the rest: they are asked for only if the postures as they are clash.
     clear = chances_clear(apart[close], np.zeros(len(close)), spreads, least_apart)
-    if not meeting.refuses(clear, s):
+    odds = odds_against(seen, none_wrong(seen), least_apart, s.sight)
+    if not meeting.refuses(clear, odds, s):
         return None
     shift = s.sigmas * _posture_sigmas(graph, first, second, one.nearest[close], two.nearest[close])
     clear = chances_clear(apart[close], shift, spreads, least_apart)
-    if not meeting.refuses(clear, s):
+    if len(seen):
+        odds = odds_against(seen, errors_in_common(graph, seen, s.sight.sigmas), least_apart, s.sight)
+    if not meeting.refuses(clear, odds, s):
         return None
+    by_bodies, by_sight = meeting.by_bodies(clear, s).sum(), meeting.by_sight(odds, s).sum(axis=1)
+    evidence = float(by_bodies + by_sight.min())
+    if by_sight.min() > by_bodies:
+        return _unseen(graph, (first, second), meeting, odds[np.argmin(by_sight)], evidence)
     worst = close[np.argmin(distances[close])]
     return Clash(
         first.agent, second.agent, first.clock, len(close), float(distances[worst]), float(times[worst]),
-        float(meeting.evidence(clear, s).sum()),
+        evidence,
     )  # fmt: skip
 
 
@@ -142,6 +164,7 @@ class _Meeting:
         known: (T,) whether both are known to be somewhere.
         distances: (T,) m, between them.
         close: (K,) indices of moments when they are too near.
+        seen: M looks at where the other one would have been.
         least_apart: what is too near, m.
     """
 
@@ -149,9 +172,18 @@ class _Meeting:
     known: NDArray[np.bool_]
     distances: Array
     close: NDArray[np.int64]
+    seen: Looking
     least_apart: float
 
-    def evidence(self, clear: Array, s: ExclusionSettings) -> Array:
+    def _windows(self, s: ExclusionSettings) -> NDArray[np.int64]:
+        """(T,) number of the window of time in which a moment is; -1 where it is not known of both."""
+        windows = np.floor(self.times / s.window).astype(np.int64)
+        _, seats = np.unique(windows[self.known], return_inverse=True)
+        out = np.full(len(windows), -1, np.int64)
+        out[self.known] = seats
+        return out
+
+    def by_bodies(self, clear: Array, s: ExclusionSettings) -> Array:
         """(W,) logarithms of the odds against the merge that each window of time gives.
 
         Args:
@@ -162,17 +194,49 @@ class _Meeting:
         free = 1.0 - s.neighbourhood**-2
         odds = np.where(self.distances < s.neighbourhood * self.least_apart, free, 1.0)
         odds[self.close] = free / clear
-        windows = np.floor(self.times[self.known] / s.window).astype(np.int64)
-        _, seat, counts = np.unique(windows, return_inverse=True, return_counts=True)
+        seats = self._windows(s)[self.known]
         # Moments of one window hang together: the mean of their odds is fair all the same, a product is not.
-        out: Array = np.log(np.bincount(seat, odds[self.known]) / counts)
+        out: Array = np.log(np.bincount(seats, odds[self.known]) / np.bincount(seats))
         return out
 
-    def refuses(self, clear: Array, s: ExclusionSettings) -> bool:
-        """Whether that is enough to refuse a merge."""
-        evidence = self.evidence(clear, s)
-        witnesses = int((evidence > math.log(2.0)).sum())
-        return witnesses >= s.least_witnesses and float(evidence.sum()) >= -math.log(s.doubt)
+    def by_sight(self, odds: Array, s: ExclusionSettings) -> Array:
+        """(S, W) the same of what they should have seen.
+
+        Args:
+            odds: (S, M) against the merge, of each look.
+            s: how long a window is.
+        """
+        seats = self._windows(s)
+        looks, count = seats[self.seen.moments], int(seats.max()) + 1
+        counts = np.bincount(looks, minlength=count)
+        sums = np.array([np.bincount(looks, row, minlength=count) for row in odds])
+        out: Array = np.log(np.where(counts > 0, sums / np.maximum(counts, 1), 1.0))
+        return out
+
+    def refuses(self, clear: Array, odds: Array, s: ExclusionSettings) -> bool:
+        """Whether that is enough to refuse a merge, in all S ways in which postures may be wrong."""
+        evidence = self.by_bodies(clear, s) + self.by_sight(odds, s)
+        witnesses = (evidence > math.log(2.0)).sum(axis=1)
+        enough = (witnesses >= s.least_witnesses) & (evidence.sum(axis=1) >= -math.log(s.doubt))
+        return bool(enough.all())
+
+
+def _unseen(
+    graph: PoseGraph, trails: tuple[Trail, Trail], meeting: _Meeting, odds: Array, evidence: float
+) -> Clash:
+    """Two robots that should have seen each other; (M,) odds of their looks."""
+    seen = meeting.seen
+    against = np.flatnonzero(odds > 2.0)
+    ways = np.hypot(seen.offsets[:, 0], seen.offsets[:, 1])
+    worst = against[np.argmin(ways[against])]
+    agents = [graph.nodes[row[worst]].agent for row in (seen.observers, seen.others)]
+    x, y = seen.offsets[worst]
+    bearing = math.remainder(math.atan2(y, x) - graph.means[seen.observers[worst], 2], math.tau)
+    side = ("ahead", "to its left", "behind", "to its right")[round(bearing / (math.pi / 2)) % 4]
+    return Clash(
+        agents[0], agents[1], trails[0].clock, len(against), float(ways[worst]),
+        float(meeting.times[seen.moments[worst]]), evidence, side,
+    )  # fmt: skip
 
 
 def _posture_sigmas(
@@ -183,21 +247,6 @@ def _posture_sigmas(
     relative = graph.relative([first.nodes[k] for k in pairs[:, 0]], [second.nodes[k] for k in pairs[:, 1]])
     out: Array = np.sqrt(np.linalg.eigvalsh(relative.covariances[:, :2, :2])[:, -1])[seat.ravel()]
     return out
-
-
-def _evenly_spread() -> Array:
-    """(64, 2) equally likely points of a normal distribution in the plane: eight rings of eight."""
-    radii = np.sqrt(-2.0 * np.log(1.0 - (np.arange(8) + 0.5) / 8))
-    angles = 2 * math.pi * (np.arange(8)[None] + 0.5 * (np.arange(8)[:, None] % 2)) / 8
-    points = np.stack([radii[:, None] * np.cos(angles), radii[:, None] * np.sin(angles)], axis=-1)
-    flat = points.reshape(-1, 2)
-    out: Array = flat / flat.std(axis=0)
-    return out
-
-
-DRAWS = _evenly_spread()
-LEAST_SPREAD = 0.01
-"""Nobody's place is known better than this, m."""
 
 
 def chances_clear(apart: Array, shift: Array, spreads: Array, least_apart: float) -> Array:
@@ -211,8 +260,7 @@ def chances_clear(apart: Array, shift: Array, spreads: Array, least_apart: float
     """
     distances = np.hypot(apart[:, 0], apart[:, 1])[:, None]
     outwards = np.where(distances > 1e-9, apart / np.maximum(distances, 1e-9), [1.0, 0.0])
-    roots = np.linalg.cholesky(spreads + LEAST_SPREAD**2 * np.eye(2))
-    places = (apart + shift[:, None] * outwards)[:, None, :] + DRAWS @ roots.transpose(0, 2, 1)
+    places = (apart + shift[:, None] * outwards)[:, None, :] + drawn(spreads)
     clear = (np.hypot(places[..., 0], places[..., 1]) >= least_apart).sum(axis=1)
     # One more on both sides: what 64 draws do not show is not impossible.
     out: Array = (clear + 1.0) / (len(DRAWS) + 1.0)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Array
+from merge.looks import Looks
 
 NANOSECONDS = 1e9
 
@@ -45,12 +46,14 @@ class Trail:
         nodes: N, in the order of their stamps.
         times: (N,) s, ascending.
         radius: of the robot, m; 0 if not all nodes tell.
+        looks: what its proximity sensors saw at each node.
     """
 
     clock: str
     nodes: tuple[NodeId, ...]
     times: Array
-    radius: float = 0.0
+    radius: float
+    looks: Looks
 
     @property
     def agent(self) -> str:
@@ -69,7 +72,8 @@ def trails_of(nodes: Collection[Node]) -> tuple[Trail, ...]:
         known.sort(key=lambda node: (node.stamp_ns, node.id))
         times = np.array([node.stamp_ns for node in known]) / NANOSECONDS
         radius = min(node.radius for node in known)
-        trails.append(Trail(clock, tuple(node.id for node in known), times, radius))
+        looks = Looks.of([node.ranges for node in known])
+        trails.append(Trail(clock, tuple(node.id for node in known), times, radius, looks))
     return tuple(trails)
 
 
