@@ -10,8 +10,8 @@ import pytest
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan, Rectangle
-from sim.worlds.office import make_office
 from sim.world import Block, PanelSet, World
+from sim.worlds.office import make_office
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,9 @@ from hybridmap.pose import Array, Pose2
 from sim.bridge import SimBridge
 from sim.control import SimControl
 from sim.floorplan import FloorPlan, Rectangle
-from sim.worlds.office import make_office
 from sim.simulated import Simulated
 from sim.simulation import Simulation
+from sim.worlds.office import make_office
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
 

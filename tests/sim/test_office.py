@@ -9,9 +9,9 @@ import pytest
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.errors import InvalidValue
-from sim.worlds.office import DOOR, make_office
 from sim.simulation import Simulation
 from sim.world import World
+from sim.worlds.office import DOOR, make_office
 
 SEEDS = range(9)
 SCALE = 40
