@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test check bench slow clean
+.PHONY: setup demo test check bench slow scenarios clean
 
 setup: $(STAMP)
 
@@ -20,10 +20,14 @@ demo: setup
 	$(BIN)/mapweave demo
 
 test: setup
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow and not scenario"
 
 slow: setup
 	$(BIN)/python -m pytest -m slow
+
+# About a quarter of an hour on two cores: every scenario, in real processes.
+scenarios: setup
+	$(BIN)/python -m pytest -m scenario -rA --durations=0
 
 check: setup
 	$(BIN)/ruff check .

@@ -228,7 +228,7 @@ def _unseen(
     seen = meeting.seen
     against = np.flatnonzero(odds > 2.0)
     ways = np.hypot(seen.offsets[:, 0], seen.offsets[:, 1])
-    worst = against[np.argmin(ways[against])]
+    worst = against[np.lexsort([ways[against], -odds[against].round(1)])[0]]
     agents = [graph.nodes[row[worst]].agent for row in (seen.observers, seen.others)]
     x, y = seen.offsets[worst]
     bearing = math.remainder(math.atan2(y, x) - graph.means[seen.observers[worst], 2], math.tau)

@@ -48,7 +48,7 @@ class SightSettings:
         missed: share of looks, at most, in which the sensors miss a robot that stands in their way.
         scenery: how often something else ends a ray where the robot would have been.
         core: a ray surely meets a robot if it comes as near to its middle as this share of its radius: few
-            robots are round, and a square's inner circle is 0.7 of its outer one.
+            robots are round, but a square hides this much to four of five sides.
         margin: a ray went on if it is longer by more than this than where it would have met the robot, m;
         margin_share: and by this share of it.
         sigmas: the postures may be wrong by as many standard deviations.
@@ -56,7 +56,7 @@ class SightSettings:
 
     missed: float = 0.1
     scenery: float = 0.2
-    core: float = 0.7
+    core: float = 0.8
     margin: float = 0.1
     margin_share: float = 0.05
     sigmas: float = 2.0
@@ -224,8 +224,8 @@ def _odds(seen: Looking, places: Array, least_apart: float, s: SightSettings) ->
     possible = np.hypot(places[..., 0], places[..., 1]) >= least_apart
     on = (went_on & possible).sum(axis=1)
     there = (ended & ~went_on & possible).sum(axis=1)
-    # One more: what the draws do not show is not impossible.
-    unknown = possible.sum(axis=1) - on - there + 1.0
+    # A trace more: if no draw is possible, nothing is known.
+    unknown = possible.sum(axis=1) - on - there + 1e-9
     without = unknown + (1.0 - s.scenery) * on + there
     out: Array = without / (unknown + s.missed * on + (1.0 - s.missed) / s.scenery * there)
     return out

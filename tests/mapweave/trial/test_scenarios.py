@@ -10,7 +10,7 @@ from mapweave.trial.scenario import load_scenario, scenario_names, scenario_path
 SEED = 77
 
 
-@pytest.mark.slow
+@pytest.mark.scenario
 @pytest.mark.timeout(500)
 @pytest.mark.parametrize("name", [name for name in scenario_names() if name != "demo"])
 def test_scenario(name, tmp_path):
