@@ -43,8 +43,7 @@ class MemoryHub:
         """Make a hub that nobody is on, and that loses nothing."""
         self._lock = threading.RLock()
         self._buses: list[MemoryBus] = []
-        self._faults = Faults()
-        self._disturbed: MemoryBus | None = None
+        self._faults: dict[MemoryBus | None, Faults] = {}
         self._random = np.random.default_rng(0)
         self._held: list[tuple[int, MemoryBus, Sample]] = []
         self._clock = 0
@@ -52,15 +51,18 @@ class MemoryHub:
     def disturb(self, faults: Faults, random: np.random.Generator, bus: MemoryBus | None = None) -> None:
         """From now on treat messages badly, by the given source of chance: one bus's, or everybody's."""
         with self._lock:
-            self._faults = faults
-            self._disturbed = bus
+            self._faults[bus] = faults
             self._random = random
 
-    def calm(self) -> None:
-        """From now on treat messages well; those held back arrive now, oldest last."""
+    def calm(self, bus: MemoryBus | None = None) -> None:
+        """From now on treat one bus's messages, or everybody's, well; those held back arrive, oldest last."""
         with self._lock:
-            self._faults = Faults()
-            held, self._held = self._held, []
+            if bus is None:
+                self._faults.clear()
+            else:
+                self._faults.pop(bus, None)
+            held = [entry for entry in self._held if bus in (None, entry[1])]
+            self._held = [entry for entry in self._held if bus not in (None, entry[1])]
             for _, sender, sample in reversed(held):
                 self._deliver(sender, sample)
 
@@ -98,7 +100,7 @@ class MemoryHub:
             if sender._cut:
                 return
             self._clock += 1
-            faults = self._faults if self._disturbed in (None, sender) else Faults()
+            faults = self._faults.get(sender) or self._faults.get(None) or Faults()
             if self._random.random() >= faults.drop:
                 for _ in range(2 if self._random.random() < faults.double else 1):
                     if self._random.random() < faults.delay:

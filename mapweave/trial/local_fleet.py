@@ -23,6 +23,10 @@ from wire.log_messages import encode_record
 from wire.memory import Faults, MemoryBus, MemoryHub
 
 
+OVERTAKEN = 0.5
+"""Share of a bad network's messages that later ones overtake."""
+
+
 class LocalFleet:
     """Calls every agent itself, tick by tick. Its answers are those of a fleet of processes."""
 
@@ -132,15 +136,15 @@ class LocalFleet:
         self._hub.cut(self._buses[robot])
 
     def worsen(self, robot: str, loss: float, delay: float) -> None:
-        """Lose what the robot publishes, and hold some of it back; questions are not touched."""
-        faults = Faults(drop=loss, delay=min(1.0, delay))
-        random = np.random.default_rng([self._stage.seed, 0x105E])
+        """Lose some of what the robot publishes, and let later messages overtake some; no time passes here."""
+        faults = Faults(drop=loss, delay=OVERTAKEN if delay > 0.0 else 0.0)
+        random = np.random.default_rng([self._stage.seed, 0x105E, self._stage.robots.index(robot)])
         self._hub.disturb(faults, random, self._buses[robot])
 
     def restore(self, robot: str) -> None:
         """Put the bus back, and treat it well."""
         self._hub.restore(self._buses[robot])
-        self._hub.calm()
+        self._hub.calm(self._buses[robot])
 
     def end(self) -> None:
         """Close everything, the server last; what was said is written down."""

@@ -45,6 +45,23 @@ def test_without_faults_all_arrives_in_order() -> None:
     assert run(Faults()) == list(range(300))
 
 
+def test_one_bus_may_be_disturbed_alone() -> None:
+    hub = MemoryHub()
+    bad, good, receiver = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
+    got: list[bytes] = []
+    receiver.subscribe("n", lambda sample: got.append(sample.payload))
+    hub.disturb(Faults(drop=1.0), np.random.default_rng(1), bad)
+    for _ in range(20):
+        bad.publish("n", b"bad")
+        good.publish("n", b"good")
+    hub.calm(bad)
+    bad.publish("n", b"end")
+    eventually(lambda: b"end" in got)
+    assert got == [b"good"] * 20 + [b"end"]
+    for bus in (bad, good, receiver):
+        bus.close()
+
+
 def test_dropped_messages_are_gone_and_the_others_in_order() -> None:
     got = run(Faults(drop=0.3))
     assert got == sorted(set(got))
