@@ -22,7 +22,6 @@ from wire.keys import Keys
 from wire.log_messages import encode_record
 from wire.memory import Faults, MemoryBus, MemoryHub
 
-
 OVERTAKEN = 0.5
 """Share of a bad network's messages that later ones overtake."""
 
@@ -136,7 +135,7 @@ class LocalFleet:
         self._hub.cut(self._buses[robot])
 
     def worsen(self, robot: str, loss: float, delay: float) -> None:
-        """Lose some of what the robot publishes, and let later messages overtake some; no time passes here."""
+        """Lose some of what the robot publishes, and let later messages overtake some."""
         faults = Faults(drop=loss, delay=OVERTAKEN if delay > 0.0 else 0.0)
         random = np.random.default_rng([self._stage.seed, 0x105E, self._stage.robots.index(robot)])
         self._hub.disturb(faults, random, self._buses[robot])
