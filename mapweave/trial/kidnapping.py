@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import networkx as nx
 import numpy as np
 
 from hybridmap.errors import MapweaveError
@@ -24,6 +25,8 @@ BODY = 0.16
 """Half the width of a robot that stands in the way, m."""
 ROOM = 0.26
 """Half the width of what a robot drives through, m."""
+STEPS = 12
+"""Points on the line between two nodes at which it is looked for robots."""
 NEARBY = 0.25
 """A robot may stand or park this near to where it can drive, m."""
 LEAST_LANDMARKS = 30
@@ -102,8 +105,11 @@ def plan_kidnapping(
         place = _place(rng, plan, [truth[n] for n in rooms[room][host]], list(standing.values()))
         if place is None:
             continue
-        way = _way(plan, [pose for name, pose in standing.items() if name != robot], place)
-        reached = [goal for goal in goals if way(truth[goal])]
+        others = [pose for name, pose in standing.items() if name != robot]
+        way, mapped = _way(plan, others, place), _open_ways(merged, truth, others)
+        start = min(rooms[room][host], key=lambda node: (truth[node].distance(place), node))
+        known = nx.node_connected_component(mapped, start)
+        reached = [goal for goal in goals if goal in known and way(truth[goal])]
         if reached:
             return Kidnapping(robot, room, host, place, reached[int(rng.integers(len(reached)))])
     raise NothingToShow("no free place near the nodes of such a room, from which the others leave a way")
@@ -121,6 +127,22 @@ def _way(plan: FloorPlan, others: Sequence[Pose2], start: Pose2) -> Callable[[Po
 
     here = region(start)
     return lambda goal: here is not None and region(goal) == here
+
+
+def _open_ways(merged: HybridMap, truth: Mapping[NodeId, Pose2], others: Sequence[Pose2]) -> nx.Graph:
+    """The nodes, and those edges that pass no robot that stands still too closely."""
+    graph: nx.Graph = nx.Graph()
+    graph.add_nodes_from(truth)
+    bodies = np.array([[other.x, other.y] for other in others]).reshape(-1, 2)
+    for edge in merged.edges.values():
+        if edge.a not in truth or edge.b not in truth:
+            continue
+        start, end = (np.array([truth[node].x, truth[node].y]) for node in (edge.a, edge.b))
+        way = np.linspace(start, end, STEPS)
+        gaps = np.linalg.norm(way[:, None] - bodies[None], axis=2)
+        if gaps.min(initial=np.inf) > BODY + ROOM:
+            graph.add_edge(edge.a, edge.b)
+    return graph
 
 
 def choose_goal(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 
 from hybridmap.camera import Camera
-from hybridmap.change import NodePut
+from hybridmap.change import EdgePut, EdgeRetired, NodePut
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Landmarks, Node, NodeId
+from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from mapweave.trial.kidnapping import CLEARANCE, LEAST_LANDMARKS, NEAR, NothingToShow, plan_kidnapping
 from sim.floorplan import FloorPlan, Rectangle
@@ -42,6 +43,8 @@ def a_map(where: dict[str, list[tuple[float, float]]], landmarks: int = LEAST_LA
     )  # fmt: skip
     here = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
     merged = HybridMap(NodePut(Node(n, 0, here, CAMERA, seen)) for n in truth)
+    for k, (a, b) in enumerate(combinations(truth, 2)):
+        merged.apply(EdgePut(Edge(NodeId("r0", 1, 1000 + k), a, b, here, EdgeKind.MAPPED)))
     return merged, dict.fromkeys(truth, 0), truth
 
 
@@ -152,3 +155,18 @@ def test_a_goal_that_the_others_cut_off_is_none():
     in_the_gap = {name: Pose2(4.0, 2.0) for name in ("r0", "r1")}
     with pytest.raises(NothingToShow, match="leave a way"):
         plan_kidnapping(merged, components, truth, hall, robots, in_the_gap, 3)
+
+
+def test_a_goal_whose_only_mapped_way_is_taken_is_none():
+    """There is room to drive around a robot that stands on the way, but nobody has mapped it."""
+    hall = FloorPlan((Rectangle.spanning(0, 0, 4, 6, "room 0"), Rectangle.spanning(4, 0, 8, 6, "room 1")), ())
+    merged, components, truth = a_map({"r0": [(1, 3)], "r1": [(5, 3), (7, 3)]})
+    aside = {"r0": Pose2(1, 1), "r1": Pose2(7, 1)}
+    assert plan_kidnapping(merged, components, truth, hall, ("r0",), aside, 3).goal.agent == "r0"
+    between = {"r0": Pose2(1, 1), "r1": Pose2(3, 3)}
+    with pytest.raises(NothingToShow, match="leave a way"):
+        plan_kidnapping(merged, components, truth, hall, ("r0",), between, 3)
+    for edge in list(merged.edges):
+        merged.apply(EdgeRetired(edge))
+    with pytest.raises(NothingToShow, match="leave a way"):
+        plan_kidnapping(merged, components, truth, hall, ("r0",), aside, 3)
