@@ -16,7 +16,7 @@ Bodies are also seen: what `merge.sight` makes of it is multiplied with this.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,21 +138,19 @@ def clash_of(
     odds = odds_against(seen, none_wrong(seen), least_apart, s.sight)
     if not meeting.refuses(clear, odds, s):
         return None
+    # Nor for all looks, where the first of them are ample.
+    ample = meeting.ample(clear, odds, s)
+    bodies, sight = meeting.evidence(clear, odds, s)
     shift = s.sigmas * _posture_sigmas(graph, first, second, one.nearest[close], two.nearest[close])
     clear = chances_clear(apart[close], shift, spreads, least_apart)
-    if len(seen):
-        odds = odds_against(seen, errors_in_common(graph, seen, s.sight.sigmas), least_apart, s.sight)
-    if not meeting.refuses(clear, odds, s):
-        return None
-    by_bodies, by_sight = meeting.by_bodies(clear, s).sum(), meeting.by_sight(odds, s).sum(axis=1)
-    evidence = float(by_bodies + by_sight.min())
-    if by_sight.min() > by_bodies:
-        return _unseen(graph, (first, second), meeting, odds[np.argmin(by_sight)], evidence)
-    worst = close[np.argmin(distances[close])]
-    return Clash(
-        first.agent, second.agent, first.clock, len(close), float(distances[worst]), float(times[worst]),
-        evidence,
-    )  # fmt: skip
+    for some in sorted({ample, len(times)}):
+        part = replace(meeting, seen=seen.take(seen.moments < some))
+        errors = errors_in_common(graph, part.seen, s.sight) if len(part.seen) else none_wrong(part.seen)
+        moved = odds_against(part.seen, errors, least_apart, s.sight)
+        if part.refuses(clear, moved, s):
+            evidence = sum(part.evidence(clear, moved, s))
+            return _clash(graph, (first, second), meeting, odds[0] if sight > bodies else None, evidence)
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,15 +214,38 @@ class _Meeting:
     def refuses(self, clear: Array, odds: Array, s: ExclusionSettings) -> bool:
         """Whether that is enough to refuse a merge, in all S ways in which postures may be wrong."""
         evidence = self.by_bodies(clear, s) + self.by_sight(odds, s)
-        witnesses = (evidence > math.log(2.0)).sum(axis=1)
-        enough = (witnesses >= s.least_witnesses) & (evidence.sum(axis=1) >= -math.log(s.doubt))
-        return bool(enough.all())
+        witnesses = np.cumsum(evidence > math.log(2.0), axis=1)
+        # What was enough at any time is enough: later meetings do not make it possible.
+        enough = (witnesses >= s.least_witnesses) & (np.cumsum(evidence, axis=1) >= -math.log(s.doubt))
+        return bool(enough.any(axis=1).all())
+
+    def evidence(self, clear: Array, odds: Array, s: ExclusionSettings) -> tuple[float, float]:
+        """By bodies and by sight, when it was most, in the way in which it is least."""
+        by_bodies = np.cumsum(self.by_bodies(clear, s))
+        by_sight = np.cumsum(self.by_sight(odds, s), axis=1)
+        sight = by_sight[np.argmin((by_bodies + by_sight).max(axis=1))]
+        most = int(np.argmax(by_bodies + sight))
+        return float(by_bodies[most]), float(sight[most])
+
+    def ample(self, clear: Array, odds: Array, s: ExclusionSettings) -> int:
+        """Number of moments after which there is twice as much evidence as is asked for; all, if never."""
+        evidence = np.cumsum(self.by_bodies(clear, s) + self.by_sight(odds, s)[0])
+        enough = np.flatnonzero(evidence >= -2.0 * math.log(s.doubt))
+        seats = self._windows(s)
+        return int(np.flatnonzero(seats == enough[0])[-1]) + 1 if len(enough) else len(seats)
 
 
-def _unseen(
-    graph: PoseGraph, trails: tuple[Trail, Trail], meeting: _Meeting, odds: Array, evidence: float
+def _clash(
+    graph: PoseGraph, trails: tuple[Trail, Trail], meeting: _Meeting, odds: Array | None, evidence: float
 ) -> Clash:
-    """Two robots that should have seen each other; (M,) odds of their looks."""
+    """In numbers: by sight if (M,) odds against the merge of the looks are given, else by bodies."""
+    first, second = trails
+    if odds is None:
+        worst = meeting.close[np.argmin(meeting.distances[meeting.close])]
+        return Clash(
+            first.agent, second.agent, first.clock, len(meeting.close), float(meeting.distances[worst]),
+            float(meeting.times[worst]), evidence,
+        )  # fmt: skip
     seen = meeting.seen
     against = np.flatnonzero(odds > 2.0)
     ways = np.hypot(seen.offsets[:, 0], seen.offsets[:, 1])
@@ -234,7 +255,7 @@ def _unseen(
     bearing = math.remainder(math.atan2(y, x) - graph.means[seen.observers[worst], 2], math.tau)
     side = ("ahead", "to its left", "behind", "to its right")[round(bearing / (math.pi / 2)) % 4]
     return Clash(
-        agents[0], agents[1], trails[0].clock, len(against), float(ways[worst]),
+        agents[0], agents[1], first.clock, len(against), float(ways[worst]),
         float(meeting.times[seen.moments[worst]]), evidence, side,
     )  # fmt: skip
 

@@ -52,6 +52,7 @@ class SightSettings:
         margin: a ray went on if it is longer by more than this than where it would have met the robot, m;
         margin_share: and by this share of it.
         sigmas: the postures may be wrong by as many standard deviations.
+        floor_xy: error of how the two maps lie to each other that no covariance tells of, m.
     """
 
     missed: float = 0.1
@@ -60,6 +61,7 @@ class SightSettings:
     margin: float = 0.1
     margin_share: float = 0.05
     sigmas: float = 2.0
+    floor_xy: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +99,14 @@ class Looking:
         pairs = {name: (getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__}
         pairs["looks"] = self.looks, other.looks + len(self)
         return Looking(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+
+    def take(self, mask: NDArray[np.bool_]) -> Looking:
+        """Some of these looks."""
+        rays = ("looks", "directions", "lengths")
+        of_rays = mask[self.looks]
+        kept = {n: getattr(self, n)[of_rays if n in rays else mask] for n in self.__dataclass_fields__}
+        kept["looks"] = (np.cumsum(mask) - 1)[kept["looks"]]
+        return Looking(**kept)
 
 
 def looking(graph: PoseGraph, observer: Trail, other: Trail, stay: Stay, times: Array) -> Looking:
@@ -154,15 +164,16 @@ def none_wrong(seen: Looking) -> Errors:
     return Errors(np.zeros((1, len(seen), 2)), np.zeros((len(seen), 2, 2)))
 
 
-def errors_in_common(graph: PoseGraph, seen: Looking, sigmas: float) -> Errors:
+def errors_in_common(graph: PoseGraph, seen: Looking, settings: SightSettings | None = None) -> Errors:
     """The principal components of what may be wrong with all looks.
 
     Args:
         graph: of the nodes.
         seen: at least one look.
-        sigmas: the shifts are none, and half as many and as many standard deviations along each component
-            and between them.
+        settings: the shifts are none, and half of `sigmas` and `sigmas` standard deviations along each
+            component and between them.
     """
+    s = settings or SightSettings()
     rows = np.unique(np.concatenate([seen.observers, seen.others]))
     joint = graph.covariance([graph.nodes[k] for k in rows]).reshape(3 * len(rows), -1)
     headings = graph.means[:, 2]
@@ -174,7 +185,10 @@ def errors_in_common(graph: PoseGraph, seen: Looking, sigmas: float) -> Errors:
     by_node[looks, :, seats, 2] = seen.offsets[:, ::-1] * [1.0, -1.0]
     by_node[looks, :, np.searchsorted(rows, seen.others), :2] = _rotations(headings[seen.others])
     design = by_node.reshape(2 * len(seen), -1)
-    covariance = design @ joint @ design.T
+    # What is between the maps the one sees from the one side, the other from the other.
+    agents = np.array([graph.nodes[row].agent for row in seen.others])
+    apart = np.kron(np.where(agents == agents[0], 1.0, -1.0)[:, None], np.eye(2))
+    covariance = design @ joint @ design.T + s.floor_xy**2 * apart @ apart.T
     count = min(MODES, len(covariance))
     values, vectors = scipy.linalg.eigh(
         covariance, subset_by_index=[len(covariance) - count, len(covariance) - 1]
@@ -182,10 +196,10 @@ def errors_in_common(graph: PoseGraph, seen: Looking, sigmas: float) -> Errors:
     modes = vectors * np.sqrt(np.maximum(values, 0.0))
     ways = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=count) if any(way)])
     ways /= np.linalg.norm(ways, axis=1)[:, None]
-    ways = np.concatenate([np.zeros((1, count)), 0.5 * sigmas * ways, sigmas * ways])
-    apart = modes.reshape(len(seen), 2, count)
+    ways = np.concatenate([np.zeros((1, count)), 0.5 * s.sigmas * ways, s.sigmas * ways])
+    by_look = modes.reshape(len(seen), 2, count)
     own = covariance.reshape(len(seen), 2, len(seen), 2)[looks, :, looks, :]
-    rest = own - apart @ apart.transpose(0, 2, 1)
+    rest = own - by_look @ by_look.transpose(0, 2, 1)
     return Errors((ways @ modes.T).reshape(len(ways), len(seen), 2), rest)
 
 
@@ -239,7 +253,7 @@ def _outcomes(seen: Looking, places: Array, s: SightSettings) -> tuple[NDArray[n
     across = np.abs(u[:, 0] * middle[:, 1] - u[:, 1] * middle[:, 0])
     along = (u * middle).sum(axis=1)
     reach = (s.core * seen.radii + wander)[seen.looks]
-    may_meet = np.flatnonzero((across < reach) & (along > -reach))
+    may_meet = np.flatnonzero((across < reach) & (along > -reach) & (seen.lengths > along - 2.0 * reach))
     looks, u, lengths = seen.looks[may_meet], u[may_meet], seen.lengths[may_meet, None]
     x, y = places[looks, :, 0], places[looks, :, 1]
     along = u[:, :1] * x + u[:, 1:] * y
