@@ -96,6 +96,7 @@ def encode_report(report: AgentReport) -> bytes:
             "unsent": report.unsent,
             "traffic": report.traffic,
             "linked": report.linked,
+            "astray": status.astray,
             "doing": _one_line(status.doing),
             "detail": _one_line(status.detail),
             "nodes": status.nodes,
@@ -138,6 +139,7 @@ def decode_report(payload: bytes) -> AgentReport:
             fix_node=NodeId.parse(_typed(values, "fix_node", str)) if values["fix_node"] else None,
             node_from_robot=_posture(values, "fix_x", "fix_y", "fix_heading"),
             legs=_typed(values, "legs", int),
+            astray=_typed(values, "astray", bool),
         )
         return AgentReport(
             status=status,

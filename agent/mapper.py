@@ -139,7 +139,7 @@ class Mapper:
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
         self._tracking.step(observation)
-        if self._tracking.carried_off:
+        if self._tracking.carried_off or self._tracking.disputed:
             self.lose()
             self._tracking.step(observation)
 

@@ -62,6 +62,7 @@ class Status:
         node_from_robot: posture in that node's frame.
         legs: nodes on the first route of the drive, beginning and goal included.
         lost: whether it has given up to find itself on its own map: a fresh map must be begun.
+        astray: whether it looks for a place of its own map; `map_from_robot` then means nothing.
     """
 
     doing: str
@@ -75,6 +76,7 @@ class Status:
     node_from_robot: Pose2 = IDENTITY
     legs: int = 0
     lost: bool = False
+    astray: bool = False
 
 
 @dataclass(frozen=True)
@@ -280,4 +282,5 @@ class Pipeline:
             node_from_robot=IDENTITY if fix is None else fix.node_from_robot.mean,
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
+            astray=self._resumption is not None,
         )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.continuity import Continuity, ContinuitySettings, Sight, relit, turned
+from agent.dispute import Dispute, DisputeSettings
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.observation import Observation, RobotDescription
@@ -36,6 +37,7 @@ class TrackingSettings:
         prior_near: ... but no less than this, 1/m: a landmark may always be as near as 1 / (2 prior_near). A
             robot before a bare wall would else take its nearness for a slip of the wheels.
         continuity: whether an image continues the one before.
+        dispute: when wheels and images contradict each other.
         patience: images that show other things than they should, one after the other, before the robot
             takes itself for carried off. A person who walks by is gone by then.
         blank_patience: likewise images that show nothing: somebody has switched off the light.
@@ -53,6 +55,7 @@ class TrackingSettings:
     prior_spread: float = 0.6
     prior_near: float = 1.5
     continuity: ContinuitySettings = field(default_factory=ContinuitySettings)
+    dispute: DisputeSettings = field(default_factory=DisputeSettings)
     patience: int = 30
     blank_patience: int = 100
     dropped: int = 3
@@ -85,6 +88,7 @@ class Tracking:
         )
         self._continuity = Continuity(lens, description.camera, settings.tracker, settings.continuity)
         self.strange = self.blank = self.missing = 0
+        self._dispute = Dispute(settings.dispute)
         self._believed: NDArray[np.uint8] | None = None
         self._since_believed = Pose2()
         self._strikes: dict[int, int] = {}
@@ -111,6 +115,11 @@ class Tracking:
         return bool(self.strange or self.blank) or self.missing > self._settings.dropped
 
     @property
+    def disputed(self) -> bool:
+        """Whether wheels and images tell stories since the anchor that cannot both be true."""
+        return self._dispute.with_filter(self._filter.pose.mean)
+
+    @property
     def carried_off(self) -> bool:
         """Whether images have shown something else for so long that the robot must be elsewhere."""
         return self.strange >= self._settings.patience or self.blank >= self._settings.blank_patience
@@ -128,6 +137,7 @@ class Tracking:
     def step(self, observation: Observation) -> None:
         """Predict by the wheels, follow the tracks, correct by what they show."""
         self._filter.predict(observation.odometry)
+        self._dispute.step(observation.odometry)
         self._since_believed = self._since_believed @ observation.odometry.motion()
         if observation.image is None or self._frozen(observation.image):
             self.missing += self._believed is not None
@@ -174,6 +184,7 @@ class Tracking:
     def reanchor(self) -> PoseGaussian:
         """Begin anew from here; returns `old_anchor_from_new`."""
         moved = self._filter.reanchor()
+        self._dispute.settle()
         self.history.reanchor(moved.mean, self._tracker.ids)
         return moved
 

@@ -76,7 +76,7 @@ class RobotRecord:
     Attributes:
         truth: `world_from_robot` at every tick.
         estimates: while mapping, `map_from_robot` of each of its maps (an agent that had to begin anew has
-            several).
+            several), but for the time in which it said that it did not know where it was.
         collisions: how often it ran into something.
         map_bytes: of changes as they went over the wire.
         wire_bytes: of everything that the agent sent or received over the fleet's network.

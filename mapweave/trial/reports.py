@@ -121,7 +121,8 @@ class Reports:
             if report.traffic < lives[-1]:
                 lives.append(0)
             lives[-1] = report.traffic
-            if status.mission in ("explore", "carried") and status.nodes:
+            # A robot that says that it does not know where it is claims no posture.
+            if status.mission in ("explore", "carried") and status.nodes and not status.astray:
                 pose = status.map_from_robot
                 by_stamp = self._postures.setdefault(MapId(robot, report.epoch), {})
                 by_stamp[report.stamp_ns] = (pose.x, pose.y, pose.heading)
