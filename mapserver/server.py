@@ -44,7 +44,7 @@ class ServerSettings:
         status_every: seconds between two status messages.
         merge_share: at most this share of the time is spent making the merged map anew.
         lockstep: answer only when everything that came is merged, so that an answer does not depend on the
-            machine's speed (simulation only; a robot's question must not wait).
+            machine's speed, and merge only when asked (simulation only; a robot's question must not wait).
     """
 
     status_every: float = 0.5
@@ -140,7 +140,8 @@ class MapServer:
         while True:
             pause = max(rest_until - time.monotonic(), 0.0)
             try:
-                change = self._changes.get(timeout=pause + 0.02 if self._dirty else None)
+                by_itself = self._dirty and not self._settings.lockstep
+                change = self._changes.get(timeout=pause + 0.02 if by_itself else None)
             except queue.Empty:
                 began = time.monotonic()
                 self._merge()

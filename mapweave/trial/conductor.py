@@ -20,7 +20,7 @@ from mapweave.trial.scenario import CONDITIONS, LONGEST, ScenarioEvent, When
 from sim import events
 from wire.mapfile import MapFile
 
-LOOK_EVERY = {"joined": 5.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "grown": 1.0}
+LOOK_EVERY = {"joined": 10.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "grown": 1.0}
 """How often it is looked whether something has come true, simulated s."""
 STRIDE = 5.0
 """Time is let go on by at most this without showing progress, s."""
