@@ -116,39 +116,58 @@ def test_a_true_merge_has_odds_of_at_most_one_on_average(
     assert found.min() < 0.3 and (missed == 0.0 or found.max() > 3.0)
 
 
-def chain(rng: np.random.Generator, n: int = 8) -> PoseGraph:
+def chain(share: float = 1.0, n: int = 8) -> PoseGraph:
     """Two walks, joined by one link at their beginnings: whatever is wrong there is wrong with all."""
     a, b = ([NodeId(agent, 1, k) for k in range(n)] for agent in "ab")
-    step = PoseGaussian(Pose2(0.5, 0.0, 0.3), np.diag([0.005, 0.005, 0.005]) ** 2)
-    across = PoseGaussian(Pose2(0.3, 1.0, 2.0), np.diag([0.05, 0.03, 0.04]) ** 2)
+    step = PoseGaussian(Pose2(0.5, 0.0, 0.3), share * np.diag([0.005, 0.005, 0.005]) ** 2)
+    across = PoseGaussian(Pose2(0.3, 1.0, 2.0), share * np.diag([0.05, 0.03, 0.04]) ** 2)
     way = [Measurement(x[k], x[k + 1], step) for x in (a, b) for k in range(n - 1)]
     return solve_graph(a[0], Pose2(), [*way, Measurement(a[0], b[0], across)])
 
 
 def test_errors_in_common_against_many_draws() -> None:
+    """Both look at each other; what each would see is computed from postures that are drawn."""
     rng = np.random.default_rng(2)
-    graph = chain(rng)
-    observers, others = np.arange(8), np.arange(8, 16)
+    graph = chain()
+    observers, others = np.arange(16), (np.arange(16) + 8) % 16
     offsets = graph.means[others, :2] - graph.means[observers, :2]
-    seen = replace(looks(offsets, np.full((8, 4), 3.0)), observers=observers, others=others)
-    errors = errors_in_common(graph, seen, SightSettings(floor_xy=0.0))
+    seen = replace(looks(offsets, np.full((16, 4), 3.0)), observers=observers, others=others)
+    s = SightSettings(floor_xy=0.0)
+    errors = errors_in_common(graph, seen, s)
     joint = graph.covariance(graph.nodes).reshape(48, 48)
-    moved = np.zeros((4000, 8, 2))
+    moved = np.zeros((4000, 16, 2))
     for draw, delta in enumerate(rng.multivariate_normal(np.zeros(48), joint, 4000).reshape(-1, 16, 3)):
         poses = [Pose2.from_vector(m) @ Pose2.from_vector(d) for m, d in zip(graph.means, delta, strict=True)]
-        for k in range(8):
-            there = (poses[k].inverse() @ poses[8 + k]).vector[:2]
+        for k in range(16):
+            there = (poses[k].inverse() @ poses[others[k]]).vector[:2]
             moved[draw, k] = Pose2(0, 0, graph.means[k, 2]).rotation @ there
     moved -= moved.mean(axis=0)
-    # Straight along a component, by two standard deviations: its first and its last step of three.
-    for k in range(8):
-        covariance = moved[:, k].T @ moved[:, k] / len(moved)
+    # The 26 ways at full length are even: their mean square is a third of that of each component.
+    assert np.array_equal(errors.shifts[0], np.zeros((16, 2))) and len(errors.shifts) == 53
+    full = errors.shifts[27:] / s.sigmas
+    for k in range(16):
+        drawn_covariance = moved[:, k].T @ moved[:, k] / len(moved)
+        covariance = errors.rest[k] + full[:, k].T @ full[:, k] * 3 / 26
+        assert np.allclose(covariance, drawn_covariance, atol=0.1 * np.trace(drawn_covariance))
         assert np.linalg.eigvalsh(errors.rest[k]).min() > -1e-9
         assert np.trace(errors.rest[k]) < 0.2 * np.trace(covariance)
-        furthest = np.abs(errors.shifts[:, k]).max(axis=0)
-        assert (furthest > 1.5 * np.sqrt(np.diag(covariance))).all()
-        assert (furthest < 2.2 * np.sqrt(np.diag(covariance))).all()
-    assert np.array_equal(errors.shifts[0], np.zeros((8, 2)))
+    # And they move all looks together as the draws do.
+    for k in range(1, 16):
+        assert np.allclose(
+            full[:, 0].T @ full[:, k] * 3 / 26, moved[:, 0].T @ moved[:, k] / len(moved), atol=4e-4
+        )
+
+
+def test_what_is_between_the_maps_is_seen_from_both_sides() -> None:
+    """The floor: if the other is further east for the one, the one is further west for the other."""
+    graph = chain(1e-6)
+    observers, others = np.array([0, 8]), np.array([8, 0])
+    offsets = graph.means[others, :2] - graph.means[observers, :2]
+    seen = replace(looks(offsets, np.full((2, 4), 3.0)), observers=observers, others=others)
+    errors = errors_in_common(graph, seen, SightSettings(floor_xy=0.1))
+    assert np.allclose(errors.shifts[:, 0], -errors.shifts[:, 1], atol=0.01)
+    furthest = np.hypot(*errors.shifts[:, 0].T).max()
+    assert 0.15 < furthest < 0.21
 
 
 def test_looking_at_a_thousand_nodes_takes_no_time() -> None:
