@@ -34,8 +34,8 @@ class TrackingSettings:
         associate_px: a feature this near to a track is the same point.
         strikes: a track that the filter refuses this often in a row is given up.
         prior_spread: sigma of a new landmark's inverse depth, as a share of the expected one ...
-        prior_near: ... but no less than this, 1/m: a landmark may always be as near as 1 / (2 prior_near). A
-            robot before a bare wall would else take its nearness for a slip of the wheels.
+        prior_near: ... but no less than this over the camera's height: a landmark may always be about as near
+            as the floor. A robot before a bare wall would else take its nearness for a slip of the wheels.
         continuity: whether an image continues the one before.
         dispute: when wheels and images contradict each other.
         patience: images that show other things than they should, one after the other, before the robot
@@ -53,7 +53,7 @@ class TrackingSettings:
     associate_px: float = 1.5
     strikes: int = 3
     prior_spread: float = 0.6
-    prior_near: float = 1.5
+    prior_near: float = 0.45
     continuity: ContinuitySettings = field(default_factory=ContinuitySettings)
     dispute: DisputeSettings = field(default_factory=DisputeSettings)
     patience: int = 30
@@ -177,7 +177,8 @@ class Tracking:
             pixels = view.features.pixels[new]
             chosen = even_choice(pixels, taken, room)
             inverse_depths = np.full(len(chosen), 1.0 / expected_depth)
-            sigmas = np.maximum(self._settings.prior_spread * inverse_depths, self._settings.prior_near)
+            nearest = self._settings.prior_near / max(self._camera.mount_height, 0.05)
+            sigmas = np.maximum(self._settings.prior_spread * inverse_depths, nearest)
             self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
         self.remember(force=True)
 
