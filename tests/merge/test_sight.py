@@ -199,4 +199,5 @@ def test_looking_at_a_thousand_nodes_takes_no_time() -> None:
         start = time.process_time()
         assert [clash_of(graph, one, two) for one, two in combinations(trails, 2)] == [None] * 6
         took.append(time.process_time() - start)
-    assert min(took) < 0.03
+    # 21 ms where this was written.
+    assert min(took) < 0.05
