@@ -10,8 +10,8 @@ from mapweave.trial.scenario import load_scenario, scenario_names, scenario_path
 SEED = 77
 
 KNOWN = {
-    "warehouse": "alike shelves look the same when turned by 180 degrees: in some seeds a dozen false links agree "
-    "with each other, and the robots were never where one should have seen the other"
+    "warehouse": "alike shelves look the same when turned by 180 degrees: in some seeds a dozen false links "
+    "agree with each other, and the robots were never where one should have seen the other",
 }
 """Scenarios that are known to fail in some seeds, and why."""
 
