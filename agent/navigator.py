@@ -15,7 +15,7 @@ from agent.follower import Follower, FollowerSettings, Progress
 from agent.localizer import Localizer
 from agent.mission import Answer, Question, WhereAmI, WhichWay
 from agent.observation import Command, Observation, RobotDescription
-from agent.recall import recall
+from agent.recall import exact_enough, recall
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
@@ -224,10 +224,7 @@ class Navigator:
 
     def _sure(self, posture: PoseGaussian) -> bool:
         """Whether a recognition is exact enough to drive by; else another look, elsewhere, costs little."""
-        sigma = np.sqrt(np.diag(posture.covariance))
-        position, heading = self._settings.sure
-        leniency = 1.0 + self._looked / math.tau
-        return bool(max(sigma[:2]) <= position * leniency and sigma[2] <= heading * leniency)
+        return exact_enough(posture, self._settings.sure, 1.0 + self._looked / math.tau)
 
     def _ask(self, question: Question) -> Generator[Command, None, Answer]:
         self._questions.append(question)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 
@@ -11,6 +12,8 @@ from agent.mission import Answer, Question
 from agent.observation import Observation
 from agent.pipeline import Pipeline, Step
 from agent.replication import Replicator
+
+log = logging.getLogger(__name__)
 
 REPORT_EVERY = 5
 """Ticks between two status reports."""
@@ -58,15 +61,25 @@ class Runner:
         if step.changes:
             self._replicator.submit(step.changes, observation.stamp_ns)
             if self._lockstep:
-                self._replicator.flush(LOCKSTEP_PATIENCE)
-                if self._fleet.server_in_reach():
-                    self._replicator.wait_acknowledged(LOCKSTEP_PATIENCE)
+                self._await_server()
         self._questions = step.questions
         now = self._ticks % REPORT_EVERY == 0 or bool(step.questions)
         self._fleet.report(step.status, observation.stamp_ns, publish=now)
         self._ticks += 1
         self._on_step(step)
         return step
+
+    def _await_server(self) -> None:
+        """Lock-step: the tick lasts until the own disk, and a server that is in reach, have the changes."""
+        there = self._replicator.flush(LOCKSTEP_PATIENCE)
+        if there and self._fleet.server_in_reach():
+            there = self._replicator.wait_acknowledged(LOCKSTEP_PATIENCE)
+            # A network that went away meanwhile is a scenario's doing, and no reason to complain.
+            there = there or not self._fleet.server_in_reach()
+        if not there:
+            log.warning(
+                "what was mapped was not saved within %g s: this run may not repeat itself", LOCKSTEP_PATIENCE
+            )
 
     @property
     def curious(self) -> bool:

@@ -9,22 +9,10 @@ from mapweave.trial.scenario import load_scenario, scenario_names, scenario_path
 
 SEED = 77
 
-KNOWN = {
-    "warehouse": "alike shelves look the same when turned by 180 degrees: in some seeds a dozen false links "
-    "agree with each other, and the robots were never where one should have seen the other",
-}
-"""Scenarios that are known to fail in some seeds, and why."""
-
-NAMES = [
-    pytest.param(name, marks=pytest.mark.xfail(reason=KNOWN[name], strict=False)) if name in KNOWN else name
-    for name in scenario_names()
-    if name != "demo"
-]
-
 
 @pytest.mark.scenario
 @pytest.mark.timeout(500)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [name for name in scenario_names() if name != "demo"])
 def test_scenario(name, tmp_path):
     options = TrialOptions(seed=SEED, out=tmp_path / "out", quiet=True)
     trial = run_trial(load_scenario(scenario_path(name)), options)
