@@ -6,15 +6,14 @@ Mapping: 50 s at 10 Hz back and forth, in four shapes of drive; 30 landmarks 1.5
 of 2 % that slip by 10 % in two steps of a hundred. The rival is the maximum a posteriori of the whole run by
 GTSAM on the same measurements, noise and priors. An error is the RMS distance to the truth, in the first
 robot frame, of all landmarks and of the robot itself at the end. The same runs are repeated with 30 % of the
-tracks spoiled; there the other 70 % are judged. Localization: ten random starts a run.
+tracks spoiled; there the other 70 % are judged. Localization: ten random starts a run. Times of a step are
+told beside FilterPy's (benchmarks.ekf_speed).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from benchmarks.ekf_batch import batch_optimum
 from benchmarks.ekf_faults import spoil
 from benchmarks.ekf_localization import Start, try_start
 from benchmarks.ekf_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
+from benchmarks.ekf_speed import measure, one_thread
 from hybridmap.pose import Array
 
 _STARTS = 10
@@ -111,21 +111,6 @@ def try_run(seed: int, trial: int) -> Trial:
     )
 
 
-def step_ms(seed: int, landmarks: int) -> float:
-    """Median time of one predict and update."""
-    run = draw_run(np.random.default_rng(seed), "arc", steps=200, landmarks=landmarks)
-    filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))
-    ids = np.arange(landmarks)
-    filter_.add(ids, run.pixels[0])
-    times = []
-    for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
-        before = time.perf_counter()
-        filter_.predict(odometry)
-        filter_.update(ids, pixels)
-        times.append(1e3 * (time.perf_counter() - before))
-    return float(np.median(times))
-
-
 def summary(trials: list[Trial]) -> dict[str, float | list[float]]:
     """The figures over all runs."""
     ratios = [t.ratio for t in trials]
@@ -155,25 +140,27 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
     console = Console(stderr=arguments.json)
-    # One core a process: small matrices gain nothing from threads, and times are told for one core.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-        times = {n: pool.submit(step_ms, arguments.seed, n).result() for n in (30, 100)}
-    with ProcessPoolExecutor(arguments.jobs, mp_context=spawn) as pool:
+    one_thread()
+    with console.status("timing ..."):
+        times = measure(arguments.seed)
+    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
         results: Iterator[Trial] = pool.map(try_run, [arguments.seed] * arguments.runs, range(arguments.runs))
         trials = list(track(results, "filtering", total=arguments.runs, console=console))
     figures = summary(trials)
-    figures |= {f"step_ms_n{n}": ms for n, ms in times.items()}
+    figures |= times
     table = Table("figure", "value", title=f"{arguments.runs} runs of 500 steps")
     for key, value in figures.items():
         parts = value if isinstance(value, list) else [value]
-        table.add_row(key, " to ".join(f"{part:.3f}" for part in parts))
+        table.add_row(key, " to ".join(f"{part:.3g}" if part < 1e-3 else f"{part:.3f}" for part in parts))
     console.print(table)
     if arguments.json:
-        rounded = {k: np.round(v, 4).tolist() for k, v in figures.items()}
-        print(json.dumps(rounded))
+        print(json.dumps({key: _rounded(value) for key, value in figures.items()}))
+
+
+def _rounded(value: float | list[float]) -> float | list[float]:
+    if isinstance(value, list):
+        return [float(f"{part:.5g}") for part in value]
+    return float(f"{value:.5g}")
 
 
 if __name__ == "__main__":
