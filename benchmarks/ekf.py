@@ -56,9 +56,9 @@ class Trial:
     starts: tuple[Start, ...]
 
 
-def follow(run: MappingRun) -> MappingFilter:
-    """Filter a run."""
-    settings = FilterSettings(pixel_sigma=run.pixel_sigma)
+def follow(run: MappingRun, settings: FilterSettings | None = None) -> MappingFilter:
+    """Filter a run, with the standard settings if not told otherwise."""
+    settings = settings or FilterSettings(pixel_sigma=run.pixel_sigma)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, settings)
     ids = np.arange(len(run.points))
     filter_.add(ids, run.pixels[0])
