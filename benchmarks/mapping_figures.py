@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Polygon
 
 from benchmarks.mapping_scene import MappingDrive
-from benchmarks.mapping_score import LastKnown, rows_of, track_errors, true_points
+from benchmarks.mapping_score import LastKnown, track_errors
 from hybridmap.pose import Array, wrap_angle
 
 ESTIMATE, TRUTH, WHEELS, GREEN, PERSON = "#1f77b4", "#222222", "#d95f02", "#2a9d4b", "#f3d9d6"
@@ -108,7 +108,7 @@ def _draw_landmarks(run: MappingDrive, path: Path) -> None:
     t, chosen = run.seconds, _choose(run, len(COLOURS))
     with _sheet(run, "landmarks in the moving camera, with 2 sigma; truth dashed", path, (13, 9)) as figure:
         axes = figure.subplots(3, 1, sharex=True)
-        limits = _true_depths(run, chosen)
+        farthest = run.truth(np.array(chosen, np.int64))[0][:, 0].max(initial=1.0)
         for colour, track in zip(COLOURS, chosen, strict=False):
             believed, true = _history(run, track)
             depth, sigma, aside = believed.T
@@ -126,7 +126,7 @@ def _draw_landmarks(run: MappingDrive, path: Path) -> None:
             axes[1].plot(t, true[:, 1], "--", color=TRUTH, linewidth=0.9)
         for at in axes:
             _shade(run, at)
-        axes[0].set_ylim(0.0, 1.5 * limits.max(initial=1.0))
+        axes[0].set_ylim(0.0, 1.5 * farthest)
         axes[2].set_ylim(-20, 20)
         for at, name in zip(axes, ("p3, depth, m", "p1, to the right, m", "depth error, %"), strict=True):
             at.set_ylabel(name)
@@ -138,7 +138,7 @@ def _draw_landmarks(run: MappingDrive, path: Path) -> None:
 def _draw_map(run: MappingDrive, path: Path) -> None:
     """The plan, in the anchor's frame: ways, and landmarks as they were known last, with their ellipses."""
     anchor_from_world, known = run.world_from_anchor.inverse(), LastKnown.of(run)
-    true = true_points(run, known.ids)
+    true, _ = run.truth(known.ids)
     with _sheet(run, "plan, in the anchor's frame", path, (11, 8)) as figure:
         at = figure.add_subplot()
         for solid in (*run.world.plan.walls, *run.world.plan.furniture):
@@ -151,10 +151,10 @@ def _draw_map(run: MappingDrive, path: Path) -> None:
         ):
             way = np.array([pose.vector for pose in who])
             at.plot(way[:, 0], way[:, 1], style, color=colour, linewidth=1.1, label=label)
-        for point, covariance, there in zip(known.points, known.covariances, true, strict=True):
+        for k, (point, covariance) in enumerate(zip(known.points, known.covariances, strict=True)):
             if np.isfinite(covariance).all():
-                at.add_patch(_ellipse(point, covariance))
-            at.plot(*np.stack([point, there])[:, :2].T, color="#999999", linewidth=0.8)
+                at.add_patch(_ellipse(point, covariance, 1.0 if known.converged[k] else 0.25))
+            at.plot(*np.stack([point, true[k]])[:, :2].T, color="#999999", linewidth=0.8)
         at.plot(true[:, 0], true[:, 1], "x", color=TRUTH, markersize=5, label="landmarks, true")
         for chosen, fill, label in (
             (known.converged, GREEN, "landmarks, estimated, 2 sigma"),
@@ -185,12 +185,9 @@ def _draw_view(run: MappingDrive, path: Path) -> None:
             for track, trail in _trails(run, number).items():
                 held = track in moment.landmarks.ids
                 at.plot(trail[:, 0], trail[:, 1], color="#ffd34d" if held else "#7fb3d5", linewidth=0.8)
-            ids, off = track_errors(run, moment)
-            pixels = moment.pixels[rows_of(moment.ids, ids)]
-            size = np.where(np.isin(ids, moment.landmarks.ids), 26, 9)
-            shade = at.scatter(
-                *pixels.T, c=np.linalg.norm(off, axis=1), s=size, cmap="plasma", vmin=0, vmax=2
-            )
+            off = np.linalg.norm(track_errors(run, moment), axis=1)
+            size = np.where(np.isin(moment.ids, moment.landmarks.ids), 26, 9)
+            shade = at.scatter(*moment.pixels.T, c=off, s=size, cmap="plasma", vmin=0, vmax=2)
             counts = f"{len(moment.ids)} tracks, {len(moment.landmarks.ids)} landmarks"
             at.set_title(f"{run.seconds[number]:.1f} s: {counts}", fontsize=9)
             at.set_xlim(0, image.shape[1] - 1)
@@ -227,23 +224,19 @@ def _true_steps(run: MappingDrive) -> Array:
 def _choose(run: MappingDrive, most: int) -> list[int]:
     """Landmarks on one surface that lived long, from near to far."""
     first = run.moments[0].landmarks.ids
-    first = first[run.flat[rows_of(run.ids, first)]]
+    points, flat = run.truth(first)
     lives = np.array([sum(i in m.landmarks.ids for m in run.moments) for i in first.tolist()])
-    longest = first[np.argsort(-lives, kind="stable")][: 2 * most]
-    by_depth = longest[np.argsort(true_points(run, longest)[:, 0])]
+    longest = np.argsort(-lives * flat, kind="stable")[: min(2 * most, int(flat.sum()))]
+    by_depth = longest[np.argsort(points[longest, 0])]
     picked = np.linspace(0, len(by_depth) - 1, min(most, len(by_depth))).round().astype(int)
-    return [int(i) for i in by_depth[picked]]
-
-
-def _true_depths(run: MappingDrive, chosen: list[int]) -> Array:
-    return true_points(run, np.array(chosen, np.int64))[:, 0] - run.robot.camera.mount_forward
+    return [int(i) for i in first[by_depth[picked]]]
 
 
 def _history(run: MappingDrive, track: int) -> tuple[Array, Array]:
     """A landmark in the camera over time: (T, 3) depth, its sigma, right, m, and (T, 2) the true two."""
     believed = np.full((len(run.moments), 3), np.nan)
     true = np.full((len(run.moments), 2), np.nan)
-    point = true_points(run, np.array([track]))[0]
+    point = run.truth(np.array([track]))[0][0]
     for k, moment in enumerate(run.moments):
         at = moment.true.inverse().apply(point)
         true[k] = at[0] - run.robot.camera.mount_forward, -at[1]
@@ -256,17 +249,22 @@ def _history(run: MappingDrive, track: int) -> tuple[Array, Array]:
 
 
 def _trails(run: MappingDrive, number: int) -> dict[int, Array]:
-    """The last pixels (K, 2) of each track alive at a moment."""
+    """The last pixels (K, 2) of each track alive at a moment; NaN where it was not."""
     alive = run.moments[number].ids
     recent = run.moments[max(0, number - TRAIL) : number + 1]
-    pixels = np.stack([m.pixels[rows_of(m.ids, alive)] for m in recent], axis=1)
+    pixels = np.full((len(alive), len(recent), 2), np.nan)
+    for k, moment in enumerate(recent):
+        _, rows, there = np.intersect1d(alive, moment.ids, return_indices=True)
+        pixels[rows, k] = moment.pixels[there]
     return dict(zip(alive.tolist(), pixels, strict=True))
 
 
-def _ellipse(point: Array, covariance: Array) -> Ellipse:
+def _ellipse(point: Array, covariance: Array, alpha: float) -> Ellipse:
     """Two standard deviations in the plane."""
     values, vectors = np.linalg.eigh(covariance)
     width, height = 4.0 * np.sqrt(np.maximum(values, 0.0))
     angle = math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
-    return Ellipse((float(point[0]), float(point[1])), width, height, angle=angle, facecolor="none",
-                   edgecolor=GREEN, linewidth=0.9)  # fmt: skip
+    at = float(point[0]), float(point[1])
+    return Ellipse(
+        at, width, height, angle=angle, facecolor="none", edgecolor=GREEN, linewidth=0.9, alpha=alpha
+    )

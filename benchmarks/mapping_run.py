@@ -13,10 +13,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from functools import partial
 from pathlib import Path
 
+# numpy reads it when it is imported. One thread for algebra and images, as in Mapweave's own processes.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import cv2
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -34,6 +39,7 @@ LEAST_STEPS = 30
 def main() -> None:
     """Run, draw and print."""
     arguments = _arguments()
+    cv2.setNumThreads(1)
     console = Console(stderr=arguments.json)
     try:
         results, abandoned = _run(arguments, console)

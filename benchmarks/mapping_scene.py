@@ -84,7 +84,7 @@ class MappingDrive:
         robot: as its agent knows it.
         world: where it happened.
         world_from_anchor: true.
-        ids: (N,) tracks that began at the anchor.
+        ids: (N,) tracks that began at the anchor, ascending.
         points: (N, 3) m, in the anchor's robot frame: where they truly are; NaN if nothing is there.
         flat: (N,) whether the patch of a track is on one surface, so that it is one point.
         filter_settings: of the filter that ran.
@@ -110,6 +110,17 @@ class MappingDrive:
     def seconds(self) -> Array:
         """(T,) s since the anchor."""
         return self.robot.tick * np.arange(len(self.moments), dtype=np.float64)
+
+    def truth(self, ids: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        """Points (N, 3) m in the anchor's robot frame and whether each is flat, of tracks (N,).
+
+        Of a track that did not begin at the anchor nothing is known: NaN, and not flat.
+        """
+        known = np.isin(ids, self.ids)
+        rows = np.searchsorted(self.ids, ids[known])
+        points, flat = np.full((len(ids), 3), np.nan), np.zeros(len(ids), np.bool_)
+        points[known], flat[known] = self.points[rows], self.flat[rows]
+        return points, flat
 
 
 def drive(

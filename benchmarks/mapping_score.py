@@ -47,17 +47,6 @@ def figures(run: MappingDrive) -> Figures:
     return {key: float(value) if math.isfinite(value) else None for key, value in measured.items()}
 
 
-def rows_of(known: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.intp]:
-    """(N,) where each id of ids (N,) is in known, which holds all of them."""
-    order = np.argsort(known)
-    return np.asarray(order[np.searchsorted(known, ids, sorter=order)], np.intp)
-
-
-def true_points(run: MappingDrive, ids: NDArray[np.int64]) -> Array:
-    """(N, 3) m, in the anchor's robot frame: where tracks truly are."""
-    return run.points[rows_of(run.ids, ids)]
-
-
 def landmark_nees(estimates: LandmarkEstimates, points_in_robot: Array, camera: Camera) -> Array:
     """(N,) squared Mahalanobis distance of each landmark from its true place, 3 degrees of freedom.
 
@@ -77,24 +66,19 @@ def landmark_nees(estimates: LandmarkEstimates, points_in_robot: Array, camera: 
     return out
 
 
-def track_errors(run: MappingDrive, moment: Moment) -> tuple[NDArray[np.int64], Array]:
-    """How far tracks are from where their points truly are in the image.
-
-    Returns:
-        (N,) tracks that are alive and began on one surface, and (N, 2) px.
-    """
-    rows = rows_of(run.ids, moment.ids)
-    chosen = run.flat[rows]
-    points = moment.true.inverse().apply(run.points[rows[chosen]])
-    return moment.ids[chosen], moment.pixels[chosen] - run.robot.camera.project(points)
+def track_errors(run: MappingDrive, moment: Moment) -> Array:
+    """(N, 2) px, tracks less where their points truly are; NaN for those that are no points."""
+    points, flat = run.truth(moment.ids)
+    off = moment.pixels - run.robot.camera.project(moment.true.inverse().apply(points))
+    off[~flat] = np.nan
+    return off
 
 
 def reprojection_errors(run: MappingDrive, moment: Moment) -> Array:
-    """(N, 2) px, tracks less where the filter then has their landmarks."""
-    held = moment.landmarks.ids
-    alive = np.isin(held, moment.ids)
-    expected = run.robot.camera.project(moment.landmarks.points_in_robot[alive])
-    return moment.pixels[rows_of(moment.ids, held[alive])] - expected
+    """(N, 2) px, tracks that are landmarks less where the filter then has these."""
+    known = moment.landmarks
+    _, tracks, held = np.intersect1d(moment.ids, known.ids, return_indices=True)
+    return moment.pixels[tracks] - run.robot.camera.project(known.points_in_robot[held])
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +115,9 @@ class LastKnown:
         converged = np.zeros(len(ids), np.bool_)
         seconds = np.full(len(ids), np.inf)
         for second, moment in zip(run.seconds.tolist(), run.moments, strict=True):
-            known = moment.landmarks
-            rows, true = rows_of(ids, known.ids), true_points(run, known.ids)
+            _, rows, held = np.intersect1d(ids, moment.landmarks.ids, return_indices=True)
+            known = LandmarkEstimates._make(column[held] for column in moment.landmarks)
+            true, _ = run.truth(known.ids)
             in_robot, turn = moment.true.inverse().apply(true), moment.pose.mean.rotation
             points[rows] = moment.pose.mean.apply(known.points_in_robot)
             covariances[rows] = turn @ known.covariances_in_robot[:, :2, :2] @ turn.T
@@ -160,7 +145,7 @@ def _pose_figures(who: str, poses: Sequence[Pose2], run: MappingDrive) -> dict[s
 
 def _landmark_figures(run: MappingDrive) -> dict[str, float]:
     known = LastKnown.of(run)
-    flat = run.flat[rows_of(run.ids, known.ids)]
+    _, flat = run.truth(known.ids)
     shares = _finite(known.depth_errors[known.converged])
     nees = _finite(known.nees)
     return {
@@ -186,7 +171,7 @@ def _track_figures(run: MappingDrive, away: Array) -> dict[str, float]:
     lengths = np.unique(alive, return_counts=True)[1]
     off = [np.linalg.norm(reprojection_errors(run, m), axis=1) for m in run.moments]
     reprojections = _finite(np.concatenate(off))
-    true = [track_errors(run, m)[1] for m in run.moments]
+    true = [track_errors(run, m) for m in run.moments]
     # Only after the first way out is the robot back at the anchor.
     out = int(np.argmax(away > FAR)) if (away > FAR).any() else len(away)
     near = [e for k, e in enumerate(true) if k > out and away[k] < NEAR]
