@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.ekf.kernels import inverse, leave_one_out
 from hybridmap.pose import Array
 
 Mask = NDArray[np.bool_]
@@ -32,20 +33,6 @@ def chi_squares(innovations: Array, covariance: Array) -> Array:
         covariance: (2N, 2N) S, joint, ordered as the innovations' rows.
     """
     return _quadratic(_blocks(covariance)[_diagonal(len(innovations))], innovations)
-
-
-def leave_one_out(innovations: Array, information: Array) -> Array:
-    """(N,) squared Mahalanobis distance of each innovation given all the others.
-
-    With Q the inverse of S, an innovation given all others has mean residual Q_ii^-1 (Q r)_i and covariance
-    Q_ii^-1, so that one inverse serves all N tests.
-
-    Args:
-        innovations: (N, 2) measured minus expected.
-        information: (2N, 2N) inverse of S.
-    """
-    pulled = (information @ innovations.ravel()).reshape(-1, 2)
-    return _quadratic(_blocks(information)[_diagonal(len(innovations))], pulled)
 
 
 def one_point_consensus(innovations: Array, covariance: Array, gate: float) -> Mask:
@@ -96,23 +83,18 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
         (N,) accepted; and the inverse of the accepted ones' joint covariance, (2K, 2K).
     """
     accepted: Mask = np.ones(len(innovations), np.bool_)
+    innovations = np.ascontiguousarray(innovations)
     information = inverse(covariance)
     if (leave_one_out(innovations, information) <= gate).all():
         return accepted, information
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:
         chosen = np.flatnonzero(np.repeat(accepted, 2))
-        information = inverse(covariance[np.ix_(chosen, chosen)])
+        information = inverse(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
         distances = leave_one_out(innovations[accepted], information)
         if not len(distances) or distances.max() <= gate:
             return accepted, information
         accepted[np.flatnonzero(accepted)[int(np.argmax(distances))]] = False
-
-
-def inverse(covariance: Array) -> Array:
-    """Inverse of a positive definite matrix, symmetric to the last bit."""
-    out = np.linalg.inv(covariance)
-    return np.asarray(0.5 * (out + out.T), np.float64)
 
 
 def _blocks(matrix: Array) -> Array:

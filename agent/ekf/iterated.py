@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.ekf.anchored import see
-from agent.ekf.gating import believe, inverse
+from agent.ekf.gating import believe
+from agent.ekf.kernels import inverse
 from agent.ekf.node_state import NEAREST_SCALE, NodeState
 from hybridmap.pose import Array
 

@@ -14,7 +14,7 @@ from agent.ekf.iterated import Measurement, iterated_update
 from agent.ekf.landmarks import Ids, NodeLandmarks
 from agent.ekf.motion import WheelNoise, move_posture
 from agent.ekf.node_state import NEAREST_SCALE, NodeState, turning
-from agent.ekf.report import UpdateReport
+from agent.ekf.report import Health, UpdateReport
 from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
@@ -156,9 +156,12 @@ class LocalizationFilter:
         innovations_px = np.full((len(ids), 2), np.nan)
         innovations_px[rows] = fit.innovations * self._focal
         kept = int(fit.accepted.sum())
-        needed = max(min(s.least_agreeing, len(self.ids)), s.least_agreeing_share * len(slots))
-        reason = "" if kept >= needed else f"{kept} of {len(slots)} landmarks agree"
-        return self._judge(UpdateReport(ids, accepted, innovations_px, fit.mean_nis, not reason, reason))
+        health, reason = Health.GOOD, ""
+        if kept < s.least_agreeing_share * len(slots):
+            health, reason = Health.DISAGREEMENT, f"{kept} of {len(slots)} landmarks agree"
+        elif kept < s.least_agreeing:
+            health, reason = Health.FEW, f"{kept} of {len(slots)} landmarks agree"
+        return self._judge(UpdateReport(ids, accepted, innovations_px, fit.mean_nis, health, reason))
 
     def add(self, ids: Ids, points_in_robot: Array, covariances_in_robot: Array) -> NDArray[np.bool_]:
         """Add landmarks that are new to the map, as they are known from where the robot stands now.

@@ -8,16 +8,17 @@ sigma of w (docs/decisions/ekf-parametrisation.md).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.gating import believe, inverse, pixel_gate
+from agent.ekf import kernels
+from agent.ekf.gating import believe, pixel_gate
 from agent.ekf.landmarks import Ids, LandmarkEstimates
 from agent.ekf.motion import WheelNoise
 from agent.ekf.moving_state import MovingState, Step
-from agent.ekf.report import UpdateReport
+from agent.ekf.report import Health, UpdateReport
+from agent.ekf.settings import FilterSettings
 from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
@@ -25,48 +26,8 @@ from hybridmap.pose import Array, PoseGaussian
 
 __all__ = ["FilterSettings", "LandmarkEstimates", "MappingFilter"]
 
-SAME_STEP = 1e-4
-"""m and rad; a step is not linearised again for less: its second-order part is then below 1e-5 px."""
-
-
-@dataclass(frozen=True, slots=True)
-class FilterSettings:
-    """How the mapping filter believes, gates and stops.
-
-    Attributes:
-        pixel_sigma: standard deviation of a tracked pixel, px.
-        wheel_floor: standard deviation of a wheel's way in a step without any, m.
-        posture_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
-        slip_sigmas: a step that the image puts further than this from the wheels is taken for a slip.
-        slip: sigma of (forward m, turn rad) of a step whose wheels the landmarks refute.
-        prior_depth: depth at which a landmark is expected when nothing is known, m.
-        prior_spread: sigma of the prior inverse depth, in units of 1 / prior_depth. 1.2 reaches from
-            0.3 prior_depth (two sigma) to infinity (one sigma).
-        relinearisations: how often at most a step is linearised again in the light of its image.
-        gate_probability: share of true measurements that each gate lets pass.
-        least_agreeing: fewer accepted landmarks than this are no healthy update.
-        least_agreeing_share: nor is a smaller share of those seen.
-        converged_sigma: depth sigma under which a landmark has converged, m.
-        converged_share: the same as a share of the depth; the larger of the two counts.
-        widest_slope: landmarks further aside than this |a| have left the view for good and are let go.
-        nearest: landmarks nearer than this to the optical centre are let go, m.
-    """
-
-    pixel_sigma: float = 0.7
-    wheel_floor: float = 1e-5
-    posture_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    slip_sigmas: float = 4.0
-    slip: tuple[float, float] = (0.1, 0.2)
-    prior_depth: float = 2.5
-    prior_spread: float = 1.2
-    relinearisations: int = 3
-    gate_probability: float = 0.999
-    least_agreeing: int = 3
-    least_agreeing_share: float = 0.4
-    converged_sigma: float = 0.05
-    converged_share: float = 0.05
-    widest_slope: float = 4.0
-    nearest: float = 0.05
+SAME_STEP = (1e-3, 4e-4)
+"""m and rad; a step is not linearised again for less: what is then left of second order is below 1e-4 px."""
 
 
 class MappingFilter:
@@ -96,24 +57,34 @@ class MappingFilter:
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._gate = pixel_gate(self.settings.gate_probability)
-        self._state = MovingState.at_anchor()
+        self._slope_variances = np.square(self.settings.pixel_sigma / self._focal)
+        self._posture_variances = np.square(np.array(self.settings.posture_noise, np.float64))
+        self._settled = MovingState.at_anchor()
         self._step: Step | None = None
+        self._steps_unseen = 0
+        self._distrust = 0
+        self._baseline = 0.0
+        self._base = np.zeros(2)
+        self._last = (Health.GOOD, "")
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are let go."""
-        taken = Step.predict(
-            self._state,
-            odometry,
-            self._wheels.root(odometry),
-            np.square(self.settings.posture_noise),
-            self._camera.mount_forward,
-        )
-        rays = taken.state.rays
-        near = rays[:, 2] * self.settings.nearest > 1.0
-        stays = (taken.scale > 1e-3) & ~near & (np.abs(rays[:, 0]) <= self.settings.widest_slope)
-        self.lost += int((~stays).sum())
-        self.ids = self.ids[stays]
-        self._take(taken.kept(stays))
+        root = self._wheels.root(odometry)
+        if self._distrust:
+            # Slip and lost encoders last for more than one step.
+            self._distrust -= 1
+            root = self._wheels.refuted_root(odometry, 1.0, self.settings.slip[0])
+        mount = self._camera.mount_forward
+        taken = Step.predict(self.state, odometry, root, self._posture_variances, mount)
+        stays = kernels.ahead(taken.rays, taken.scale, self.settings.nearest, self.settings.widest_slope)
+        if not stays.all():
+            self.lost += int((~stays).sum())
+            self.ids = self.ids[stays]
+            taken = taken.kept(stays)
+        self._step = taken
+        self._steps_unseen += 1
+        x, y = (taken.posture[:2] - self._base).tolist()
+        self._baseline = max(self._baseline, math.hypot(x, y))
 
     def add(
         self,
@@ -148,9 +119,9 @@ class MappingFilter:
         else:
             rays[:, 2] = inverse_depths
             variances[:, 2] = np.square(sigmas)
-        self._state = self._state.grown(rays, variances)
+        self._settle(self.state.grown(rays, variances))
+        self._base, self._baseline = self.state.posture[:2].copy(), 0.0
         self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)])
-        self._step = None
 
     def update(self, ids: Ids, pixels: Array) -> UpdateReport:
         """Correct by the pixels of one image.
@@ -159,52 +130,68 @@ class MappingFilter:
             ids: (N,) what is seen; ids that the filter does not hold are ignored.
             pixels: (N, 2) px, undistorted; rows with NaN are ignored.
         """
+        s = self.settings
+        self._steps_unseen = 0
         slots, rows = self._slots(ids, pixels)
         if not len(slots):
-            return UpdateReport.blind(ids, "no landmark of the filter is in view")
+            self._last = Health.BLIND, "no landmark of the filter is in view"
+            return UpdateReport.blind(ids, self._last[1])
         slopes = (pixels[rows] - self._centre) / self._focal
-        innovations = slopes - self._state.rays[slots, :2]
-        believed, information = believe(innovations, self._spread(slots), self._gate)
-        reason = self._doubt(int(believed.sum()), len(slots))
-        if reason and self._step is not None:
-            # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
-            step = self._step
-            self._take(step.again(wheel_root=np.diag(self.settings.slip)))
-            then_believed, then_information = believe(innovations, self._spread(slots), self._gate)
-            kept = int(then_believed.sum())
-            if self._doubt(kept, len(slots)):
-                self._take(step)
-            else:
-                believed, information = then_believed, then_information
-                reason = f"the wheels are refuted by {kept} of {len(slots)} landmarks"
-        if believed.sum() < self.settings.least_agreeing_share * len(slots):
-            # A few that agree among many that do not may as well be the wrong ones.
-            believed[:] = False
-        nis = self._correct(slots[believed], slopes[believed], information) if believed.any() else math.nan
-        self._step = None
+        by_wheels = self._step
+        if by_wheels is not None and s.relinearisations and len(slots) >= s.least_agreeing:
+            self._step = by_wheels.again(at=by_wheels.seems(slots, slopes, s.slip_sigmas))
+        innovations = slopes - self._rays[slots, :2]
+        believed, information, health, reason = self._believe(slots, innovations)
+        nis = math.nan
+        if believed.any():
+            nis, slip = self._correct(slots[believed], slopes[believed], information)
+            if slip and health is Health.GOOD:
+                health, reason = Health.SLIP, slip
+        else:
+            # What is not believed must not choose where the step is linearised either.
+            self._step = by_wheels
+            self._settle(self.state)
         accepted = np.zeros(len(ids), np.bool_)
         accepted[rows[believed]] = True
         innovations_px = np.full((len(ids), 2), np.nan)
         innovations_px[rows] = innovations * self._focal
-        return UpdateReport(ids, accepted, innovations_px, nis, not reason, reason)
+        self._last = health, reason
+        return UpdateReport(ids, accepted, innovations_px, nis, health, reason)
 
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
         keep = ~np.isin(self.ids, ids)
         if not keep.all():
-            self._state = self._state.kept(keep)
-            self.ids = self.ids[keep]
+            self._settled = self._settled.kept(keep) if self._step is None else self._settled
             self._step = self._step.kept(keep) if self._step is not None else None
+            self.ids = self.ids[keep]
 
     @property
     def state(self) -> MovingState:
         """The whole state, a value: for figures and tests."""
-        return self._state
+        return self._settled if self._step is None else self._step.state
+
+    @property
+    def health(self) -> tuple[Health, str]:
+        """What holds the estimate up at present, and in words what is wrong; empty if nothing is."""
+        unseen = self._steps_unseen
+        if unseen >= self.settings.patience:
+            return Health.NO_IMAGE, f"no image for {unseen} steps"
+        if self._last[0] is not Health.GOOD:
+            return self._last
+        parallax = self._baseline * self._focal[0] / self.settings.prior_depth
+        if parallax < self.settings.parallax_px and not self.converged().any():
+            way = 1e3 * self._baseline
+            return (
+                Health.NO_PARALLAX,
+                f"the robot has moved by {way:.0f} mm since landmarks were taken up: no depths",
+            )
+        return self._last
 
     @property
     def pose(self) -> PoseGaussian:
         """`anchor_from_robot`."""
-        return self._state.pose
+        return self.state.pose
 
     def reanchor(self) -> PoseGaussian:
         """Make the present posture the anchor.
@@ -215,13 +202,13 @@ class MappingFilter:
             `old_anchor_from_new_anchor`.
         """
         pose = self.pose
-        self._state = self._state.reanchored()
-        self._step = None
+        self._settle(self.state.reanchored())
+        self._base = pose.mean.inverse().apply(self._base[None])[0]
         return pose
 
     def predict_pixels(self, ids: Ids | None = None) -> Array:
         """(N, 2) px where landmarks are expected now; NaN for ids that the filter does not hold."""
-        pixels: Array = self._centre + self._focal * self._state.rays[:, :2]
+        pixels: Array = self._centre + self._focal * self._rays[:, :2]
         if ids is None:
             return pixels
         slots, rows = self._slots(ids)
@@ -231,7 +218,8 @@ class MappingFilter:
 
     def landmarks(self) -> LandmarkEstimates:
         """All landmarks as they are known now."""
-        return LandmarkEstimates.of_rays(self.ids.copy(), self._state.rays, self._state.blocks, self._camera)
+        state = self.state
+        return LandmarkEstimates.of_rays(self.ids.copy(), state.rays, state.blocks, self._camera)
 
     def converged(self) -> NDArray[np.bool_]:
         """(n,) landmarks whose depth is known well enough, in metres."""
@@ -239,59 +227,94 @@ class MappingFilter:
         limit = np.maximum(self.settings.converged_sigma, self.settings.converged_share * now.depths)
         return np.asarray(np.isfinite(now.depths) & (now.depth_sigmas <= limit), np.bool_)
 
+    @property
+    def _rays(self) -> Array:
+        """(n, 3) where landmarks are expected now, without the covariance that `state` would compute."""
+        return self._settled.rays if self._step is None else self._step.rays
+
+    def _settle(self, state: MovingState) -> None:
+        """Go on from a state; no step waits for its image any more."""
+        self._settled, self._step = state, None
+
     def _slots(self, ids: Ids, pixels: Array | None = None) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Places in the state of those ids that are held and seen, and their rows among the ids given."""
-        held, slots, rows = np.intersect1d(self.ids, ids, return_indices=True)
-        if pixels is not None and len(held):
+        if len(ids) == len(self.ids) and (ids == self.ids).all():
+            if pixels is not None:
+                rows = kernels.finite_rows(np.ascontiguousarray(pixels, np.float64))
+                return rows, rows
+            return np.arange(len(ids)), np.arange(len(ids))
+        _, slots, rows = np.intersect1d(self.ids, ids, return_indices=True)
+        if pixels is not None:
             seen = np.isfinite(pixels[rows]).all(axis=1)
             slots, rows = slots[seen], rows[seen]
         return slots, rows
 
-    def _take(self, step: Step) -> None:
-        self._step, self._state = step, step.state
-
     def _spread(self, slots: NDArray[np.intp]) -> Array:
         """(2N, 2N) joint covariance of the innovations of some landmarks."""
-        index = _measured(slots)
-        spread = self._state.covariance[np.ix_(index, index)]
-        diagonal = np.arange(len(index))
-        spread[diagonal, diagonal] += np.tile((self.settings.pixel_sigma / self._focal) ** 2, len(slots))
+        spread: Array = kernels.spread(self.state.covariance, slots, self._slope_variances)
         return spread
 
-    def _doubt(self, agreeing: int, seen: int) -> str:
-        """Why so many landmarks of those seen are no good update; empty if they are."""
-        s = self.settings
-        needed = max(min(s.least_agreeing, len(self.ids)), s.least_agreeing_share * seen)
-        return "" if agreeing >= needed else f"{agreeing} of {seen} landmarks agree"
+    def _believe(
+        self, slots: NDArray[np.intp], innovations: Array
+    ) -> tuple[NDArray[np.bool_], Array, Health, str]:
+        """Which of the landmarks seen to correct by, the inverse of their S, and what that tells."""
+        s, seen = self.settings, len(slots)
+        believed, information = believe(innovations, self._spread(slots), self._gate)
+        agreeing = int(np.count_nonzero(believed))
+        health, reason = Health.GOOD, ""
+        if agreeing < s.least_agreeing_share * seen:
+            health, reason = Health.DISAGREEMENT, f"{agreeing} of {seen} landmarks agree"
+            if self._step is not None:
+                # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
+                step, self._step = self._step, self._step.again(wheel_root=np.diag(s.slip))
+                then_believed, then_information = believe(innovations, self._spread(slots), self._gate)
+                agreeing = int(np.count_nonzero(then_believed))
+                if agreeing >= max(s.least_agreeing, s.least_agreeing_share * seen):
+                    self._distrust = s.distrust
+                    reason = f"the wheels are refuted by {agreeing} of {seen} landmarks"
+                    return then_believed, then_information, Health.SLIP, reason
+                self._step = step
+            # A few that agree among many that do not may as well be the wrong ones.
+            believed[:] = False
+        elif agreeing < s.least_agreeing:
+            health, reason = (
+                Health.FEW,
+                f"{agreeing} of {seen} landmarks in view agree, {s.least_agreeing} are needed",
+            )
+        return believed, information, health, reason
 
-    def _correct(self, slots: NDArray[np.intp], slopes: Array, information: Array) -> float:
-        """Correct by believed measurements, whose innovations have this information, and return their NIS.
+    def _correct(self, slots: NDArray[np.intp], slopes: Array, information: Array) -> tuple[float, str]:
+        """Correct by believed measurements, whose innovations have this information.
 
         The image tells better than the wheels by how much the robot has turned, so the step is linearised
-        again at what it then seems to have been. Without this each step leaves a second-order error of one
+        at what it then seems to have been. Without this each step leaves a second-order error of one
         sign, an expansion of the image that passes for a way forward (docs/decisions/ekf-parametrisation.md).
-        A wheel that has slipped further than its noise allows is believed so much less, in this step only.
+        Wheels that an image refutes are believed less; if they claim to stand, not at all and for a while.
+
+        Returns:
+            Their NIS over its degrees of freedom; and what is wrong with the wheels, empty if nothing is.
         """
-        index = _measured(slots)
-        residual = (slopes - self._state.rays[slots, :2]).ravel()
+        slip = ""
+        residual = (slopes - self._rays[slots, :2]).ravel()
         for _ in range(self.settings.relinearisations):
             if self._step is None:
                 break
-            errors = self._step.wheel_errors(index, information @ residual)
-            likely, at = self._step.likely(errors), self._step.at
-            beyond = float(np.linalg.norm(errors))
-            if beyond > self.settings.slip_sigmas:
-                self._take(self._step.again(at=likely, wheel_root=beyond * self._step.wheel_root))
-            elif max(abs(likely.forward - at.forward), abs(likely.turn - at.turn)) >= SAME_STEP:
-                self._take(self._step.again(at=likely))
+            errors, at = self._step.wheel_errors(slots, residual, information), self._step.at
+            likely, surprise = self._step.if_erred(errors.likely), errors.surprise
+            if surprise > self.settings.slip_sigmas and not slip:
+                slip = f"the landmarks refute the wheels by {surprise:.0f} sigmas"
+                root = self._wheels.refuted_root(self._step.measured, surprise, self.settings.slip[0])
+                self._step = self._step.again(at=likely, wheel_root=root)
+                self._distrust = self.settings.distrust
+            elif (
+                abs(likely.forward - at.forward) >= SAME_STEP[0] or abs(likely.turn - at.turn) >= SAME_STEP[1]
+            ):
+                self._step = self._step.again(at=likely)
+                if self._distrust:
+                    slip = slip or "the wheels were refuted a moment ago, and are again"
             else:
                 break
-            residual = (slopes - self._state.rays[slots, :2]).ravel()
-            information = inverse(self._spread(slots))
-        self._state = self._state.corrected(index, residual, information)
-        return float(residual @ information @ residual) / len(residual)
-
-
-def _measured(slots: NDArray[np.intp]) -> NDArray[np.intp]:
-    """(2N,) entries of the state that the pixels of some landmarks measure: their a and b."""
-    return np.asarray((3 + 3 * slots[:, None] + np.arange(2)).ravel(), np.intp)
+            residual = (slopes - self._rays[slots, :2]).ravel()
+            information = kernels.inverse(self._spread(slots))
+        self._settle(self.state.corrected(slots, residual, information, self._slope_variances))
+        return float(residual @ information @ residual) / len(residual), slip

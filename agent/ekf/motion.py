@@ -23,6 +23,9 @@ import numpy as np
 from agent.observation import Odometry
 from hybridmap.pose import Array
 
+STANDS = 1e-4
+"""A wheel's way below this is none, m."""
+
 
 @dataclass(frozen=True, slots=True)
 class WheelNoise:
@@ -40,9 +43,30 @@ class WheelNoise:
 
     def root(self, odometry: Odometry) -> Array:
         """(2, 2) root R of the covariance R R^T of (u1 m, u2 rad) of one step, one column a wheel."""
+        right, left = self.ways(odometry)
+        return self._root(
+            math.hypot(self.share * right, self.floor), math.hypot(self.share * left, self.floor)
+        )
+
+    def refuted_root(self, odometry: Odometry, factor: float, lost: float) -> Array:
+        """The same of wheels that cannot be right: less is believed of a way, nothing of a wheel that stood.
+
+        Args:
+            odometry: the step.
+            factor: by which the wheels err more than they should.
+            lost: standard deviation of a wheel's way if its encoder says that there was none, m.
+        """
+        sigmas = [
+            factor * self.share * abs(way) if abs(way) > STANDS else lost for way in self.ways(odometry)
+        ]
+        return self._root(*sigmas)
+
+    def ways(self, odometry: Odometry) -> tuple[float, float]:
+        """Ways of the right and the left wheel, m."""
         half = 0.5 * self.axle * odometry.turn
-        right = math.hypot(self.share * (odometry.forward + half), self.floor)
-        left = math.hypot(self.share * (odometry.forward - half), self.floor)
+        return odometry.forward + half, odometry.forward - half
+
+    def _root(self, right: float, left: float) -> Array:
         return np.array([[0.5 * right, 0.5 * left], [right / self.axle, -left / self.axle]])
 
 

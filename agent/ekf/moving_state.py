@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.motion import move_posture, move_rays
+from agent.ekf import kernels
 from agent.observation import Odometry
 from hybridmap.pose import Array, Pose2, PoseGaussian
 
@@ -67,20 +69,43 @@ class MovingState:
         covariance[:3, :] = covariance[:, :3] = 0.0
         return MovingState(np.zeros(3), self.rays, covariance)
 
-    def corrected(self, index: NDArray[np.intp], residual: Array, information: Array) -> MovingState:
-        """Kalman update by direct measurements of some entries of the state.
+    def corrected(
+        self, slots: NDArray[np.intp], residual: Array, information: Array, variances: Array
+    ) -> MovingState:
+        """Kalman update by direct measurements of the slopes of some landmarks.
 
         Args:
-            index: (K,) which entries.
-            residual: (K,) measured minus expected.
-            information: (K, K) inverse of the residuals' joint covariance.
+            slots: (m,) which landmarks.
+            residual: (2m,) measured minus expected.
+            information: (2m, 2m) inverse of the residuals' joint covariance.
+            variances: (2,) of a measured slope.
         """
-        columns = self.covariance[:, index]
-        step = columns @ (information @ residual)
-        # A product with its own transpose stays symmetric to the last bit.
-        root = columns @ np.linalg.cholesky(information)
-        covariance = self.covariance - root @ root.T
+        step, covariance = kernels.condition(self.covariance, slots, information, variances, residual)
         return MovingState(self.posture + step[:3], self.rays + step[3:].reshape(-1, 3), covariance)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class WheelErrors:
+    """What an image says of the wheels' errors in the step before it, in sigmas of theirs.
+
+    Attributes:
+        likely: (2,) the errors' posterior mean. It is also the score, the image's pull at the errors.
+        certainty: (2, 2) covariance of the score if the wheels are right: what the image could know of them.
+    """
+
+    likely: Array
+    certainty: Array
+
+    @property
+    def surprise(self) -> float:
+        """How far the score is from what right wheels allow, in its own sigmas.
+
+        Unlike `likely` it does not shrink with the wheels' noise: wheels that claim for certain to stand, as
+        with a lost encoder, are refuted as well.
+        """
+        (p, q), (_, r) = self.certainty.tolist()
+        x, y = self.likely.tolist()
+        return math.sqrt(max(r * x * x - 2.0 * q * x * y + p * y * y, 0.0) / max(p * r - q * q, 1e-300))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +119,11 @@ class Step:
         posture_variances: (3,) process noise of the posture, the diagonal of Q.
         mount_forward: of the optical centre ahead of the axle, m.
         at: where the step is linearised: as measured, or a better guess.
-        state: after the step.
+        posture: (3,) expected after the step.
+        rays: (n, 3) expected after the step.
         scale: (n,) depth after over depth before; not positive for landmarks now behind the camera.
-        by_input: (3 + 3n, 2) Jacobian of the state by (u1, u2).
+        blocks: (1 + n, 3, 3) Jacobian of the state after by the state before.
+        by_input: (3 + 3n, 2) Jacobian of the state after by (u1, u2).
     """
 
     before: MovingState
@@ -105,8 +132,10 @@ class Step:
     posture_variances: Array
     mount_forward: float
     at: Odometry
-    state: MovingState
+    posture: Array
+    rays: Array
     scale: Array
+    blocks: Array
     by_input: Array
 
     @staticmethod
@@ -118,29 +147,25 @@ class Step:
         mount_forward: float,
         at: Odometry | None = None,
     ) -> Step:
-        """Predict: P- = A P A^T + B S B^T + Q of paper-notes, with the exact motion."""
-        at = at or measured
-        n = len(before.rays)
-        posture, by_posture, posture_by_input = move_posture(before.posture, at)
-        moved = move_rays(before.rays, at, mount_forward)
-        by_input = np.concatenate([posture_by_input, moved.by_input.reshape(3 * n, 2)])
-        shift = by_input @ np.array([measured.forward - at.forward, measured.turn - at.turn])
-        old = before.covariance
-        new = np.empty_like(old)
-        new[:3, :3] = by_posture @ old[:3, :3] @ by_posture.T
-        # The transition is block diagonal: 3x3 blocks times rows, never the dense product.
-        new[3:, :3] = (moved.by_ray @ (by_posture @ old[:3, 3:]).T.reshape(n, 3, 3)).reshape(3 * n, 3)
-        new[:3, 3:] = new[3:, :3].T
-        half = (moved.by_ray @ old[3:, 3:].reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        new[3:, 3:] = (moved.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        root = by_input @ wheel_root
-        new += root @ root.T
-        new[[0, 1, 2], [0, 1, 2]] += posture_variances
-        rays = moved.rays + shift[3:].reshape(n, 3)
-        state = MovingState(posture + shift[:3], rays, 0.5 * (new + new.T))
-        return Step(
-            before, measured, wheel_root, posture_variances, mount_forward, at, state, moved.scale, by_input
+        """Move the mean, with the exact motion; the covariance waits until somebody asks for it."""
+        guess = at or measured
+        posture, rays, scale, blocks, by_input = kernels.transition(
+            before.posture, before.rays, guess.forward, guess.turn, mount_forward
         )
+        if at is not None:
+            shift = by_input @ np.array([measured.forward - at.forward, measured.turn - at.turn])
+            posture, rays = posture + shift[:3], rays + shift[3:].reshape(-1, 3)
+        return Step(
+            before, measured, wheel_root, posture_variances, mount_forward, guess, posture, rays, scale,
+            blocks, by_input,
+        )  # fmt: skip
+
+    @cached_property
+    def state(self) -> MovingState:
+        """After the step: P- = A P A^T + B S B^T + Q of paper-notes."""
+        root = self.by_input @ self.wheel_root
+        covariance = kernels.propagate(self.before.covariance, self.blocks, root, self.posture_variances)
+        return MovingState(self.posture, self.rays, covariance)
 
     def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> Step:
         """The same step linearised elsewhere, or with the wheels believed less."""
@@ -149,20 +174,44 @@ class Step:
             self.before, self.measured, root, self.posture_variances, self.mount_forward, at or self.at
         )
 
-    def wheel_errors(self, index: NDArray[np.intp], pull: Array) -> Array:
-        """(2,) what the two wheels most likely erred by, in sigmas, given measurements of the state after.
+    def seems(self, slots: NDArray[np.intp], slopes: Array, most: float) -> Odometry:
+        """Where to linearise, at a first glance at the image: a quarter of the landmarks may be wrong.
+
+        The image shows a turn as da = (1 + a^2) du2, alike for all landmarks, near and far; the way is left
+        as the wheels say. The landmarks vote by the mean of their middle half, whose error the half's width
+        tells; it and the wheels are weighed by their variances.
 
         Args:
-            index: (K,) which entries of the state were measured.
-            pull: (K,) inverse of the residuals' joint covariance, times the residuals.
+            slots: (m,) landmarks seen, m > 0.
+            slopes: (m, 2) where.
+            most: sigmas of the wheels by which the guess may be off what they say.
         """
-        errors: Array = self.wheel_root.T @ (self.by_input[index].T @ pull)
-        return errors
+        a = self.rays[slots, 0]
+        turns = np.sort((slopes[:, 0] - a) / (1.0 + a * a))
+        quarter = len(turns) // 4
+        half = turns[quarter : len(turns) - quarter]
+        # A Gaussian's middle half is 1.35 sigma wide; its mean has 1.2 times the variance of the whole mean.
+        vote = 1.2 * (float(half[-1] - half[0]) / 1.35) ** 2 / len(turns)
+        wheels = self.wheel_root[1, 0] ** 2 + self.wheel_root[1, 1] ** 2
+        turn = float(half.sum()) / len(half) * wheels / (wheels + vote)
+        limit = most * math.sqrt(wheels)
+        return Odometry(self.measured.forward, self.measured.turn + min(max(turn, -limit), limit))
 
-    def likely(self, errors: Array) -> Odometry:
-        """What the robot most likely did if the wheels erred so, (2,) in sigmas."""
-        u = self.wheel_root @ errors
-        return Odometry(self.measured.forward + float(u[0]), self.measured.turn + float(u[1]))
+    def wheel_errors(self, slots: NDArray[np.intp], residual: Array, information: Array) -> WheelErrors:
+        """What the two wheels erred by in this step, given what was seen after it.
+
+        Args:
+            slots: (m,) landmarks seen.
+            residual: (2m,) measured minus expected.
+            information: (2m, 2m) inverse of the residuals' joint covariance.
+        """
+        pulled = self.wheel_root.T @ kernels.pull(self.by_input, slots, information, residual)
+        return WheelErrors(pulled[:, 2], pulled[:, :2] @ self.wheel_root)
+
+    def if_erred(self, errors: Array) -> Odometry:
+        """What the robot did if the wheels erred so, (2,) in sigmas."""
+        forward, turn = (self.wheel_root @ errors).tolist()
+        return Odometry(self.measured.forward + forward, self.measured.turn + turn)
 
     def kept(self, mask: NDArray[np.bool_]) -> Step:
         """The step of only some of the landmarks."""
@@ -172,7 +221,8 @@ class Step:
         return replace(
             self,
             before=self.before.kept(mask),
-            state=self.state.kept(mask),
+            rays=self.rays[mask],
             scale=self.scale[mask],
+            blocks=self.blocks[np.concatenate([[True], mask])],
             by_input=self.by_input[rows],
         )

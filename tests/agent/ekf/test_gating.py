@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from agent.ekf.gating import believe, chi_squares, inverse, leave_one_out, one_point_consensus, pixel_gate
+from agent.ekf.gating import believe, chi_squares, one_point_consensus, pixel_gate
+from agent.ekf.kernels import inverse, leave_one_out
 
 
 def joint(n: int, shared: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

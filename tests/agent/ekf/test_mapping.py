@@ -1,6 +1,4 @@
-"""The mapping filter: its algebra against dense textbook forms, and what it does when sensors fail."""
-
-import dataclasses
+"""The mapping filter: its algebra against dense textbook forms, and what it tells."""
 
 import numpy as np
 import pytest
@@ -33,10 +31,6 @@ def drive(filter_: MappingFilter, run: MappingRun, first: int = 0, last: int | N
 
 def a_run(shape: str = "arc", seed: int = 0, steps: int = 120, camera: Camera = CAMERA) -> MappingRun:
     return draw_run(np.random.default_rng(seed), shape, steps, camera=camera)
-
-
-def pose_error(filter_: MappingFilter, truth: Pose2) -> np.ndarray:
-    return np.abs((filter_.pose.mean.inverse() @ truth).vector)
 
 
 @pytest.mark.parametrize("camera", [CAMERA, AHEAD])
@@ -247,60 +241,6 @@ def test_removed_between_wheels_and_image() -> None:
     np.testing.assert_allclose(one.state.rays, other.state.rays, atol=1e-12)
 
 
-def test_a_blocked_lens_grows_the_covariance_and_is_told() -> None:
-    run = a_run("line", steps=300)
-    filter_ = start(run)
-    drive(filter_, run, last=100)
-    before = np.trace(filter_.pose.covariance)
-    for k in range(100, 130):
-        filter_.predict(run.odometry[k])
-        report = filter_.update(np.arange(30), np.full((30, 2), np.nan))
-        assert not report.healthy
-        assert "in view" in report.reason
-    assert np.trace(filter_.pose.covariance) > 3 * before
-    drive(filter_, run, first=130)
-    assert filter_.pose.mahalanobis2(run.poses[-1]) < 16.3
-
-
-@pytest.mark.parametrize("factor", [0.0, 4.0, -1.0])
-def test_wheels_that_lie_are_refuted_and_the_filter_recovers(factor: float) -> None:
-    """An encoder drops out, spikes or is reversed for some steps while the camera sees on."""
-    run = a_run("arc", steps=300)
-    odometry = list(run.odometry)
-    for k in range(150, 158):
-        odometry[k] = Odometry(odometry[k].forward, factor * odometry[k].turn - 0.1 * (factor == 4.0))
-    run = dataclasses.replace(run, odometry=odometry)
-    filter_ = start(run)
-    reasons = []
-    for k in range(300):
-        filter_.predict(odometry[k])
-        report = filter_.update(np.arange(30), run.pixels[k + 1])
-        if not report.healthy:
-            reasons.append((k, report.reason))
-    if factor == 4.0:
-        assert {k for k, _ in reasons} >= set(range(150, 158))
-        assert all("wheels" in reason for _, reason in reasons)
-    assert all(150 <= k < 158 for k, _ in reasons)
-    assert filter_.pose.mahalanobis2(run.poses[-1]) < 16.3
-    assert pose_error(filter_, run.poses[-1])[:2].max() < 0.03
-
-
-def test_a_single_landmark_in_view_is_used_without_pretending() -> None:
-    run = a_run("line", steps=300)
-    filter_ = start(run)
-    drive(filter_, run, last=100)
-    only = np.full((30, 2), np.nan)
-    before = filter_.pose.covariance.trace()
-    for k in range(100, 140):
-        filter_.predict(run.odometry[k])
-        pixels = only.copy()
-        pixels[4] = run.pixels[k + 1][4]
-        report = filter_.update(np.arange(30), pixels)
-        assert not report.healthy
-    assert filter_.pose.covariance.trace() > before
-    assert filter_.pose.mahalanobis2(run.poses[140]) < 16.3
-
-
 def test_a_few_that_agree_among_many_that_do_not_are_not_believed() -> None:
     run = a_run("line", steps=100)
     filter_ = start(run)
@@ -312,4 +252,5 @@ def test_a_few_that_agree_among_many_that_do_not_are_not_believed() -> None:
     report = filter_.update(np.arange(30), pixels)
     assert not report.accepted.any()
     assert report.reason.endswith("landmarks agree")
-    assert filter_.state is before
+    np.testing.assert_array_equal(filter_.state.covariance, before.covariance)
+    np.testing.assert_array_equal(filter_.state.rays, before.rays)
