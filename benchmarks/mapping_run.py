@@ -50,9 +50,8 @@ def main() -> None:
     for key in next(iter(results.values())):
         table.add_row(key, *(_shown(one[key]) for one in results.values()))
     console.print(table)
-    for name, reason in abandoned.items():
-        if reason:
-            console.print(f"{name}: the robot would have dropped this episode ({reason}); it was ended there")
+    for note in notes(results, abandoned):
+        console.print(note)
     console.print(f"pictures are in {arguments.out}")
     if arguments.json:
         by_figure = {
@@ -98,6 +97,22 @@ def _run(arguments: argparse.Namespace, console: Console) -> tuple[dict[str, Fig
             results[name], abandoned[name] = figures(run), run.given_up
             draw(run, folder)
     return results, abandoned
+
+
+def notes(results: dict[str, Figures], abandoned: dict[str, str]) -> list[str]:
+    """What a reader must know before he compares the runs."""
+    told = []
+    for name, one in results.items():
+        if abandoned[name]:
+            reason = abandoned[name]
+            told.append(f"{name}: the robot would have dropped this episode ({reason}); it was ended there")
+        if RUNS[name][1] and not one["person_in_view_s"]:
+            told.append(f"{name}: nobody came into view, there was no room ahead; take another seed")
+        if not one["landmarks_left"]:
+            told.append(
+                f"{name}: no landmark was left at the end; since the last the wheels were trusted alone"
+            )
+    return told
 
 
 def _make(folder: Path) -> None:

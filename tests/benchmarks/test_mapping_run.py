@@ -16,7 +16,7 @@ import pytest
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings
 from agent.observation import Odometry
-from benchmarks.mapping_run import main
+from benchmarks.mapping_run import main, notes
 from benchmarks.mapping_scene import MappingDrive, Moment, drive
 from benchmarks.mapping_score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
 from benchmarks.mapping_truth import Surfaces
@@ -81,6 +81,17 @@ def test_what_cannot_be_run_is_told_in_one_line(
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
     assert file.read_text() == "not a folder"
+
+
+def test_what_spoils_a_comparison_is_told() -> None:
+    seen: dict[str, float | None] = {"person_in_view_s": 3.0, "landmarks_left": 9.0}
+    unseen: dict[str, float | None] = {"person_in_view_s": 0.0, "landmarks_left": 0.0}
+    assert notes({"line": unseen | {"landmarks_left": 1.0}, "person": seen}, {"line": "", "person": ""}) == []
+    told = notes({"line": seen, "person": unseen}, {"line": "carried off", "person": ""})
+    assert [line.split(":")[0] for line in told] == ["line", "person", "person"]
+    assert "carried off" in told[0]
+    assert "nobody came into view" in told[1]
+    assert "no landmark was left" in told[2]
 
 
 def test_a_run_is_near_the_truth(run: MappingDrive) -> None:
