@@ -183,9 +183,7 @@ def main() -> None:
     console = Console(stderr=arguments.json)
     with console.status("three filters take turns ..."):
         figures = measure(arguments.seed)
-    table = Table(
-        "landmarks", "ours", "ours, plain", "FilterPy", "FilterPy / ours", title="ms a step"
-    )
+    table = Table("landmarks", "ours", "ours, plain", "FilterPy", "FilterPy / ours", title="ms a step")
     for n in SIZES:
         ours, same, theirs = (figures[f"{key}_n{n}{end}"] for key, end in _COLUMNS)
         table.add_row(str(n), f"{ours:.2f}", f"{same:.2f}", f"{theirs:.2f}", f"{theirs / ours:.1f}")
