@@ -12,6 +12,7 @@ from agent.observation import Observation, RobotDescription
 from agent.tracking import Tracking, TrackingSettings
 from agent.view import View
 from agent.vision.lens import Lens
+from agent.vision.report import TrackReport
 from agent.vision.sift import Features, Sift, SiftSettings
 from hybridmap.change import ChangeBody, NodePut
 from hybridmap.hybrid_map import HybridMap
@@ -113,6 +114,11 @@ class Mapper:
     def tracked(self) -> int:
         """Tracks alive."""
         return len(self._tracking.ids)
+
+    @property
+    def track_report(self) -> TrackReport:
+        """Age of the tracks, how well they agree with the filter, and how much of the image they cover."""
+        return self._tracking.report
 
     @property
     def anchored(self) -> int:

@@ -268,7 +268,7 @@ class Pipeline:
             detail = f"{detail}; {warning}" if detail else warning
         nodes = len(self.map.nodes)
         if not nodes and isinstance(self._mission, Explore | Carried):
-            detail = f"no nodes yet: {detail or f'{self._mapper.tracked} features in view'}"
+            detail = f"no nodes yet: {detail or self._mapper.track_report}"
         fix = self._navigator.fix if self._navigator is not None else None
         return Status(
             doing=doing,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,9 @@ from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.observation import Observation, RobotDescription
 from agent.track_history import TrackHistory
-from agent.view import View, associate
+from agent.view import View, associate, even_choice
 from agent.vision.lens import Lens
+from agent.vision.report import TrackReport
 from agent.vision.sift import Features
 from agent.vision.tracker import Tracker, TrackerSettings
 from hybridmap.pose import Array, Pose2, PoseGaussian
@@ -80,17 +81,19 @@ class Tracking:
         """Start with nothing in view."""
         self.history = TrackHistory()
         self._camera = description.camera
-        self._lens = lens
         self._settings = settings
         self._tracker = Tracker(lens, settings.tracker)
         self._filter = MappingFilter(
             description.camera, description.axle, description.wheel_noise, settings.filter
         )
-        self._continuity = Continuity(lens, description.camera, settings.tracker, settings.continuity)
+        # Two images are compared by points that live for one step: nothing to hold them to.
+        once = replace(settings.tracker, anchored=False)
+        self._continuity = Continuity(lens, description.camera, once, settings.continuity)
         self.strange = self.blank = self.missing = 0
         self._dispute = Dispute(settings.dispute)
         self._believed: NDArray[np.uint8] | None = None
         self._since_believed = Pose2()
+        self._misses_px: Array = np.zeros((0, 2))
         self._strikes: dict[int, int] = {}
         self._next_track = 1
 
@@ -103,6 +106,12 @@ class Tracking:
     def pixels(self) -> Array:
         """(N, 2) px in the ideal image, where they are."""
         return self._tracker.pixels
+
+    @property
+    def report(self) -> TrackReport:
+        """What the tracks are worth after the last image that was believed."""
+        tracker = self._tracker
+        return TrackReport.of(self._camera, tracker.pixels, tracker.ages, tracker.held, self._misses_px)
 
     @property
     def pose(self) -> PoseGaussian:
@@ -149,9 +158,12 @@ class Tracking:
         self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
         filtered = np.isin(self._tracker.ids, self._filter.ids)
         pixels = self._tracker.pixels[filtered]
+        self._misses_px = np.zeros((0, 2))
         if self._trusted(pixels):
             ids = self._tracker.ids[filtered]
-            self._judge(ids, self._filter.update(ids, pixels).accepted)
+            update = self._filter.update(ids, pixels)
+            self._misses_px = update.innovations_px[update.accepted]
+            self._judge(ids, update.accepted)
         self.remember()
 
     def remember(self, force: bool = False) -> None:
@@ -209,9 +221,7 @@ class Tracking:
             sight = self._see(image, believed)
             if sight is not Sight.SAME and self._see(relit(image, believed), believed) is Sight.SAME:
                 # The next image will be in the same light as this one really is.
-                followed, self._tracker = self._tracker, Tracker(self._lens, self._settings.tracker)
-                self._tracker.track(image)
-                self._tracker.add(followed.ids, followed.raw)
+                self._tracker.relight(image)
             elif sight is not Sight.SAME:
                 self.strange += sight is Sight.STRANGE
                 self.blank += sight is Sight.BLANK
@@ -265,26 +275,3 @@ class Tracking:
             gone = np.array(given_up, np.int64)
             self._filter.remove(gone)
             self._tracker.keep(~np.isin(self._tracker.ids, gone))
-
-
-def even_choice(candidates: Array, taken: Array, most: int) -> NDArray[np.int64]:
-    """Choose pixels far from each other and from those taken, by farthest-point sampling.
-
-    Args:
-        candidates: (N, 2) px, strongest first.
-        taken: (M, 2) px.
-        most: how many to choose.
-
-    Returns:
-        (K,) indices of the candidates.
-    """
-    distance = np.full(len(candidates), np.inf)
-    if len(taken):
-        distance = np.linalg.norm(candidates[:, None] - taken[None], axis=2).min(axis=1)
-    chosen: list[int] = []
-    while len(chosen) < min(most, len(candidates)):
-        best = int(distance.argmax())
-        chosen.append(best)
-        distance = np.minimum(distance, np.linalg.norm(candidates - candidates[best], axis=1))
-        distance[best] = -1.0
-    return np.array(chosen, np.int64)

@@ -50,3 +50,26 @@ def associate(features: Features, ids: NDArray[np.int64], raw: Array, within_px:
         same = mutual & (distance.min(axis=1) <= within_px)
         tracks[same] = ids[nearest[same]]
     return tracks
+
+
+def even_choice(candidates: Array, taken: Array, most: int) -> NDArray[np.int64]:
+    """Choose pixels far from each other and from those taken, by farthest-point sampling.
+
+    Args:
+        candidates: (N, 2) px, strongest first.
+        taken: (M, 2) px.
+        most: how many to choose.
+
+    Returns:
+        (K,) indices of the candidates.
+    """
+    distance = np.full(len(candidates), np.inf)
+    if len(taken):
+        distance = np.linalg.norm(candidates[:, None] - taken[None], axis=2).min(axis=1)
+    chosen: list[int] = []
+    while len(chosen) < min(most, len(candidates)):
+        best = int(distance.argmax())
+        chosen.append(best)
+        distance = np.minimum(distance, np.linalg.norm(candidates - candidates[best], axis=1))
+        distance[best] = -1.0
+    return np.array(chosen, np.int64)

@@ -1,14 +1,20 @@
-"""Tracks of image points by pyramidal Lucas-Kanade, checked forward and backward."""
+"""Tracks of image points by pyramidal Lucas-Kanade, checked forward and backward, held to where they began.
+
+From frame to frame, Lucas-Kanade finds a point however it has moved; the patch in which the point was first
+seen then says where exactly it is (agent/vision/template.py, docs/decisions/tracking.md).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.vision.lens import Lens
+from agent.vision.template import TemplateMatcher, TemplateSettings
+from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array
 
 EIGENVALUE_UNIT = 1024.0
@@ -26,6 +32,9 @@ class TrackerSettings:
         border_px: points nearer to the border are lost.
         least_texture: mean squared gradient of a patch in its weakest direction, (grey/px)^2; with less (that
             of noise included, about 1 for a webcam) a point would slide along an edge, and is lost.
+        anchored: whether points are held to the patches in which they were first seen. What is tracked over
+            one frame only gains nothing by it.
+        template: how they are.
     """
 
     window_px: int = 11
@@ -33,6 +42,8 @@ class TrackerSettings:
     backward_px: float = 0.8
     border_px: float = 4.0
     least_texture: float = 2.5
+    anchored: bool = True
+    template: TemplateSettings = field(default_factory=TemplateSettings)
 
 
 class Tracker:
@@ -41,6 +52,9 @@ class Tracker:
     Attributes:
         ids: (N,) int64 of the points that are followed now.
         raw: (N, 2) px in the real image, where they are now.
+        ages: (N,) int64, images into which they were followed so far.
+        held: (N,) whether they were found by the patch in which they were first seen, or from frame to frame
+            alone.
     """
 
     def __init__(self, lens: Lens, settings: TrackerSettings | None = None) -> None:
@@ -50,6 +64,10 @@ class Tracker:
         self._image: NDArray[np.uint8] | None = None
         self.ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self.raw: Array = np.zeros((0, 2))
+        self.ages: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.held: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self._matcher = TemplateMatcher(self._settings.template)
+        self._templates = self._matcher.none()
 
     @property
     def pixels(self) -> Array:
@@ -98,18 +116,46 @@ class Tracker:
         kept &= (there >= s.border_px).all(axis=1)
         kept &= (there[:, 0] < width - s.border_px) & (there[:, 1] < height - s.border_px)
         lost: NDArray[np.int64] = self.ids[~kept]
-        self.ids, self.raw = self.ids[kept], there[kept].astype(np.float64)
+        self.raw = there.astype(np.float64)
+        self.keep(kept)
+        self.ages = self.ages + 1
+        if s.anchored:
+            match = self._matcher.match(self._templates, image, self.raw)
+            self.raw, self.held, self._templates = match.raw, match.held, match.templates
         return lost
 
     def add(self, ids: NDArray[np.int64], raw: Array) -> None:
-        """Follow more points of the last image that was given to `track`."""
+        """Follow more points of the last image.
+
+        Args:
+            ids: (N,) that no point has yet.
+            raw: (N, 2) px in the real image.
+
+        Raises:
+            InvalidValue: there was no image yet.
+        """
+        if self._image is None:
+            raise InvalidValue("add: points are points of an image; track one first")
         self.ids = np.concatenate([self.ids, ids])
         self.raw = np.concatenate([self.raw, raw])
+        self.ages = np.concatenate([self.ages, np.zeros(len(ids), np.int64)])
+        self.held = np.concatenate([self.held, np.full(len(ids), self._settings.anchored)])
+        if self._settings.anchored:
+            self._templates = self._templates.joined(self._matcher.cut(self._image, raw))
+
+    def relight(self, image: NDArray[np.uint8]) -> None:
+        """Take the last image as it is in another light: (H, W) grey, from the same place."""
+        self._image = image
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Follow only the points that a (N,) mask selects."""
+        if mask.all():
+            return
         self.ids, self.raw = self.ids[mask], self.raw[mask]
+        self.ages, self.held = self.ages[mask], self.held[mask]
+        if self._settings.anchored:
+            self._templates = self._templates.chosen(mask)
 
     def clear(self) -> None:
         """Follow nothing."""
-        self.ids, self.raw = self.ids[:0], self.raw[:0]
+        self.keep(np.zeros(len(self.ids), np.bool_))

@@ -1,0 +1,195 @@
+"""Patches of points as they were first seen, to which tracks are held: what keeps them from drifting.
+
+Lucas-Kanade from frame to frame adds up its errors, and a patch that grows while the robot approaches pulls
+it aside in every frame alike. The way from the first image to the present one is a single match, whose error
+does not grow with time (Shi and Tomasi 1994 watch their tracks that way). The match is the inverse
+compositional one of Baker and Matthews (2004), so that all derivatives are taken once, when a patch is cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Array
+
+Floats = NDArray[np.float32]
+
+FAINT = 0.5
+"""Grey levels: a patch is taken to have at least this deviation, for a blank one has no looks at all."""
+
+RIDGE = 1e-3
+"""Added to the normal equations, whose entries are about 1: a patch may tell nothing of its size."""
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateSettings:
+    """How tracks are held to the patches in which they were first seen.
+
+    Attributes:
+        half_px: a patch reaches this far from its point in each direction.
+        sigma_px: of the Gaussian by which pixels far from the point count less: they are on another surface,
+            or on a slanted one, more often than those near it.
+        iterations: of Gauss and Newton. The guess is a track and good to a fraction of a pixel.
+        agree_px: a match further than this from the track is another thing that looks alike.
+        least_correlation: of the patch then and now, 1 for the same looks in whatever light.
+        most_scale: once a patch has grown or shrunk by more than this it is cut anew from the present image.
+    """
+
+    half_px: int = 7
+    sigma_px: float = 4.0
+    iterations: int = 2
+    agree_px: float = 1.5
+    least_correlation: float = 0.8
+    most_scale: float = 1.7
+
+
+@dataclass(frozen=True, eq=False)
+class Templates:
+    """N patches in columns. Values: nothing in them is ever changed.
+
+    Attributes:
+        looks: (N, P) grey, of mean 0 and deviation 1 by the pixels' weights.
+        slopes: (N, 3, P) weighted derivative of the looks by (shift right px, shift down px, growth), without
+            what brightness and contrast could do as well.
+        solve: (N, 3, 3) inverse of the normal equations of these.
+        scales: (N,) how large the patch is now, 1 as it was cut.
+    """
+
+    looks: Floats
+    slopes: Floats
+    solve: Floats
+    scales: Floats
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.looks)
+
+    @property
+    def columns(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Looks, slopes, solve and scales."""
+        return self.looks, self.slopes, self.solve, self.scales
+
+    def chosen(self, which: NDArray[np.bool_]) -> Templates:
+        """Those that a (N,) mask selects."""
+        if which.all():
+            return self
+        return Templates(*(column[which] for column in self.columns))
+
+    def joined(self, others: Templates) -> Templates:
+        """These and then others."""
+        pairs = zip(self.columns, others.columns, strict=True)
+        return Templates(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Where N patches are in an image.
+
+    Attributes:
+        raw: (N, 2) px in the real image: found where they are held, else as they were given.
+        held: (N,) whether a patch was found near its track and looks as it did.
+        templates: the same patches with their present size; some cut anew.
+    """
+
+    raw: Array
+    held: NDArray[np.bool_]
+    templates: Templates
+
+
+class TemplateMatcher:
+    """Cuts patches and finds them again, moved, grown and lit differently."""
+
+    def __init__(self, settings: TemplateSettings | None = None) -> None:
+        """Lay out the patch."""
+        self._settings = s = settings or TemplateSettings()
+        side = np.arange(-s.half_px, s.half_px + 1, dtype=np.float32)
+        self._spots = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+        weights = np.exp(-(self._spots**2).sum(axis=1) / (2 * s.sigma_px**2))
+        self._weights: Floats = (weights / weights.sum()).astype(np.float32)
+
+    def none(self) -> Templates:
+        """No patches."""
+        return self._cut(np.zeros((1, 1), np.float32), np.zeros((0, 2)))
+
+    def cut(self, image: NDArray[np.uint8], raw: Array) -> Templates:
+        """Cut the patches around (N, 2) px of a grey image (H, W)."""
+        return self._cut(image.astype(np.float32), raw)
+
+    def match(self, templates: Templates, image: NDArray[np.uint8], raw: Array) -> Match:
+        """Find patches in an image.
+
+        Args:
+            templates: N.
+            image: (H, W) grey.
+            raw: (N, 2) px in the real image, where tracking from the last frame has found them.
+        """
+        if not len(templates):
+            return Match(raw, np.zeros(0, np.bool_), templates)
+        s = self._settings
+        grey = image.astype(np.float32)
+        at, scales = raw.astype(np.float32), templates.scales.copy()
+        for _ in range(s.iterations):
+            off = self._normalised(self._sampled(grey, at, scales))[0] - templates.looks
+            step = np.einsum("nij,nj->ni", templates.solve, np.einsum("nip,np->ni", templates.slopes, off))
+            # Inverse composition: the step moves the patch as it was cut, and is undone on the present one.
+            scales = scales / np.clip(1.0 + step[:, 2], 0.5, 2.0)
+            at = at - scales[:, None] * step[:, :2]
+        looks, _ = self._normalised(self._sampled(grey, at, scales))
+        correlation = np.einsum("np,np,p->n", looks, templates.looks, self._weights)
+        held = correlation >= s.least_correlation
+        held &= np.linalg.norm(at - raw, axis=1) <= s.agree_px
+        reach = (s.half_px * scales)[:, None]
+        held &= ((at >= reach) & (at <= np.array(image.shape[::-1], np.float32) - 1 - reach)).all(axis=1)
+        found = np.where(held[:, None], at.astype(np.float64), raw)
+        scales = np.where(held, scales, templates.scales)
+        now = Templates(templates.looks, templates.slopes, templates.solve, scales)
+        return Match(found, held, self._renewed(now, held, grey, found))
+
+    def _renewed(self, templates: Templates, held: NDArray[np.bool_], grey: Floats, raw: Array) -> Templates:
+        """The patches, those that have changed their size too much cut anew where they are held now."""
+        most = self._settings.most_scale
+        strange = held & ((templates.scales > most) | (templates.scales < 1 / most))
+        if not strange.any():
+            return templates
+        columns = []
+        for old, new in zip(templates.columns, self._cut(grey, raw[strange]).columns, strict=True):
+            column = old.copy()
+            column[strange] = new
+            columns.append(column)
+        return Templates(*columns)
+
+    def _cut(self, grey: Floats, raw: Array) -> Templates:
+        at, ones = raw.astype(np.float32).reshape(-1, 2), np.ones(len(raw), np.float32)
+        looks, spread = self._normalised(self._sampled(grey, at, ones))
+        right, down = (
+            (self._sampled(grey, at + half, ones) - self._sampled(grey, at - half, ones)) / spread
+            for half in (np.array([0.5, 0.0], np.float32), np.array([0.0, 0.5], np.float32))
+        )
+        growth = right * self._spots[:, 0] + down * self._spots[:, 1]
+        slopes = np.stack([right, down, growth], axis=1)
+        # A change along 1 or along the looks themselves is one of brightness or contrast, and no motion.
+        slopes = slopes - np.einsum("nip,p->ni", slopes, self._weights)[..., None]
+        alike = np.einsum("nip,np,p->ni", slopes, looks, self._weights)
+        slopes = slopes - alike[..., None] * looks[:, None]
+        weighted = slopes * self._weights
+        normal = np.einsum("nip,njp->nij", weighted, slopes) + RIDGE * np.eye(3, dtype=np.float32)
+        return Templates(looks, weighted, np.linalg.inv(normal).astype(np.float32), ones)
+
+    def _sampled(self, grey: Floats, at: Floats, scales: Floats) -> Floats:
+        """(N, P) grey levels of the patches around points, bilinear; beyond the border that of the border."""
+        if not len(at):
+            return np.zeros((0, len(self._spots)), np.float32)
+        x, y = (at[:, axis, None] + scales[:, None] * self._spots[:, axis] for axis in (0, 1))
+        found = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found, dtype=np.float32)
+
+    def _normalised(self, grey: Floats) -> tuple[Floats, Floats]:
+        """(N, P) with mean 0 and deviation 1, and (N, 1) the deviation it had."""
+        centred = grey - np.einsum("np,p->n", grey, self._weights)[:, None]
+        spread = np.sqrt(np.einsum("np,np,p->n", centred, centred, self._weights))[:, None]
+        spread = np.maximum(spread, np.float32(FAINT))
+        return centred / spread, spread
