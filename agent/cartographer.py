@@ -208,9 +208,10 @@ class Cartographer:
             ahead = view_from_robot.apply(known.points_in_robot[row])[:, 0] - camera.mount_forward
             axis = view_from_robot.rotation[0]
             spread = np.einsum("i,nij,j->n", axis, known.covariances_in_robot[row][:, :2, :2], axis)
-            seen = ahead > 0.05
-            depths[seat[seen]] = ahead[seen]
-            sigmas[seat[seen]] = np.sqrt(np.maximum(spread[seen], 1e-12))
+            # What the filter has followed for a moment only is known better by all its sightings.
+            sure = (ahead > 0.05) & (np.sqrt(np.maximum(spread, 0.0)) < s.depth_share * ahead)
+            depths[seat[sure]] = ahead[sure]
+            sigmas[seat[sure]] = np.sqrt(np.maximum(spread[sure], 1e-12))
         with np.errstate(invalid="ignore"):
             good = np.flatnonzero((depths > 0.05) & (sigmas < s.depth_share * depths))[: s.most_landmarks]
         # Tracks err alike for a while, which neither filter nor triangulation knows.

@@ -30,6 +30,8 @@ class TrackingSettings:
         tracker: of image points.
         filter: the mapping EKF.
         filtered: landmarks in the EKF; further tracks are triangulated against its trajectory.
+        refill: with fewer left than this, further tracks are taken into the EKF: those that were chosen first
+            may all be on the side that the robot turns away from.
         least_filtered: with fewer landmarks in view the wheels are trusted alone.
         least_spread: likewise if they cover less than this share of the image's width.
         associate_px: a feature this near to a track is the same point.
@@ -49,6 +51,7 @@ class TrackingSettings:
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
     filtered: int = 36
+    refill: int = 18
     least_filtered: int = 5
     least_spread: float = 0.2
     associate_px: float = 1.5
@@ -95,6 +98,7 @@ class Tracking:
         self._since_believed = Pose2()
         self._misses_px: Array = np.zeros((0, 2))
         self._strikes: dict[int, int] = {}
+        self._expected_depth = 1.0
         self._next_track = 1
 
     @property
@@ -164,6 +168,8 @@ class Tracking:
             update = self._filter.update(ids, pixels)
             self._misses_px = update.innovations_px[update.accepted]
             self._judge(ids, update.accepted)
+        if len(self._filter.ids) < self._settings.refill:
+            self._fill()
         self.remember()
 
     def remember(self, force: bool = False) -> None:
@@ -181,17 +187,10 @@ class Tracking:
         ids = np.arange(self._next_track, self._next_track + int(new.sum()), dtype=np.int64)
         self._next_track += len(ids)
         view.tracks[new] = ids
-        taken = self._tracker.pixels[np.isin(self._tracker.ids, self._filter.ids)]
         self._tracker.add(ids, view.features.raw[new])
         self._strikes = {int(track): 0 for track in self._tracker.ids}
-        room = self._settings.filtered - len(self._filter.ids)
-        if room > 0 and len(ids):
-            pixels = view.features.pixels[new]
-            chosen = even_choice(pixels, taken, room)
-            inverse_depths = np.full(len(chosen), 1.0 / expected_depth)
-            nearest = self._settings.prior_near / max(self._camera.mount_height, 0.05)
-            sigmas = np.maximum(self._settings.prior_spread * inverse_depths, nearest)
-            self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
+        self._expected_depth = expected_depth
+        self._fill(first=int(ids[0]) if len(ids) else self._next_track)
         self.remember(force=True)
 
     def reanchor(self) -> PoseGaussian:
@@ -200,6 +199,23 @@ class Tracking:
         self._dispute.settle()
         self.history.reanchor(moved.mean, self._tracker.ids)
         return moved
+
+    def _fill(self, first: int = 0) -> None:
+        """Give the filter an even choice of the tracks that it does not hold, from a first one on.
+
+        What was seen of them before is in the history alone: to the filter they are new.
+        """
+        room = self._settings.filtered - len(self._filter.ids)
+        inside = np.isin(self._tracker.ids, self._filter.ids)
+        candidates = ~inside & (self._tracker.ids >= first)
+        if room <= 0 or not candidates.any():
+            return
+        ids, pixels = self._tracker.ids[candidates], self._tracker.pixels[candidates]
+        chosen = even_choice(pixels, self._tracker.pixels[inside], room)
+        inverse_depths = np.full(len(chosen), 1.0 / self._expected_depth)
+        nearest = self._settings.prior_near / max(self._camera.mount_height, 0.05)
+        sigmas = np.maximum(self._settings.prior_spread * inverse_depths, nearest)
+        self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
 
     def _frozen(self, image: NDArray[np.uint8]) -> bool:
         """Whether an image is the last one again, to the last grey level, although the wheels have moved.
