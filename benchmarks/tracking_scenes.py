@@ -85,7 +85,7 @@ def wall_drive(rng: np.random.Generator, frames: int) -> Drive:
     camera, name = WEBCAM, str(rng.choice(PHOTOGRAPHS))
     picture = _wide(getattr(skimage.data, name)())
     depth, slant = rng.uniform(1.2, 2.6), rng.uniform(-0.6, 0.6)
-    to_images = [_wall_to_image(picture, depth, slant, pose) for pose in way(rng, frames)]
+    to_images = [wall_to_image(picture, depth, slant, pose) for pose in way(rng, frames)]
     gamma, blur, noise = rng.uniform(0.7, 1.4), rng.uniform(0.4, 0.9), rng.uniform(1.0, 3.0)
     dimming, lights = rng.uniform(0.0, 0.15), rng.uniform(4.0, 12.0)
     images = []
@@ -112,7 +112,7 @@ def _wide(picture: Image) -> Image:
     return np.asarray(wide, dtype=np.uint8)
 
 
-def _wall_to_image(picture: Image, depth: float, slant: float, pose: Pose2) -> Array:
+def wall_to_image(picture: Image, depth: float, slant: float, pose: Pose2) -> Array:
     """(3, 3) homography from the pixels of a picture to those of a robot's image.
 
     Args:
