@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +68,7 @@ class Localizer:
             landmarks.astype(np.int64),
             node.points_in_robot[landmarks],
             node.landmarks.covariances_in_robot(node.camera)[landmarks],
-            settings=self._settings.filter,
+            settings=replace(self._settings.filter, side_slip=description.side_slip),
         )
 
     @property

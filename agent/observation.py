@@ -76,6 +76,8 @@ class RobotDescription:
         radius: of the robot's footprint, m.
         axle: distance between the wheels L, m.
         wheel_noise: standard deviation of a wheel's way, as a share of the way: sigma of the paper.
+        side_slip: standard deviation of the slip aside in a step, as a share of the way: two wheels never
+            quite agree, and no encoder sees that.
         ranger_bearings: (K,) rad, directions of the proximity sensors, 0 ahead, positive to the left.
         ranger_reach: the rangers' maximum, m.
         ranges_see_robots: whether the rangers are low enough to see other robots of the fleet. Then what they
@@ -92,6 +94,7 @@ class RobotDescription:
     radius: float = 0.16
     axle: float = 0.24
     wheel_noise: float = 0.02
+    side_slip: float = 0.005
     ranger_bearings: tuple[float, ...] = ()
     ranger_reach: float = 0.0
     max_forward: float = 0.3

@@ -86,9 +86,8 @@ class Tracking:
         self._camera = description.camera
         self._settings = settings
         self._tracker = Tracker(lens, settings.tracker)
-        self._filter = MappingFilter(
-            description.camera, description.axle, description.wheel_noise, settings.filter
-        )
+        own = replace(settings.filter, side_slip=description.side_slip)
+        self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
         # Two images are compared by points that live for one step: nothing to hold them to.
         once = replace(settings.tracker, anchored=False)
         self._continuity = Continuity(lens, description.camera, once, settings.continuity)

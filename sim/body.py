@@ -25,6 +25,8 @@ CASTER_AT = 0.11
 """Casters ahead of and behind the axle, m."""
 CASTER_GAP = 5e-5
 """Casters end above the wheels' lowest points, else a robot with small wheels stands on casters alone, m."""
+SLIP_WANDERS = 1.0
+"""Time after which slip has forgotten what it was, s."""
 EPISODE_TICKS = 10
 """A collision is over when the robot has touched nothing for so long."""
 
@@ -64,6 +66,13 @@ class BodySettings:
         }  # fmt: skip
         for name, (low, high) in within.items():
             check_range(f"body: {name}", getattr(self, name), low, high)
+
+    def wheel_noise(self, tick: float) -> float:
+        """What a calibration drive would give for a wheel's noise, as a share of the way of a tick (s).
+
+        Slip is alike from tick to tick; over a way its errors add up as those of so much noise that is not.
+        """
+        return self.slip * math.sqrt(2.0 * SLIP_WANDERS / tick)
 
 
 class Body:
@@ -156,7 +165,7 @@ class Body:
         turn = float(np.clip(command.turn, -d.max_turn, d.max_turn))
         self._targets = np.array([forward - turn * d.axle / 2, forward + turn * d.axle / 2]) / WHEEL_RADIUS
         # Slip is a property of floor and tyre: it wanders and the encoders do not see it.
-        keep = math.exp(-d.tick / 1.0)
+        keep = math.exp(-d.tick / SLIP_WANDERS)
         fresh = self._rng.standard_normal(2) * self._settings.slip * math.sqrt(1.0 - keep**2)
         self._slips = keep * self._slips + fresh
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agent.observation import RobotDescription
@@ -69,8 +69,10 @@ class RobotSetup:
 
     def describe(self) -> RobotDescription:
         """What the robot's agent is told."""
-        return RobotDescription(
-            camera=self.camera.intrinsics,
+        ideal = RobotDescription(self.camera.intrinsics)
+        return replace(
+            ideal,
+            wheel_noise=math.hypot(ideal.wheel_noise, self.body.wheel_noise(ideal.tick)),
             distortion=self.camera.distortion,
             ranger_bearings=tuple(k * math.tau / self.rangers for k in range(self.rangers)),
             ranger_reach=self.ranger_reach if self.rangers else 0.0,

@@ -27,13 +27,13 @@ def transition(
 
     Returns:
         Posture and rays after; (n,) depth after over depth before; (1 + n, 3, 3) blocks of the Jacobian by
-        the state, of the posture and of each landmark; (3 + 3n, 2) Jacobian by (u1, u2).
+        the state, of the posture and of each landmark; (3 + 3n, 3) Jacobian by (u1, u2, u3).
     """
     step = Odometry(forward, turn)
     moved_posture, by_posture, posture_by_input = move_posture(posture, step)
     moved = move_rays(rays, step, mount_forward)
     blocks = np.concatenate([by_posture[None], moved.by_ray])
-    by_input = np.concatenate([posture_by_input, moved.by_input.reshape(-1, 2)])
+    by_input = np.concatenate([posture_by_input, moved.by_input.reshape(-1, 3)])
     return moved_posture, moved.rays, moved.scale, blocks, by_input
 
 
@@ -43,7 +43,7 @@ def propagate(covariance: Array, transitions: Array, root: Array, variances: Arr
     Args:
         covariance: P before.
         transitions: (1 + n, 3, 3) blocks of A: of the posture, then of each landmark.
-        root: (3 + 3n, 2) G, how the two wheels' errors enter.
+        root: (3 + 3n, 3) G, how the errors of the wheels and the slip aside enter.
         variances: (3,) of the posture, the diagonal of Q.
     """
     blocks, size = len(transitions), len(covariance)
@@ -121,12 +121,12 @@ def pull(by_input: Array, slots: NDArray[np.intp], information: Array, residual:
     """(2, 3) what the residuals of some landmarks say of the two inputs: B_M^T S^-1 [B_M, r].
 
     Args:
-        by_input: (3 + 3n, 2) B.
+        by_input: (3 + 3n, 3) B, of which the first two columns count.
         slots: (m,) which landmarks.
         information: (2m, 2m) inverse of S.
         residual: (2m,) measured minus expected.
     """
-    lever = by_input[measured(slots)]
+    lever = by_input[measured(slots), :2]
     return np.asarray(lever.T @ information @ np.column_stack([lever, residual]), np.float64)
 
 

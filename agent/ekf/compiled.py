@@ -63,7 +63,7 @@ def transition(
     tx_turn = -0.5 * forward * sh - mount_forward * s
     ty_turn = 0.5 * forward * ch + mount_forward * c
     posture_after, after, scale = np.empty(3), np.empty((n, 3)), np.empty(n)
-    blocks, by_input = np.zeros((n + 1, 3, 3)), np.empty((3 + 3 * n, 2))
+    blocks, by_input = np.zeros((n + 1, 3, 3)), np.empty((3 + 3 * n, 3))
     course_c, course_s = math.cos(posture[2] + 0.5 * turn), math.sin(posture[2] + 0.5 * turn)
     posture_after[0] = posture[0] + forward * course_c
     posture_after[1] = posture[1] + forward * course_s
@@ -73,6 +73,7 @@ def transition(
     by_input[0, 0], by_input[0, 1] = course_c, -0.5 * forward * course_s
     by_input[1, 0], by_input[1, 1] = course_s, 0.5 * forward * course_c
     by_input[2, 0], by_input[2, 1] = 0.0, 1.0
+    by_input[0, 2], by_input[1, 2], by_input[2, 2] = -course_s, course_c, 0.0
     for i in range(n):
         a, b, w = rays[i, 0], rays[i, 1], rays[i, 2]
         ahead, right = 1.0 - tx * w, a + ty * w
@@ -94,6 +95,9 @@ def transition(
         by_input[row, 1] = (w * (c * ty_turn - s * tx_turn) + d - a2 * d_turn) * q
         by_input[row + 1, 0], by_input[row + 1, 1] = -b2 * d_forward * q, -b2 * d_turn * q
         by_input[row + 2, 0], by_input[row + 2, 1] = -w2 * d_forward * q, -w2 * d_turn * q
+        d_aside = w * (c * sh - s * ch)
+        by_input[row, 2] = (w * (s * sh + c * ch) - a2 * d_aside) * q
+        by_input[row + 1, 2], by_input[row + 2, 2] = -b2 * d_aside * q, -w2 * d_aside * q
     return posture_after, after, scale, blocks, by_input
 
 
@@ -111,13 +115,13 @@ def propagate(covariance: Array, transitions: Array, root: Array, variances: Arr
                     t0 * covariance[3 * i, k] + t1 * covariance[3 * i + 1, k] + t2 * covariance[3 * i + 2, k]
                 )
     for row in range(size):
-        g0, g1 = root[row, 0], root[row, 1]
+        g0, g1, g2 = root[row, 0], root[row, 1], root[row, 2]
         for j in range(row // 3 + 1):
             h0, h1, h2 = half[row, 3 * j], half[row, 3 * j + 1], half[row, 3 * j + 2]
             for c in range(3):
                 out[row, 3 * j + c] = (
                     h0 * transitions[j, c, 0] + h1 * transitions[j, c, 1] + h2 * transitions[j, c, 2]
-                    + g0 * root[3 * j + c, 0] + g1 * root[3 * j + c, 1]
+                    + g0 * root[3 * j + c, 0] + g1 * root[3 * j + c, 1] + g2 * root[3 * j + c, 2]
                 )  # fmt: skip
     for r in range(3):
         out[r, r] += variances[r]

@@ -31,6 +31,7 @@ class LocalizationSettings:
     Attributes:
         pixel_sigma: standard deviation of a tracked pixel, px.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
+        side_slip: standard deviation of the slip aside of a step, as a share of the wheels' way.
         gate_probability: share of true measurements that each gate lets pass.
         iterations: linearisations of one update at most; a second is made only if the first did not hold.
         linear_px: a pixel whose second-order part stays below this is linear, px.
@@ -49,6 +50,7 @@ class LocalizationSettings:
 
     pixel_sigma: float = 0.7
     wheel_floor: float = 1e-5
+    side_slip: float = 0.0
     gate_probability: float = 0.999
     iterations: int = 4
     linear_px: float = 0.1
@@ -116,7 +118,8 @@ class LocalizationFilter:
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels. The landmarks stand still in the node's frame."""
         posture, by_posture, by_input = move_posture(self._state.posture, odometry)
-        noise = by_input @ self._wheels.root(odometry)
+        aside = self.settings.side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
+        noise = np.column_stack([by_input[:, :2] @ self._wheels.root(odometry), aside * by_input[:, 2]])
         p = self._state.covariance.copy()
         p[:3, 3:] = by_posture @ p[:3, 3:]
         p[3:, :3] = p[:3, 3:].T

@@ -75,7 +75,8 @@ class MappingFilter:
             self._distrust -= 1
             root = self._wheels.refuted_root(odometry, 1.0, self.settings.slip[0])
         mount = self._camera.mount_forward
-        taken = Step.predict(self.state, odometry, root, self._posture_variances, mount)
+        aside = self.settings.side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
+        taken = Step.predict(self.state, odometry, root, aside, self._posture_variances, mount)
         stays = kernels.ahead(taken.rays, taken.scale, self.settings.nearest, self.settings.widest_slope)
         if not stays.all():
             self.lost += int((~stays).sum())

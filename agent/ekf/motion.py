@@ -70,21 +70,23 @@ class WheelNoise:
         return np.array([[0.5 * right, 0.5 * left], [right / self.axle, -left / self.axle]])
 
 
-def move_posture(posture: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
+def move_posture(posture: Array, odometry: Odometry, aside: float = 0.0) -> tuple[Array, Array, Array]:
     """Move a posture by one step of the wheels.
 
     Args:
         posture: (3,) [x m, y m, heading rad] in any fixed frame.
         odometry: the step.
+        aside: u3, how far the robot slips to the left of its way, m.
 
     Returns:
-        The posture after, (3,); its Jacobians by the posture before, (3, 3), and by (u1, u2), (3, 2).
+        The posture after, (3,); its Jacobians by the posture before, (3, 3), and by (u1, u2, u3), (3, 3).
     """
     u1, u2 = odometry.forward, odometry.turn
     c, s = math.cos(posture[2] + 0.5 * u2), math.sin(posture[2] + 0.5 * u2)
-    after = posture + np.array([u1 * c, u1 * s, u2])
-    by_posture = np.array([[1.0, 0.0, -u1 * s], [0.0, 1.0, u1 * c], [0.0, 0.0, 1.0]])
-    by_input = np.array([[c, -0.5 * u1 * s], [s, 0.5 * u1 * c], [0.0, 1.0]])
+    x, y = u1 * c - aside * s, u1 * s + aside * c
+    after = posture + np.array([x, y, u2])
+    by_posture = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    by_input = np.array([[c, -0.5 * y, -s], [s, 0.5 * x, c], [0.0, 1.0, 0.0]])
     return after, by_posture, by_input
 
 
@@ -95,7 +97,7 @@ class RayMotion:
     Attributes:
         rays: (N, 3) [a, b, w 1/m] in the camera after the step.
         by_ray: (N, 3, 3) Jacobian by the landmark before.
-        by_input: (N, 3, 2) Jacobian by (u1, u2).
+        by_input: (N, 3, 3) Jacobian by (u1, u2, u3).
         scale: (N,) D, depth after over depth before; not positive for landmarks now behind the camera,
             whose other figures mean nothing.
     """
@@ -106,41 +108,43 @@ class RayMotion:
     scale: Array
 
 
-def move_rays(rays: Array, odometry: Odometry, mount_forward: float) -> RayMotion:
+def move_rays(rays: Array, odometry: Odometry, mount_forward: float, aside: float = 0.0) -> RayMotion:
     """See landmarks from where the camera stands after one step of the wheels.
 
     Args:
         rays: (N, 3) [a, b, w 1/m] in the camera before the step.
         odometry: the step.
         mount_forward: of the optical centre ahead of the axle, m.
+        aside: u3, how far the robot slips to the left of its way, m.
     """
-    u1, u2 = odometry.forward, odometry.turn
+    u1, u2, m = odometry.forward, odometry.turn, mount_forward
     c, s = math.cos(u2), math.sin(u2)
     ch, sh = math.cos(0.5 * u2), math.sin(0.5 * u2)
-    tx, ty = u1 * ch + mount_forward * (c - 1.0), u1 * sh + mount_forward * s
-    tx_by = np.array([ch, -0.5 * u1 * sh - mount_forward * s])
-    ty_by = np.array([sh, 0.5 * u1 * ch + mount_forward * c])
+    along, across = u1 * ch - aside * sh, u1 * sh + aside * ch
+    tx, ty = along + m * (c - 1.0), across + m * s
+    # Derivatives of the camera's way by (u1, u2, u3).
+    tx_by = np.array([ch, -0.5 * across - m * s, -sh])
+    ty_by = np.array([sh, 0.5 * along + m * c, ch])
     a, w = rays[:, 0], rays[:, 2]
     ahead, right = 1.0 - tx * w, a + ty * w
     scale = c * ahead - s * right
+    inverse = 1.0 / np.where(np.abs(scale) > 1e-9, scale, 1e-9)
     after = rays.copy()
     after[:, 0] = s * ahead + c * right
-    after /= np.where(np.abs(scale) > 1e-9, scale, 1e-9)[:, None]
+    after *= inverse[:, None]
     # Each new coordinate is a quotient n / D, so its derivative is (dn - (n / D) dD) / D.
-    inverse = 1.0 / np.where(np.abs(scale) > 1e-9, scale, 1e-9)
-    scale_by_w = -c * tx - s * ty
     by_ray = np.empty((len(rays), 3, 3))
     by_ray[:, :, 0] = s * after
     by_ray[:, :, 1] = 0.0
-    by_ray[:, :, 2] = -scale_by_w * after
+    by_ray[:, :, 2] = (c * tx + s * ty) * after
     by_ray[:, 0, 0] += c
     by_ray[:, 0, 2] += c * ty - s * tx
     by_ray[:, 1, 1] = 1.0
     by_ray[:, 2, 2] += 1.0
     by_ray *= inverse[:, None, None]
-    scale_by_input = -w[:, None] * (c * tx_by + s * ty_by)
-    scale_by_input[:, 1] -= s * ahead + c * right
-    by_input = -after[:, :, None] * scale_by_input[:, None, :]
+    scale_by = -w[:, None] * (c * tx_by + s * ty_by)
+    scale_by[:, 1] -= s * ahead + c * right
+    by_input = -after[:, :, None] * scale_by[:, None, :]
     by_input[:, 0, :] += w[:, None] * (c * ty_by - s * tx_by)
     by_input[:, 0, 1] += scale
     by_input *= inverse[:, None, None]

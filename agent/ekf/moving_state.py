@@ -116,6 +116,7 @@ class Step:
         before: state before the step.
         measured: what the wheels say.
         wheel_root: (2, 2) root of the covariance S of (u1, u2).
+        side_slip: sigma of u3, m.
         posture_variances: (3,) process noise of the posture, the diagonal of Q.
         mount_forward: of the optical centre ahead of the axle, m.
         at: where the step is linearised: as measured, or a better guess.
@@ -123,12 +124,13 @@ class Step:
         rays: (n, 3) expected after the step.
         scale: (n,) depth after over depth before; not positive for landmarks now behind the camera.
         blocks: (1 + n, 3, 3) Jacobian of the state after by the state before.
-        by_input: (3 + 3n, 2) Jacobian of the state after by (u1, u2).
+        by_input: (3 + 3n, 3) Jacobian of the state after by (u1, u2, u3), u3 the slip aside.
     """
 
     before: MovingState
     measured: Odometry
     wheel_root: Array
+    side_slip: float
     posture_variances: Array
     mount_forward: float
     at: Odometry
@@ -143,6 +145,7 @@ class Step:
         before: MovingState,
         measured: Odometry,
         wheel_root: Array,
+        side_slip: float,
         posture_variances: Array,
         mount_forward: float,
         at: Odometry | None = None,
@@ -153,17 +156,19 @@ class Step:
             before.posture, before.rays, guess.forward, guess.turn, mount_forward
         )
         if at is not None:
-            shift = by_input @ np.array([measured.forward - at.forward, measured.turn - at.turn])
+            shift = by_input[:, :2] @ np.array([measured.forward - at.forward, measured.turn - at.turn])
             posture, rays = posture + shift[:3], rays + shift[3:].reshape(-1, 3)
         return Step(
-            before, measured, wheel_root, posture_variances, mount_forward, guess, posture, rays, scale,
-            blocks, by_input,
+            before, measured, wheel_root, side_slip, posture_variances, mount_forward, guess, posture, rays,
+            scale, blocks, by_input,
         )  # fmt: skip
 
     @cached_property
     def state(self) -> MovingState:
         """After the step: P- = A P A^T + B S B^T + Q of paper-notes."""
-        root = self.by_input @ self.wheel_root
+        mixing = np.zeros((3, 3))
+        mixing[:2, :2], mixing[2, 2] = self.wheel_root, self.side_slip
+        root = self.by_input @ mixing
         covariance = kernels.propagate(self.before.covariance, self.blocks, root, self.posture_variances)
         return MovingState(self.posture, self.rays, covariance)
 
@@ -171,8 +176,9 @@ class Step:
         """The same step linearised elsewhere, or with the wheels believed less."""
         root = self.wheel_root if wheel_root is None else wheel_root
         return Step.predict(
-            self.before, self.measured, root, self.posture_variances, self.mount_forward, at or self.at
-        )
+            self.before, self.measured, root, self.side_slip, self.posture_variances, self.mount_forward,
+            at or self.at,
+        )  # fmt: skip
 
     def seems(self, slots: NDArray[np.intp], slopes: Array, most: float) -> Odometry:
         """Where to linearise, at a first glance at the image: a quarter of the landmarks may be wrong.

@@ -12,6 +12,7 @@ class FilterSettings:
     Attributes:
         pixel_sigma: standard deviation of a tracked pixel, px.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
+        side_slip: standard deviation of the slip aside of a step, as a share of the wheels' way.
         posture_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
         slip_sigmas: wheels that an image refutes by more than this have slipped.
         slip: sigma of (forward m, turn rad) of a step whose wheels the landmarks refute.
@@ -33,6 +34,7 @@ class FilterSettings:
 
     pixel_sigma: float = 0.7
     wheel_floor: float = 1e-5
+    side_slip: float = 0.0
     posture_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     slip_sigmas: float = 4.5
     slip: tuple[float, float] = (0.1, 0.2)

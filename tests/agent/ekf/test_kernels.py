@@ -57,7 +57,7 @@ def test_transition(size: tuple[int, int], step: tuple[float, float, float]) -> 
 def test_propagate(size: tuple[int, int]) -> None:
     n, _ = size
     rng, _, _, covariance = scene(*size)
-    blocks, root, variances = rng.normal(size=(n + 1, 3, 3)), rng.normal(size=(3 + 3 * n, 2)), rng.random(3)
+    blocks, root, variances = rng.normal(size=(n + 1, 3, 3)), rng.normal(size=(3 + 3 * n, 3)), rng.random(3)
     dense = np.zeros_like(covariance)
     for i in range(n + 1):
         dense[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = blocks[i]
@@ -86,7 +86,7 @@ def test_update_is_the_textbook_one(size: tuple[int, int]) -> None:
     joseph = np.eye(len(covariance))
     joseph[:, index] -= gain
     after = joseph @ covariance @ joseph.T + gain @ noise @ gain.T
-    by_input = rng.normal(size=(len(covariance), 2))
+    by_input = rng.normal(size=(len(covariance), 3))
     for form in FORMS:
         np.testing.assert_array_equal(form.spread(covariance, slots, variances), expected_spread)
         inverse = form.inverse(expected_spread)
@@ -96,7 +96,7 @@ def test_update_is_the_textbook_one(size: tuple[int, int]) -> None:
         assert np.array_equal(got, got.T)
         np.testing.assert_allclose(step, gain @ residual, atol=1e-9)
         close(got, after, covariance)
-        lever = by_input[index]
+        lever = by_input[index, :2]
         pulled = form.pull(by_input, slots, information, residual)
         np.testing.assert_allclose(
             pulled, (lever.T @ information @ np.column_stack([lever, residual])), atol=1e-8

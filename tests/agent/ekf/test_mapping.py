@@ -47,11 +47,30 @@ def test_prediction_is_the_dense_form(camera: Camera) -> None:
     a[:3, :3] = by_posture
     for i in range(n):
         a[3 + 3 * i : 6 + 3 * i, 3 + 3 * i : 6 + 3 * i] = moved.by_ray[i]
-    b = np.vstack([posture_by, moved.by_input.reshape(-1, 2)])
+    b = np.vstack([posture_by, moved.by_input.reshape(-1, 3)])[:, :2]
     root = WheelNoise(AXLE, WHEEL_NOISE).root(step)
     dense = a @ before.covariance @ a.T + b @ root @ root.T @ b.T
     np.testing.assert_allclose(filter_.state.covariance, dense, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(filter_.state.posture, posture)
+
+
+def test_slip_aside_moves_robot_and_landmarks_alike() -> None:
+    """Against samples: robots that slip aside by chance, each with the landmarks as it then sees them."""
+    run, step, share = a_run(), Odometry(0.05, 0.1), 0.2
+    filter_ = start(run, side_slip=share)
+    before = filter_.state
+    plain = start(run)
+    for each in (filter_, plain):
+        each.predict(step)
+    more = filter_.state.covariance - plain.state.covariance
+    sigma = share * (step.forward + AXLE * step.turn)
+    rng = np.random.default_rng(0)
+    samples = []
+    for aside in sigma * rng.normal(size=4000):
+        posture, _, _ = move_posture(before.posture, step, aside)
+        rays = move_rays(before.rays, step, CAMERA.mount_forward, aside).rays
+        samples.append(np.concatenate([posture, rays.ravel()]))
+    np.testing.assert_allclose(more, np.cov(np.array(samples).T), atol=0.06 * np.abs(more).max())
 
 
 def test_update_is_the_textbook_kalman_update() -> None:

@@ -62,7 +62,8 @@ def test_jacobians_of_rays(step: Odometry, mount: float, seed: int) -> None:
         by_ray = derivative(lambda r: move_rays(r[None], step, mount).rays[0], ray)
         np.testing.assert_allclose(moved.by_ray[i], by_ray, rtol=1e-5, atol=1e-7)
     by_input = derivative(
-        lambda u: move_rays(rays, Odometry(u[0], u[1]), mount).rays, np.array([step.forward, step.turn])
+        lambda u: move_rays(rays, Odometry(u[0], u[1]), mount, u[2]).rays,
+        np.array([step.forward, step.turn, 0.0]),
     )
     np.testing.assert_allclose(moved.by_input, by_input, rtol=1e-5, atol=1e-7)
 
@@ -75,8 +76,8 @@ def test_posture_moves_by_composition_and_its_jacobians(step: Odometry, x: float
     np.testing.assert_allclose(after[:2], expected.vector[:2], atol=1e-12)
     assert abs(np.sin(after[2] - expected.heading)) < 1e-12
     np.testing.assert_allclose(by_posture, derivative(lambda p: move_posture(p, step)[0], posture), atol=1e-8)
-    u = np.array([step.forward, step.turn])
-    numeric = derivative(lambda v: move_posture(posture, Odometry(v[0], v[1]))[0], u)
+    u = np.array([step.forward, step.turn, 0.0])
+    numeric = derivative(lambda v: move_posture(posture, Odometry(v[0], v[1]), v[2])[0], u)
     np.testing.assert_allclose(by_input, numeric, atol=1e-8)
 
 
