@@ -8,21 +8,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
-from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question, WhereAmI
+from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
 from agent.pipeline import Status
+from agent.questions import decode_answer, encode_question
 from hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from wire.bus import Bus, Request
 from wire.keys import Keys
 from wire.log_messages import Scalar, decode_record, encode_record
-from wire.messages import (
-    RouteRequest,
-    decode_relocalize_answer,
-    decode_route_answer,
-    encode_route_request,
-    encode_view,
-)
 from wire.metered import MeteredBus
 
 NO_ANSWER = "no map server answered"
@@ -281,7 +275,7 @@ class FleetLink:
 
     def _answer(self, question: Question) -> Answer:
         try:
-            key, payload = self._encoded(question)
+            key, payload = encode_question(self._keys, question)
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
         replies = self._bus.ask(key, payload, self._timeout)
@@ -291,16 +285,7 @@ class FleetLink:
                 error = reply.error
                 continue
             try:
-                if isinstance(question, WhereAmI):
-                    return Answer(question.number, decode_relocalize_answer(reply.payload))
-                return Answer(question.number, decode_route_answer(reply.payload))
+                return Answer(question.number, decode_answer(question, reply.payload))
             except MapweaveError as refused:
                 error = str(refused)
         return Answer(question.number, None, error)
-
-    def _encoded(self, question: Question) -> tuple[str, bytes]:
-        """Whom to ask, and how; raises InvalidValue for what no message can hold."""
-        if isinstance(question, WhereAmI):
-            return self._keys.any_relocalize(), encode_view(question.view)
-        request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
-        return self._keys.any_route(), encode_route_request(request)

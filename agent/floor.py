@@ -96,9 +96,16 @@ class Floor:
     def _enough(self) -> float:
         return self._description.radius + self._settings.clearance
 
-    def unknown_around(self, radius: float) -> Array:
-        """For each cell the share of unknown cells within a radius (m): how much is to be seen from there."""
+    def unknown_around(self, radius: float, told: Array) -> Array:
+        """For each cell the share of unknown cells around it: how much is to be seen from there.
+
+        Args:
+            radius: half the side of the square that is looked at, m.
+            told: (N, 2) m in map; somebody else knows the floor within the radius of these.
+        """
         unknown = (np.abs(self._odds) <= 0.3).astype(np.float32)
+        for row, column in self.cells(told):
+            cv2.circle(unknown, (int(column), int(row)), round(radius / self._settings.cell), 0.0, -1)
         side = 2 * round(radius / self._settings.cell) + 1
         return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
 

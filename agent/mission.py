@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hybridmap.node import NodeId
+from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
-from hybridmap.query import RelocalizeAnswer, RouteAnswer, View
+from hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer, View
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,26 @@ class WhichWay:
     blocked: tuple[tuple[NodeId, NodeId], ...] = ()
 
 
-Question = WhereAmI | WhichWay
+@dataclass(frozen=True)
+class WhatIsKnown:
+    """Question to the fleet's map: what have others mapped around here?
+
+    Attributes:
+        number: of the question; the answer repeats it.
+        map: the robot's own.
+        x: of the middle, m, in that map.
+        y: of the middle, m, in that map.
+        reach: how far around, m.
+    """
+
+    number: int
+    map: MapId
+    x: float
+    y: float
+    reach: float
+
+
+Question = WhereAmI | WhichWay | WhatIsKnown
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,5 +88,5 @@ class Answer:
     """What came back. `content` is None when nobody answered; `error` says what is known of the reason."""
 
     number: int
-    content: RelocalizeAnswer | RouteAnswer | None
+    content: RelocalizeAnswer | RouteAnswer | KnownAnswer | None
     error: str = ""

@@ -14,7 +14,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from agent.explorer import Explorer, ExplorerSettings
+from agent.exploration import ExplorerSettings
+from agent.explorer import Explorer
 from agent.floor import Floor, FloorSettings
 from agent.mapper import Mapper, MapperSettings
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
@@ -25,6 +26,7 @@ from agent.resumption import Resumption, ResumptionSettings
 from agent.servo.proximity import guard
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
+from agent.wanderer import Wanderer
 from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -118,6 +120,7 @@ class Pipeline:
             contents: of the map, as `Journal.resume` gives it.
             next_number: the first that no node or edge of the map has ever had.
         """
+        self._map_id = map_id
         self._settings = settings or PipelineSettings()
         self._description = description
         lens = Lens(description)
@@ -186,7 +189,7 @@ class Pipeline:
             case Explore() | Carried() if self._mapper.astray:
                 command = self._resume(observation)
             case Explore() | Carried():
-                command, changes = self._map(observation)
+                command, changes, questions = self._map(observation, answers)
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers)
         safe, warning = guard(command, observation.proximity, self._description)
@@ -197,8 +200,9 @@ class Pipeline:
         return Step(safe, tuple(changes), tuple(questions), self._status(warning))
 
     def _new_explorer(self) -> Explorer:
-        settings = self._settings
-        return Explorer(self._description, self._mapper, self._floor, settings.explorer, settings.seed)
+        settings, parts = self._settings, (self._map_id, self._description, self._mapper, self._floor)
+        kind = Wanderer if settings.explorer.wander else Explorer
+        return kind(*parts, settings.explorer, settings.seed)
 
     def _keep_up(self, observation: Observation) -> None:
         """Let the mapper see; it may find out that the robot was carried off."""
@@ -207,16 +211,18 @@ class Pipeline:
         if started and not self._mapper.started:
             self._lose()
 
-    def _map(self, observation: Observation) -> tuple[Command, list[ChangeBody]]:
+    def _map(
+        self, observation: Observation, answers: tuple[Answer, ...]
+    ) -> tuple[Command, list[ChangeBody], list[Question]]:
         self._keep_up(observation)
         if self._mapper.doubtful or self._mapper.astray:
-            return Command(), []
+            return Command(), [], []
         if isinstance(self._mission, Carried):
             assert self._passenger is not None
-            return Command(), self._passenger.step(observation)
+            return Command(), self._passenger.step(observation), []
         assert self._explorer is not None
         self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
-        return self._explorer.step(observation)
+        return self._explorer.step(observation, answers)
 
     def _resume(self, observation: Observation) -> Command:
         """Find the robot on its own map; then map on from there."""

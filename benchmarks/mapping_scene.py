@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from agent.cartographer import HERE
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings
-from agent.explorer import ExplorerSettings
+from agent.exploration import ExplorerSettings
 from agent.mapper import MapperSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.servo.image_drive import ImageDrive, ImageDriveSettings

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.node import EdgeKind, Node, NodeId
-from hybridmap.pose import PoseGaussian
+from hybridmap.pose import Array, PoseGaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,4 +90,18 @@ class RouteAnswer:
     """A way through the merged map. `legs[0]` is the node where the robot is; empty if there is no way."""
 
     legs: tuple[RouteLeg, ...]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class KnownAnswer:
+    """What others have mapped around a position of a robot's own map.
+
+    Attributes:
+        views: (N, 4) [x m, y m, heading rad, horizontal semi-aperture rad], in the map that was asked about:
+            from where, into which direction and how widely the others' nodes look, nearest first.
+        reason: in words, whatever the outcome.
+    """
+
+    views: Array
     reason: str

@@ -14,6 +14,7 @@ from types import TracebackType
 from hybridmap.change import Change
 from hybridmap.errors import MapweaveError, NotConnected
 from mapserver.ingest import Ingest
+from mapserver.known import Known
 from mapserver.merger import Merger
 from mapserver.relocalization import Relocalizer
 from mapserver.routes import Router
@@ -24,8 +25,10 @@ from wire.keys import Keys
 from wire.log_messages import encode_record
 from wire.mapfile import MapFile, pack_map_file
 from wire.messages import (
+    decode_known_request,
     decode_route_request,
     decode_view,
+    encode_known_answer,
     encode_relocalize_answer,
     encode_route_answer,
 )
@@ -59,6 +62,7 @@ class Answers:
     merged: MergedMap
     relocalizer: Relocalizer
     router: Router
+    known: Known
 
 
 class MapServer:
@@ -103,6 +107,7 @@ class MapServer:
         self._closing = [
             self._bus.serve(keys.relocalize(name), self._guarded(self._relocalize)),
             self._bus.serve(keys.route(name), self._guarded(self._route)),
+            self._bus.serve(keys.known(name), self._guarded(self._known)),
             self._bus.serve(keys.server_map(name), self._guarded(self._map)),
             self._bus.serve(keys.server_status(name), self._guarded(self._tell_status)),
             self._bus.announce(keys.server_alive(name)),
@@ -171,7 +176,8 @@ class MapServer:
         self._answers = self._new_answers(merged)
 
     def _new_answers(self, merged: MergedMap) -> Answers:
-        return Answers(merged, Relocalizer(self._merger.index, self._merger.node, merged), Router(merged))
+        relocalizer = Relocalizer(self._merger.index, self._merger.node, merged)
+        return Answers(merged, relocalizer, Router(merged), Known(merged))
 
     # Questions
 
@@ -206,6 +212,12 @@ class MapServer:
             request.start, request.goal, request.blocked, start_from_robot=request.start_from_robot
         )
         return encode_route_answer(answer)
+
+    def _known(self, payload: bytes) -> bytes:
+        request = decode_known_request(payload)
+        self._in_step()
+        answer = self._answers.known.answer(request.map, (request.x, request.y), request.reach)
+        return encode_known_answer(answer)
 
     def _map(self, payload: bytes) -> bytes:
         self._in_step()

@@ -7,7 +7,7 @@
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk
-    mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, map
+    mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, known, map
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of whoever drives that body
@@ -124,6 +124,14 @@ class Keys:
     def any_route(self) -> str:
         """Pattern: whichever server answers."""
         return f"{self.root}/server/*/route"
+
+    def known(self, server: str) -> str:
+        """Where a server tells a robot what others have mapped around it."""
+        return self._of_server("known", server)
+
+    def any_known(self) -> str:
+        """Pattern: whichever server answers."""
+        return f"{self.root}/server/*/known"
 
     def server_map(self, server: str) -> str:
         """Where a server hands out the merged map as the bytes of a map file."""

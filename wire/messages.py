@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from hybridmap.change import NodePut
 from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import NodeId
+from hybridmap.node import MapId, NodeId, check_name
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
 from wire.codec import EDGE_KINDS, KINDS_OF_EDGE, MAX_BODY_BYTES, decode_body, encode_body
 from wire.landmark_codec import (
     FEATURE_BYTES,
@@ -28,6 +30,8 @@ MAX_VIEW_BYTES = MAX_LANDMARKS * FEATURE_BYTES + 256
 MAX_CANDIDATES = 64
 MAX_LEGS = 1024
 MAX_REASON = 1024
+MAX_KNOWN = 512
+"""Views in one answer: 8 kB, as much as two or three nodes."""
 NO_KIND = 0
 """Stands for the first leg's missing edge kind."""
 
@@ -50,6 +54,27 @@ class RouteRequest:
     goal: NodeId
     blocked: tuple[tuple[NodeId, NodeId], ...] = ()
     start_from_robot: Pose2 = field(default_factory=Pose2)
+
+
+VIEW_TYPE = np.dtype("<f4")
+VIEW_BYTES = 4 * VIEW_TYPE.itemsize
+
+
+@dataclass(frozen=True, slots=True)
+class KnownRequest:
+    """What have others mapped around a position?
+
+    Attributes:
+        map: the asking robot's own.
+        x: m, in that map.
+        y: m, in that map.
+        reach: how far around, m.
+    """
+
+    map: MapId
+    x: float
+    y: float
+    reach: float
 
 
 def encode_view(view: View) -> bytes:
@@ -126,6 +151,43 @@ def decode_route_answer(data: bytes) -> RouteAnswer:
     reader = Reader(data, "route", MAX_LEGS * (MAX_BODY_BYTES + 64) + 4 * MAX_REASON)
     legs = tuple(_read_leg(reader, leg) for leg in reader.array("g", MAX_LEGS))
     return RouteAnswer(legs, reader.text("r", MAX_REASON))
+
+
+def encode_known_request(request: KnownRequest) -> bytes:
+    """Encode a wish to know what others have mapped; raises InvalidValue if it would not decode."""
+    at = [float(request.x), float(request.y)]
+    data = pack({"m": [check_name(request.map.agent), request.map.epoch], "p": at, "d": float(request.reach)})
+    return _checked(data, decode_known_request)
+
+
+def decode_known_request(data: bytes) -> KnownRequest:
+    """Decode a wish to know what others have mapped; raises InvalidMessage."""
+    reader = Reader(data, "known request", 256)
+    at = reader.array("p", 2)
+    if len(at) != 2:
+        raise reader.error("the position must be two numbers")
+    x, y = (reader.as_number(number, "position", -MAX_POSITION, MAX_POSITION) for number in at)
+    return KnownRequest(reader.map_id("m"), x, y, reader.number("d", 0.0, MAX_POSITION))
+
+
+def encode_known_answer(answer: KnownAnswer) -> bytes:
+    """Encode what others have mapped; raises InvalidValue if it would not decode."""
+    data = pack({"k": np.asarray(answer.views, VIEW_TYPE).tobytes(), "r": answer.reason})
+    return _checked(data, decode_known_answer)
+
+
+def decode_known_answer(data: bytes) -> KnownAnswer:
+    """Decode what others have mapped; raises InvalidMessage."""
+    most = MAX_KNOWN * VIEW_BYTES
+    reader = Reader(data, "known", most + 4 * MAX_REASON + 64)
+    packed = reader.binary("k", most)
+    if len(packed) % VIEW_BYTES:
+        raise reader.error(f"views are {VIEW_BYTES} bytes each, not {len(packed)} in all")
+    views = np.frombuffer(packed, VIEW_TYPE).reshape(-1, 4).astype(np.float64)
+    # A comparison with what is no number is false.
+    if not (np.abs(views) <= [MAX_POSITION, MAX_POSITION, 4.0, 4.0]).all() or (views[:, 3] < 0.0).any():
+        raise reader.error("a view's posture or aperture is out of range")
+    return KnownAnswer(views, reader.text("r", MAX_REASON))
 
 
 def _candidate(place: Whereabouts) -> list[object]:

@@ -22,19 +22,33 @@ from agent.fleet import (
     encode_mission,
     encode_report,
 )
-from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question, WhereAmI, WhichWay
+from agent.mission import (
+    Answer,
+    Carried,
+    Explore,
+    GoTo,
+    Idle,
+    Mission,
+    Question,
+    WhatIsKnown,
+    WhereAmI,
+    WhichWay,
+)
 from agent.pipeline import Status
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidMessage
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, View
+from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, View
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
 from wire.messages import (
     MAX_BLOCKED,
+    KnownRequest,
+    decode_known_request,
     decode_route_request,
     decode_view,
+    encode_known_answer,
     encode_relocalize_answer,
     encode_route_answer,
 )
@@ -244,10 +258,10 @@ def test_the_agent_is_alive_until_it_goes(hub: MemoryHub, other: MemoryBus) -> N
     bus.close()
 
 
-QUESTIONS: list[Question] = [WhereAmI(7, VIEW), WhichWay(7, HERE, THERE)]
+QUESTIONS: list[Question] = [WhereAmI(7, VIEW), WhichWay(7, HERE, THERE), WhatIsKnown(7, MAP, 1.0, 2.0, 9.0)]
 
 
-@pytest.mark.parametrize("question", QUESTIONS, ids=["where", "way"])
+@pytest.mark.parametrize("question", QUESTIONS, ids=["where", "way", "known"])
 def test_without_a_server_the_answer_says_so(link: FleetLink, question: Question) -> None:
     link.ask(question)
     (answer,) = link.answers(wait=True)
@@ -284,6 +298,21 @@ def test_the_servers_answers_come_with_their_numbers(link: FleetLink, other: Mem
     assert np.array_equal(view.codes, VIEW.codes)
     assert (request.start, request.goal, request.blocked) == (HERE, THERE, ((HERE, THERE),))
     assert request.start_from_robot == Pose2(0.25, -0.5, 1.0)
+
+
+def test_it_is_told_what_others_have_mapped(link: FleetLink, other: MemoryBus) -> None:
+    asked: list[KnownRequest] = []
+
+    def known(request) -> None:
+        asked.append(decode_known_request(request.payload))
+        request.reply(encode_known_answer(KnownAnswer(np.array([[1.0, 2.0, 0.5, 0.5]]), "one view")))
+
+    other.serve(KEYS.known("s0"), known)
+    link.ask(WhatIsKnown(-1, MAP, 1.5, -2.0, 9.0))
+    (answer,) = link.answers(wait=True)
+    assert asked == [KnownRequest(MAP, 1.5, -2.0, 9.0)]
+    assert isinstance(answer.content, KnownAnswer)
+    assert answer.content.views.tolist() == [[1.0, 2.0, 0.5, 0.5]]
 
 
 def test_a_robot_never_waits(link: FleetLink, other: MemoryBus) -> None:

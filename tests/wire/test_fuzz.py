@@ -16,7 +16,7 @@ from hybridmap.change import NodePut
 from hybridmap.errors import InvalidMessage
 from hybridmap.node import EdgeKind, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
 from wire.codec import decode_body, decode_change, encode_body, encode_change
 from wire.log_messages import (
     Ack,
@@ -30,11 +30,16 @@ from wire.log_messages import (
 )
 from wire.mapfile import MapFile, pack_map_file, unpack_map_file
 from wire.messages import (
+    KnownRequest,
     RouteRequest,
+    decode_known_answer,
+    decode_known_request,
     decode_relocalize_answer,
     decode_route_answer,
     decode_route_request,
     decode_view,
+    encode_known_answer,
+    encode_known_request,
     encode_relocalize_answer,
     encode_route_answer,
     encode_route_request,
@@ -67,6 +72,8 @@ def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
          encode_relocalize_answer(RelocalizeAnswer(Certainty.AMBIGUOUS, places, "why"))),
         (decode_route_request, encode_route_request(request)),
         (decode_route_answer, encode_route_answer(RouteAnswer(legs, "why"))),
+        (decode_known_request, encode_known_request(KnownRequest(some.map, 1.5, -2.5, 9.0))),
+        (decode_known_answer, encode_known_answer(KnownAnswer(np.ones((2, 4)), "why"))),
         (unpack_map_file, pack_map_file(MapFile("merged", "t", (NodePut(node),), {node.id: (0, here)}))),
     ]  # fmt: skip
 

@@ -43,6 +43,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
         KEYS.acks(one.agent): KEYS.ack(server, one.agent),
         KEYS.any_relocalize(): KEYS.relocalize(server),
         KEYS.any_route(): KEYS.route(server),
+        KEYS.any_known(): KEYS.known(server),
         KEYS.any_server_map(): KEYS.server_map(server),
         KEYS.server_statuses(): KEYS.server_status(server),
         KEYS.servers_alive(): KEYS.server_alive(server),

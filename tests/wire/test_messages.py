@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hybridmap.errors import InvalidMessage, InvalidValue
 from hybridmap.node import EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
 from wire.log_messages import (
     Ack,
     Head,
@@ -24,11 +24,17 @@ from wire.log_messages import (
     encode_record,
 )
 from wire.messages import (
+    MAX_KNOWN,
+    KnownRequest,
     RouteRequest,
+    decode_known_answer,
+    decode_known_request,
     decode_relocalize_answer,
     decode_route_answer,
     decode_route_request,
     decode_view,
+    encode_known_answer,
+    encode_known_request,
     encode_relocalize_answer,
     encode_route_answer,
     encode_route_request,
@@ -171,3 +177,32 @@ def test_a_route(some: SimpleNamespace) -> None:
     assert encode_route_answer(back) == encoded
     nothing = decode_route_answer(encode_route_answer(RouteAnswer((), "no way")))
     assert (nothing.legs, nothing.reason) == ((), "no way")
+
+
+def test_what_is_known() -> None:
+    request = KnownRequest(MapId("r0", 3), 1.25, -2.5, 8.7)
+    assert decode_known_request(encode_known_request(request)) == request
+    views = np.random.default_rng(1).uniform([-50, -50, -3, 0.1], [50, 50, 3, 1.2], (MAX_KNOWN, 4))
+    encoded = encode_known_answer(KnownAnswer(views, "512 of 600 views"))
+    assert len(encoded) < 16 * MAX_KNOWN + 40
+    back = decode_known_answer(encoded)
+    assert np.allclose(back.views, views, atol=1e-5)
+    assert back.reason == "512 of 600 views"
+    assert encode_known_answer(back) == encoded
+    nothing = decode_known_answer(encode_known_answer(KnownAnswer(np.zeros((0, 4)), "nobody")))
+    assert (nothing.views.shape, nothing.reason) == ((0, 4), "nobody")
+
+
+@pytest.mark.parametrize(
+    "view", [[np.nan, 0, 0, 0.5], [0, np.inf, 0, 0.5], [2e6, 0, 0, 0.5], [0, 0, 9, 0.5], [0, 0, 0, -0.1]]
+)
+def test_what_nobody_can_have_mapped_is_not_told(view: list[float]) -> None:
+    with pytest.raises(InvalidValue, match="out of range"):
+        encode_known_answer(KnownAnswer(np.array([view]), ""))
+
+
+def test_more_than_is_told_at_once_is_refused() -> None:
+    with pytest.raises(InvalidValue, match="at most"):
+        encode_known_answer(KnownAnswer(np.zeros((MAX_KNOWN + 1, 4)), ""))
+    with pytest.raises(InvalidValue, match="position"):
+        encode_known_request(KnownRequest(MapId("r0", 1), float("nan"), 0.0, 1.0))
