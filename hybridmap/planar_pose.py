@@ -7,7 +7,7 @@ postures are solved at once from two or three sightings each, scored by likeliho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.minimal_poses import hypotheses
+from hybridmap.mirror import mirrored
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.pose_refinement import PlanarFix, Stack, improve, refine
 from hybridmap.sightings import Sightings
@@ -38,6 +39,7 @@ class PlanarPoseSettings:
         scale_sigma: share by which all points of one frame may be too near or too far together; they come
             from one drive with one set of wheels, so their errors are not independent.
         least_inliers: fewer give no posture.
+        apart: two postures nearer to each other than this are the same, m.
     """
 
     hypotheses: int = 100
@@ -46,6 +48,7 @@ class PlanarPoseSettings:
     pixel_sigma: float = 1.0
     scale_sigma: float = 0.01
     least_inliers: int = 4
+    apart: float = 0.3
 
 
 def solve_planar_pose(
@@ -91,7 +94,7 @@ def solve_planar_pose(
         return None
     inliers = np.zeros(len(points), dtype=bool)
     inliers[np.flatnonzero(usable)[solved.inliers]] = True
-    return PlanarFix(solved.node_from_robot, inliers, solved.mean_square, solved.rms_px, solved.log_evidence)
+    return replace(solved, inliers=inliers)
 
 
 def solve_sightings(
@@ -126,7 +129,31 @@ def solve_sightings(
     fix = refine(stack, best, settings.scale_sigma, prior, rounds=settings.rounds)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
-    return fix
+    return _weighed(fix, parts, stack, settings, prior)
+
+
+def _weighed(
+    fix: PlanarFix,
+    parts: Sequence[Sightings],
+    stack: Stack,
+    s: PlanarPoseSettings,
+    prior: PoseGaussian | None,
+) -> PlanarFix:
+    """The better of a posture and the one mirrored in what it sees, with how the other compares."""
+    seen = fix.inliers & ~stack.inverted
+    if int(seen.sum()) < s.least_inliers:
+        return fix
+    mean = fix.node_from_robot.mean
+    other = improve(stack, mirrored(mean, stack.points[seen, :2]), prior, rounds=s.rounds)
+    if other is None or other[0].distance(mean) < s.apart:
+        return fix
+    ours, theirs = _scores(parts, np.stack([mean.vector, other[0].vector])).tolist()
+    if theirs <= ours:
+        return replace(fix, rival=max(theirs, 0.0) / ours if ours > 0.0 else 1.0)
+    better = refine(stack, other[0], s.scale_sigma, prior, rounds=s.rounds)
+    if better is None or int(better.inliers.sum()) < s.least_inliers:
+        return replace(fix, rival=1.0)
+    return replace(better, rival=max(ours, 0.0) / theirs)
 
 
 def _scores(parts: Sequence[Sightings], poses: Array) -> Array:

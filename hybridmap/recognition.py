@@ -45,6 +45,8 @@ class RecognitionSettings:
         most_position_share: largest standard deviation of the position as a share of the median depth of
             the inliers.
         most_heading_sigma: rad.
+        most_rival: what the posture mirrored in what is seen may explain, as a share of what the best does:
+            a flat thing from afar looks almost the same from two sides.
     """
 
     matching: MatchSettings = field(default_factory=MatchSettings)
@@ -58,6 +60,7 @@ class RecognitionSettings:
     most_mean_square: float = 3.0
     most_position_share: float = 0.06
     most_heading_sigma: float = math.radians(4.0)
+    most_rival: float = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +185,7 @@ def _examine(
     inliers = usable[fix.inliers]
     evidence = gather(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
     evidence["depths"] = depth_agreement(sightings[0], fix)
+    evidence["rival"] = fix.rival
     reason = _objection(evidence, s)
     if reason:
         return Refusal(reason, len(pairs), len(inliers))
@@ -227,6 +231,8 @@ def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
         return f"only {e['depths']:.0%} of the landmarks that fit lie at the same depth"
     if e["log_evidence"] < s.least_evidence:
         return f"the {inliers} landmarks that agree are hardly better than chance"
+    if e["rival"] > s.most_rival:
+        return f"a posture on the other side of what is seen explains {e['rival']:.0%} as much"
     if e["mean_square"] > s.most_mean_square:
         return f"the residuals are {math.sqrt(e['mean_square']):.1f} times what they should be"
     if e["sigma_xy"] > s.most_position_share * e["depth"]:
