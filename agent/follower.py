@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -12,16 +13,17 @@ from numpy.typing import NDArray
 from agent.detour import Detour
 from agent.fix import Fix
 from agent.localizer import Localizer, LocalizerSettings
+from agent.lookout import Expected, Lookout, LookoutSettings
 from agent.observation import Command, Observation, RobotDescription
 from agent.servo.blind import BlindDrive
 from agent.servo.proximity import ranger_points
+from agent.servo.step import State
 from agent.servo.supervisor import Servo
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import RouteLeg
-from hybridmap.recognition import RecognitionSettings, recognise
 
 
 @dataclass(frozen=True)
@@ -29,42 +31,37 @@ class FollowerSettings:
     """How a route is followed.
 
     Attributes:
-        localizer: tracking and filtering of a node's landmarks.
+        lookout: when a node ahead counts as found; a posture may be off by as much again for each metre
+            driven blind.
         passed: an intermediate node is passed within this distance, m.
         sight_turn: a node's landmarks are looked for when the robot's heading is within this of it, rad.
         sight_reach: and the robot within this distance of it, m.
         look_every: ticks between two looks for the next nodes' landmarks.
         skip: nodes further along the route that are looked for as well.
-        recognition: when a node ahead counts as recognised. Less is asked than of a lost robot, because the
-            posture must also be the expected one.
-        plausible: a recognition this far from where the robot believes to be is not believed, m; further
-            by as much again for each metre driven blind.
-        plausible_turn: likewise, rad.
         blind: way without any landmark in sight after which the robot must find itself again, m.
-        hidden: seconds at the goal without its landmarks in sight after which it is not there, s.
+        hidden: seconds at the goal without its landmarks in sight, or recognised, after which it is not
+            there, s.
         patience: seconds without getting on before an edge counts as blocked.
         parking_patience: likewise at the goal.
         near: within this distance of the goal the last, blind turns are made if it is not in sight, m.
     """
 
-    localizer: LocalizerSettings = field(default_factory=LocalizerSettings)
+    lookout: LookoutSettings = field(default_factory=LookoutSettings)
     passed: float = 0.22
     sight_turn: float = 0.6
     sight_reach: float = 1.4
     look_every: int = 4
     skip: int = 2
-    recognition: RecognitionSettings = field(
-        default_factory=lambda: RecognitionSettings(
-            least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0
-        )
-    )
-    plausible: float = 0.3
-    plausible_turn: float = 0.25
     blind: float = 2.0
     hidden: float = 2.0
     patience: float = 6.0
     parking_patience: float = 30.0
     near: float = 0.35
+
+    @property
+    def localizer(self) -> LocalizerSettings:
+        """How a node's landmarks are tracked and filtered."""
+        return self.lookout.localizer
 
 
 class Progress(StrEnum):
@@ -117,12 +114,10 @@ class Follower:
         self.detail = ""
         self.fix = fix
         self._description = description
-        self._lens = lens
-        self._sift = sift
+        self._lookout = Lookout(description, lens, sift, settings.lookout, rng)
         self._route = route
         self._detour = detour
         self._settings = settings
-        self._rng = rng
         self._servo = Servo(description)
         self._blind_drive = BlindDrive(description)
         self._start = fix.node
@@ -138,6 +133,7 @@ class Follower:
         self._servoing = -1
         self._approaching = False
         self._hidden = 0.0
+        self._confirmed = False
 
     @property
     def blocked(self) -> tuple[NodeId, NodeId]:
@@ -151,7 +147,7 @@ class Follower:
         self._tick += 1
         self.fix.follow(observation, self._description)
         if self._tick % s.look_every == 0:
-            self._look_ahead(observation)
+            self._look_for(self._ahead(), observation)
         self._pass_nodes()
         target = self._target()
         distance = math.hypot(target.x, target.y)
@@ -173,7 +169,7 @@ class Follower:
         """Servo if the target's landmarks are in sight, else drive to its position, at the goal blindly."""
         obstacles = ranger_points(observation.proximity, self._description)
         localizer = self.fix.localizer
-        if localizer is not None and self._reference == self.leg and (parking or _ahead(target)):
+        if localizer is not None and self._reference == self.leg and (parking or _lies_ahead(target)):
             points = self._route[self.leg].node.points_in_robot
             if self._servoing != self.leg:
                 self._servo.start(target, points)
@@ -182,8 +178,7 @@ class Follower:
             if parking:
                 self.progress = Progress.PARKING
                 self.detail = f"{step.reason}, {distance * 1000:.0f} mm off"
-                if step.state == "arrived":
-                    self.progress = Progress.ARRIVED
+                self._confirm(step.state, observation)
             if step.state != "stuck":
                 self._approaching = False
                 return step.command
@@ -202,6 +197,23 @@ class Follower:
         if self._hidden > self._settings.hidden:
             self.progress = Progress.UNSURE
         return step.command
+
+    def _confirm(self, state: State, observation: Observation) -> None:
+        """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
+
+        A view from where the node's was taken shows its features at their own scale, so nothing tells better
+        where the robot is. Only if it then still stands at the goal is it there.
+        """
+        if state != "arrived":
+            self._confirmed, self._hidden = False, 0.0
+        elif self._confirmed:
+            self.progress = Progress.ARRIVED
+        elif self._look_for([self._expected(self._last)], observation):
+            self._confirmed = True
+        else:
+            self._hidden += self._description.tick
+            if self._hidden > self._settings.hidden:
+                self.progress = Progress.UNSURE
 
     def _getting_on(self, distance: float, patience: float) -> bool:
         if distance < self._best - 0.03:
@@ -226,47 +238,36 @@ class Follower:
         if self.leg != before:
             self._best, self._waited = math.inf, 0.0
 
-    def _look_ahead(self, observation: Observation) -> None:
-        """Look for the landmarks of the nodes ahead, furthest first, and take the first that is found."""
-        s, image = self._settings, observation.image
-        wanted = self._wanted()
-        if image is None or not wanted:
-            return
-        features = self._sift.extract(image)
-        view = features.view(self._description.camera)
-        for index, expected in wanted:
-            node = self._route[index].node
-            found = recognise(node, view, s.recognition, self._rng)
-            if found is None or not self._plausible(found.node_from_robot.mean, expected):
-                continue
-            same = index == self._reference and self.fix.localizer is not None
-            if same and found.inliers <= len(self.fix.localizer.visible):  # type: ignore[union-attr]
-                continue
-            localizer = Localizer(self._description, self._lens, node, image, features, found, s.localizer)
-            self.fix, self._reference = Fix.of(localizer), index
-            return
+    def _look_for(self, wanted: Sequence[Expected], observation: Observation) -> bool:
+        """Look for landmarks, furthest first; returns whether some were found: then the fix is on them."""
+        if observation.image is None or not wanted:
+            return False
+        found = self._lookout.find(observation.image, wanted)
+        if found is not None:
+            self._reference, localizer = found
+            self.fix = Fix.of(localizer)
+        return found is not None
 
-    def _plausible(self, found: Pose2, expected: Pose2) -> bool:
-        """Whether the robot may be there, by what it believes."""
-        s = self._settings
-        doubt = 1.0 + self.fix.blind
-        turned = abs(wrap_angle(found.heading - expected.heading))
-        return found.distance(expected) <= s.plausible * doubt and turned <= s.plausible_turn * doubt
-
-    def _wanted(self) -> list[tuple[int, Pose2]]:
-        """Legs whose landmarks may be in view, furthest first, with where the robot should be from each."""
+    def _ahead(self) -> list[Expected]:
+        """Nodes whose landmarks may be in view, furthest first."""
         s = self._settings
         first = self._reference + 1 if self.fix.in_sight else 0
         wanted = []
         for index in range(min(self.leg + s.skip, self._last), first - 1, -1):
-            expected = self._from_reference(index) @ self.fix.node_from_robot.mean
-            near = math.hypot(expected.x, expected.y) < s.sight_reach
-            if near and abs(wrap_angle(expected.heading)) < s.sight_turn:
-                wanted.append((index, expected))
+            expected = self._expected(index)
+            there = expected.node_from_robot
+            if math.hypot(there.x, there.y) < s.sight_reach and abs(wrap_angle(there.heading)) < s.sight_turn:
+                wanted.append(expected)
         # At the goal more of its landmarks come into view: a fresh look makes the last millimetres better.
         if self._reference == self._last and self.fix.in_sight and self._tick % (3 * s.look_every) == 0:
-            wanted.append((self._last, self.fix.node_from_robot.mean))
+            tracked = len(self.fix.localizer.visible) if self.fix.localizer is not None else 0
+            wanted.append(self._expected(self._last)._replace(tracked=tracked))
         return wanted
+
+    def _expected(self, index: int) -> Expected:
+        """A leg's node, with where the robot should be from it."""
+        there = self._from_reference(index) @ self.fix.node_from_robot.mean
+        return Expected(index, self._route[index].node, there, 1.0 + self.fix.blind)
 
     def _target(self) -> Pose2:
         """`target_from_robot`."""
@@ -283,7 +284,7 @@ class Follower:
         return math.hypot(self.fix.node_from_robot.mean.x, self.fix.node_from_robot.mean.y)
 
 
-def _ahead(target_from_robot: Pose2) -> bool:
+def _lies_ahead(target_from_robot: Pose2) -> bool:
     """Whether a posture can be servoed to without a manoeuvre: ahead, and facing alike."""
     there = target_from_robot.inverse()
     return abs(target_from_robot.heading) < 0.5 and there.x > 0.1 and abs(there.y) < 0.6 * there.x

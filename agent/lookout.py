@@ -1,0 +1,119 @@
+"""Looking for nodes whose landmarks should be in view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.localizer import Localizer, LocalizerSettings
+from agent.observation import RobotDescription
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.node import Node
+from hybridmap.pose import Pose2, wrap_angle
+from hybridmap.recognition import RecognitionSettings, recognise
+
+
+@dataclass(frozen=True)
+class LookoutSettings:
+    """When a node counts as found.
+
+    Attributes:
+        localizer: tracking and filtering of its landmarks from then on.
+        recognition: when it counts as recognised. Less is asked than of a lost robot, because the posture
+            must also be the expected one.
+        plausible: a recognition this far from where the robot believes to be is not believed, m.
+        plausible_turn: likewise, rad.
+        more: what is tracked already is given up for a fresh look that finds this many times as many
+            landmarks.
+    """
+
+    localizer: LocalizerSettings = field(default_factory=LocalizerSettings)
+    recognition: RecognitionSettings = field(
+        default_factory=lambda: RecognitionSettings(
+            least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0
+        )
+    )
+    plausible: float = 0.3
+    plausible_turn: float = 0.25
+    more: float = 1.3
+
+
+class Expected(NamedTuple):
+    """A node that may be in view.
+
+    Attributes:
+        leg: whatever the caller knows it by.
+        node: with its landmarks.
+        node_from_robot: where the robot believes to be.
+        doubt: how many times further than usual it may be off.
+        tracked: landmarks of the node that are tracked already.
+    """
+
+    leg: int
+    node: Node
+    node_from_robot: Pose2
+    doubt: float = 1.0
+    tracked: int = 0
+
+
+class Lookout:
+    """Finds nodes by their features, where they are expected and nowhere else."""
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        sift: Sift,
+        settings: LookoutSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Take the robot's camera.
+
+        Args:
+            description: of the robot.
+            lens: of its camera.
+            sift: finds features.
+            settings: when a node counts as found.
+            rng: for verification.
+        """
+        self._description = description
+        self._lens = lens
+        self._sift = sift
+        self._settings = settings
+        self._rng = rng
+
+    def find(self, image: NDArray[np.uint8], wanted: Iterable[Expected]) -> tuple[int, Localizer] | None:
+        """Look for nodes, in their order.
+
+        Args:
+            image: (H, W) grey.
+            wanted: nodes that may be in view.
+
+        Returns:
+            Leg of the first that is found, and what follows its landmarks from this image on; or None.
+        """
+        s, features = self._settings, self._sift.extract(image)
+        view = features.view(self._description.camera)
+        for one in wanted:
+            found = recognise(one.node, view, s.recognition, self._rng)
+            if found is None or not self._plausible(found.node_from_robot.mean, one):
+                continue
+            if found.inliers > s.more * one.tracked:
+                return one.leg, Localizer(
+                    self._description, self._lens, one.node, image, features, found, s.localizer
+                )
+        return None
+
+    def _plausible(self, found: Pose2, expected: Expected) -> bool:
+        """Whether the robot may be there, by what it believes."""
+        s, believed = self._settings, expected.node_from_robot
+        turned = abs(wrap_angle(found.heading - believed.heading))
+        return (
+            found.distance(believed) <= s.plausible * expected.doubt
+            and turned <= s.plausible_turn * expected.doubt
+        )
