@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Callable
 
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
 from agent.pipeline import Status
 from agent.questions import decode_answer, encode_question
+from agent.report import AgentReport, encode_report
 from hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from wire.bus import Bus, Request
 from wire.keys import Keys
-from wire.log_messages import Scalar, decode_record, encode_record
+from wire.log_messages import decode_record, encode_record
 from wire.metered import MeteredBus
 
 NO_ANSWER = "no map server answered"
-
-MAX_WORDS = 500
-"""Characters of a status text."""
-
-T = TypeVar("T")
 
 
 def encode_mission(mission: Mission) -> bytes:
@@ -51,111 +45,6 @@ def decode_mission(payload: bytes) -> Mission:
         except InvalidValue as error:
             raise InvalidMessage(str(error)) from None
     raise InvalidMessage(f"no mission {name!r}; known are idle, explore, carried and goto")
-
-
-@dataclass(frozen=True)
-class AgentReport:
-    """A status as others receive it.
-
-    Attributes:
-        status: what the agent says of itself.
-        stamp_ns: time of the observation that it speaks of.
-        epoch: of the map that it makes.
-        unsent: changes that no server has on its disk yet.
-        traffic: bytes that it has sent and received over the fleet's network since it began.
-        linked: whether it sees its map server.
-    """
-
-    status: Status
-    stamp_ns: int
-    epoch: int = 0
-    unsent: int = 0
-    traffic: int = 0
-    linked: bool = False
-
-    @property
-    def fix_node(self) -> NodeId | None:
-        """The node that the robot knows itself by, if it navigates and knows."""
-        return self.status.fix_node
-
-
-def encode_report(report: AgentReport) -> bytes:
-    """What the robot is doing, for people and for tests."""
-    status = report.status
-    pose, fix = status.map_from_robot, status.node_from_robot
-    return encode_record(
-        {
-            "stamp_ns": report.stamp_ns,
-            "epoch": report.epoch,
-            "unsent": report.unsent,
-            "traffic": report.traffic,
-            "linked": report.linked,
-            "astray": status.astray,
-            "doing": _one_line(status.doing),
-            "detail": _one_line(status.detail),
-            "nodes": status.nodes,
-            "tracked": status.tracked,
-            "finished": status.finished,
-            "x": float(pose.x),
-            "y": float(pose.y),
-            "heading": float(pose.heading),
-            "mission": status.mission,
-            "fix_node": "" if status.fix_node is None else str(status.fix_node),
-            "fix_x": float(fix.x),
-            "fix_y": float(fix.y),
-            "fix_heading": float(fix.heading),
-            "legs": status.legs,
-        }
-    )
-
-
-def _one_line(text: str) -> str:
-    """Text as a record can hold it: a status may quote whatever a server or a driver has said."""
-    return "".join(c if c.isprintable() else " " for c in text)[:MAX_WORDS]
-
-
-def decode_report(payload: bytes) -> AgentReport:
-    """Read a status.
-
-    Raises:
-        InvalidMessage: it is none.
-    """
-    values = decode_record(payload)
-    try:
-        status = Status(
-            doing=_typed(values, "doing", str),
-            detail=_typed(values, "detail", str),
-            nodes=_typed(values, "nodes", int),
-            tracked=_typed(values, "tracked", int),
-            map_from_robot=_posture(values, "x", "y", "heading"),
-            finished=_typed(values, "finished", bool),
-            mission=_typed(values, "mission", str),
-            fix_node=NodeId.parse(_typed(values, "fix_node", str)) if values["fix_node"] else None,
-            node_from_robot=_posture(values, "fix_x", "fix_y", "fix_heading"),
-            legs=_typed(values, "legs", int),
-            astray=_typed(values, "astray", bool),
-        )
-        return AgentReport(
-            status=status,
-            stamp_ns=_typed(values, "stamp_ns", int),
-            epoch=_typed(values, "epoch", int),
-            unsent=_typed(values, "unsent", int),
-            traffic=_typed(values, "traffic", int),
-            linked=_typed(values, "linked", bool),
-        )
-    except (KeyError, ValueError, InvalidValue) as error:
-        raise InvalidMessage(f"agent status: {error}") from None
-
-
-def _typed(values: Mapping[str, Scalar], name: str, kind: type[T]) -> T:
-    value = values[name]
-    if type(value) is not kind:
-        raise ValueError(f"{name} must be {kind.__name__}, not {value!r}")
-    return value
-
-
-def _posture(values: Mapping[str, Scalar], x: str, y: str, heading: str) -> Pose2:
-    return Pose2(_typed(values, x, float), _typed(values, y, float), _typed(values, heading, float))
 
 
 class FleetLink:

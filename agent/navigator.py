@@ -9,19 +9,22 @@ from enum import StrEnum
 
 import numpy as np
 
+from agent.blocks import Blocks, BlockSettings
 from agent.detour import Detour, DetourSettings
 from agent.fix import Fix
 from agent.follower import Follower, FollowerSettings, Progress
-from agent.localizer import Localizer
-from agent.mission import Answer, Question, WhereAmI, WhichWay
+from agent.helm import Behaviour, Helm
+from agent.mission import Answer, Question, WhichWay
 from agent.observation import Command, Observation, RobotDescription
-from agent.recall import exact_enough, recall
+from agent.own_route import own_route
+from agent.search import Search, SearchSettings
+from agent.tally import Tally
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId
-from hybridmap.pose import PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
+from hybridmap.pose import Pose2
+from hybridmap.query import RouteAnswer, RouteLeg
 
 
 @dataclass(frozen=True)
@@ -29,25 +32,22 @@ class NavigatorSettings:
     """How the robot navigates.
 
     Attributes:
+        search: while it is lost.
         follower: along a route.
         detour: between nodes.
-        look_turn: between two looks of a lost robot, rad.
-        turn_rate: of that turn, rad/s.
-        least_features: a view with fewer is not worth a question.
-        sure: standard deviations up to which a lost robot believes a recognition at once, m and rad; the
-            longer it has looked around, the less it asks for: twice as much after a whole turn.
+        blocks: how long it remembers where it could not get through.
         answer_patience: ticks that an answer may take before the question counts as lost.
-        pause: seconds before a lost robot without a route asks again.
+        pause: seconds that it waits before what is in its way, and before it asks again for a route.
+        trusted: after a block it still knows where it is if it has driven less than this blindly, m.
     """
 
+    search: SearchSettings = field(default_factory=SearchSettings)
     follower: FollowerSettings = field(default_factory=FollowerSettings)
     detour: DetourSettings = field(default_factory=DetourSettings)
-    look_turn: float = 0.5
-    turn_rate: float = 0.6
-    least_features: int = 8
-    sure: tuple[float, float] = (0.03, 0.018)
+    blocks: BlockSettings = field(default_factory=BlockSettings)
     answer_patience: int = 100
     pause: float = 2.0
+    trusted: float = 1.0
 
 
 class Stage(StrEnum):
@@ -55,10 +55,9 @@ class Stage(StrEnum):
 
     LOST = "looking around to find out where it is"
     ASKING = "asking for a route"
+    BLOCKED = "standing before something in the way"
+    WAITING = "waiting for a way"
     ARRIVED = "parked at the goal"
-
-
-Behaviour = Generator[Command, None, None]
 
 
 class Navigator:
@@ -70,6 +69,7 @@ class Navigator:
         fix: where the robot is, or None while lost.
         goal: where it shall be.
         legs: nodes on the first route that was given.
+        tally: what the drive was made of so far.
     """
 
     def __init__(
@@ -88,20 +88,18 @@ class Navigator:
         self.fix: Fix | None = None
         self.goal = goal
         self.legs = 0
+        self.tally = Tally()
         self._description = description
         self._lens = lens
         self._sift = sift
         self._own_map = own_map
-        self._settings = settings or NavigatorSettings()
+        self._settings = s = settings or NavigatorSettings()
         self._rng = np.random.default_rng(seed)
-        self._detour = Detour(description, self._settings.detour)
-        self._observation: Observation | None = None
-        self._answers: dict[int, Answer] = {}
-        self._questions: list[Question] = []
-        self._next_question = 1
-        self._blocked: list[tuple[NodeId, NodeId]] = []
-        self._following = False
-        self._looked = 0.0
+        self._detour = Detour(description, s.detour)
+        self._helm = Helm(description, s.answer_patience)
+        self._search = Search(description, lens, sift, own_map, self._helm, s.search, self._rng)
+        self._blocks = Blocks(s.blocks)
+        self._following = self._searching = False
         self._behaviour = self._go()
 
     @property
@@ -111,144 +109,122 @@ class Navigator:
 
     def step(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
         """One tick: returns what the wheels shall do and what to ask the fleet's map."""
-        self._observation = observation
-        self._answers.update({answer.number: answer for answer in answers})
-        self._questions = []
+        self._helm.take_in(observation, answers)
         self._detour.see(observation)
         if self.fix is not None and not self._following:
             self.fix.follow(observation, self._description)
-        return next(self._behaviour), self._questions
+        command = next(self._behaviour)
+        if self._searching:
+            self.detail = self._search.detail
+        return command, self._helm.questions()
 
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 
     def _go(self) -> Behaviour:
         while not self.arrived:
             if self.fix is None:
-                yield from self._look_around()
-                continue
+                yield from self._find()
+            assert self.fix is not None, "the search ends with a fix"
             route = yield from self._get_route(self.fix)
             if route:
                 yield from self._follow(route, self.fix)
             else:
-                # What was in the way may have gone; otherwise the robot would stand here for ever.
-                self._blocked.clear()
-                self.fix = None
-                yield from self._wait(self._settings.pause)
+                yield from self._wait_for_a_way()
         while True:
             yield Command()
 
-    def _look_around(self) -> Behaviour:
-        """Look, ask, turn a little, until somebody knows the view."""
-        self.stage, self.detail = Stage.LOST, "looking"
-        self._looked = 0.0
-        while True:
-            yield from self._wait(0.2)
-            if (yield from self._relocalize()):
-                return
-            yield from self._turn(self._settings.look_turn)
-            self._looked += self._settings.look_turn
+    def _find(self) -> Behaviour:
+        self.stage, self._searching = Stage.LOST, True
+        self.fix = yield from self._search.look_around()
+        self._found()
 
-    def _relocalize(self) -> Generator[Command, None, bool]:
-        """Recognise the current view on the own map, else ask the fleet's; sets `fix` if it is known."""
-        image = self._now.image
-        if image is None:
-            self.detail = "no image from the camera"
-            return False
-        features = self._sift.extract(image)
-        if len(features) < self._settings.least_features:
-            self.detail = f"only {len(features)} features in view"
-            return False
-        view = features.view(self._description.camera)
-        own = recall(self._own_map, view, self._rng)
-        if own is not None and self._sure(own[1].node_from_robot):
-            node, recognition = own
-            settings = self._settings.follower.localizer
-            localizer = Localizer(self._description, self._lens, node, image, features, recognition, settings)
-            self.fix = Fix.of(localizer)
-            self.detail = f"own map: node {node.id}, {recognition.inliers} landmarks agree"
-            return True
-        answer = yield from self._ask(WhereAmI(self._number(), view))
-        if not isinstance(answer.content, RelocalizeAnswer):
-            self.detail = answer.error or "no answer"
-            return False
-        self.detail = answer.content.reason
-        if answer.content.certainty is not Certainty.FOUND:
-            return False
-        best = answer.content.candidates[0]
-        if not self._sure(best.node_from_robot):
-            self.detail += ", but not exactly enough"
-            return False
-        # The robot has stood still while the answer was on its way.
-        self.fix = Fix(best.node, best.node_from_robot)
-        return True
+    def _found(self) -> None:
+        self._searching, self.detail = False, self._search.detail
+        if self.fix is not None:
+            self.tally = self.tally.found()
 
     def _get_route(self, fix: Fix) -> Generator[Command, None, tuple[RouteLeg, ...]]:
+        """Ask the fleet's map; where nobody answers, the own map must do."""
         self.stage = Stage.ASKING
-        here = fix.node_from_robot.mean
-        question = WhichWay(self._number(), fix.node, self.goal, here, tuple(self._blocked))
-        answer = yield from self._ask(question)
-        if not isinstance(answer.content, RouteAnswer):
-            self.detail = answer.error or "no answer"
-            return ()
-        self.detail = answer.content.reason
-        self.legs = self.legs or len(answer.content.legs)
-        return answer.content.legs
+        here, blocked = fix.node_from_robot.mean, self._blocks.at(self._helm.now)
+        question = WhichWay(self._helm.number(), fix.node, self.goal, here, blocked)
+        answer = yield from self._helm.ask(question)
+        content, trouble = answer.content, ""
+        if not isinstance(content, RouteAnswer):
+            trouble = f"{answer.error or 'no answer'}; "
+            content = own_route(self._own_map, fix.node, self.goal, blocked)
+        self.detail = f"{trouble}{content.reason}"
+        self.legs = self.legs or len(content.legs)
+        return content.legs
+
+    def _wait_for_a_way(self) -> Behaviour:
+        """Without a route: what is in the way may go; without that the robot may not be where it thinks."""
+        self.stage = Stage.WAITING
+        if not self._blocks.at(self._helm.now):
+            self.fix = None
+        yield from self._helm.stand(self._settings.pause)
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
-        """Follow a route until it is driven, or the robot is lost, or knows itself somewhere else."""
+        """Follow a route until it is driven, or blocked, or the robot does not know where it is."""
         follower = Follower(
             self._description, self._lens, self._sift, route, fix, self._detour, self._settings.follower,
             self._rng,
         )  # fmt: skip
         self._following = True
         while True:
-            command = follower.step(self._now)
+            leg = follower.leg
+            command = follower.step(self._helm.observation)
             self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
-            match follower.progress:
-                case Progress.ARRIVED:
-                    break
-                case Progress.BLOCKED:
-                    self._blocked.append(follower.blocked)
-                    self.fix = None
-                    break
-                case Progress.UNSURE:
-                    self._following = False
-                    yield from self._wait(0.2)
-                    if not (yield from self._relocalize()):
-                        self.fix = None
-                    break
+            self.tally = self.tally.passed(_distances(route, leg, follower.leg, follower.fix))
+            if follower.progress not in (Progress.DRIVING, Progress.PARKING):
+                break
             yield command
         self._following = False
+        match follower.progress:
+            case Progress.ARRIVED:
+                self.tally = self.tally.passed([0.0])
+            case Progress.BLOCKED:
+                yield from self._meet_block(*follower.blocked)
+            case Progress.UNSURE:
+                yield from self._make_sure()
 
-    # Small things
+    def _meet_block(self, a: NodeId, b: NodeId) -> Behaviour:
+        """Something is in the way: say what, give it time to go, then let another way be found."""
+        self._blocks.add(a, b, self._helm.now)
+        self.tally = self.tally.blocked()
+        self.stage, self.detail = Stage.BLOCKED, f"between {a} and {b}: {self._in_the_way()}"
+        yield from self._helm.stand(self._settings.pause)
+        if self.fix is not None and not self.fix.in_sight and self.fix.blind > self._settings.trusted:
+            self.fix = None
 
-    def _sure(self, posture: PoseGaussian) -> bool:
-        """Whether a recognition is exact enough to drive by; else another look, elsewhere, costs little."""
-        return exact_enough(posture, self._settings.sure, 1.0 + self._looked / math.tau)
+    def _make_sure(self) -> Behaviour:
+        """No landmark was in sight for a while: one look from here, else the robot counts as lost."""
+        self._searching = True
+        yield from self._helm.stand(self._settings.search.still)
+        self.fix = yield from self._search.look(1.0)
+        self._found()
 
-    def _ask(self, question: Question) -> Generator[Command, None, Answer]:
-        self._questions.append(question)
-        for _ in range(self._settings.answer_patience):
-            yield Command()
-            if question.number in self._answers:
-                return self._answers.pop(question.number)
-        return Answer(question.number, None, "nobody answered: is the map server up?")
+    def _in_the_way(self) -> str:
+        """What keeps the robot from getting on, as far as it can tell."""
+        ranges = self._helm.observation.proximity
+        bearings = self._description.ranger_bearings
+        if len(ranges) == len(bearings) and len(bearings):
+            nearest = int(np.argmin(ranges))
+            if ranges[nearest] < 2.0 * self._settings.detour.tight:
+                side = math.degrees(math.remainder(bearings[nearest], math.tau))
+                return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
+        return f"no headway in {self._settings.follower.patience:.0f} s, with nothing near"
 
-    def _number(self) -> int:
-        self._next_question += 1
-        return self._next_question - 1
 
-    def _wait(self, seconds: float) -> Behaviour:
-        for _ in range(max(1, round(seconds / self._description.tick))):
-            yield Command()
-
-    def _turn(self, angle: float) -> Behaviour:
-        turned, rate = 0.0, math.copysign(self._settings.turn_rate, angle)
-        while abs(turned) < abs(angle):
-            yield Command(0.0, rate)
-            turned += self._now.odometry.turn
-
-    @property
-    def _now(self) -> Observation:
-        assert self._observation is not None
-        return self._observation
+def _distances(route: tuple[RouteLeg, ...], before: int, after: int, fix: Fix) -> list[float]:
+    """Of the robot from the route's nodes that it has passed in one tick, m."""
+    reference = next((k for k, leg in enumerate(route) if leg.node.id == fix.node), 0)
+    distances = []
+    for leg in range(before, after):
+        between = Pose2()
+        for hop in route[min(leg, reference) + 1 : max(leg, reference) + 1]:
+            between = between @ hop.previous_from_node.mean
+        leg_from_reference = between if leg <= reference else between.inverse()
+        here = leg_from_reference @ fix.node_from_robot.mean
+        distances.append(math.hypot(here.x, here.y))
+    return distances

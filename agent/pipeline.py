@@ -24,6 +24,7 @@ from agent.observation import Command, Observation, RobotDescription
 from agent.passenger import Passenger, PassengerSettings
 from agent.resumption import Resumption, ResumptionSettings
 from agent.servo.proximity import guard
+from agent.tally import Tally
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from agent.wanderer import Wanderer
@@ -33,6 +34,7 @@ from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 
 IDENTITY = Pose2()
+NOTHING_DRIVEN = Tally()
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Status:
         legs: nodes on the first route of the drive, beginning and goal included.
         lost: whether it has given up to find itself on its own map: a fresh map must be begun.
         astray: whether it looks for a place of its own map; `map_from_robot` then means nothing.
+        tally: what the drive was made of so far.
     """
 
     doing: str
@@ -79,6 +82,7 @@ class Status:
     legs: int = 0
     lost: bool = False
     astray: bool = False
+    tally: Tally = NOTHING_DRIVEN
 
 
 @dataclass(frozen=True)
@@ -289,4 +293,5 @@ class Pipeline:
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
             astray=self._resumption is not None,
+            tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )

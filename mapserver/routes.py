@@ -30,12 +30,14 @@ class RouterSettings:
             robots keep apart on the two sides of a wall.
         entry_reach: a robot may enter the map at nodes nearer than this, m.
         entry_cost: what a metre from the robot to its first node costs: nobody has driven it yet.
+        wary_cost: what it costs to try again where another robot did not get through, m.
     """
 
     route: RouteSettings = field(default_factory=RouteSettings)
     near: float = 0.5
     entry_reach: float = 1.5
     entry_cost: float = 3.0
+    wary_cost: float = 4.0
 
 
 class Router:
@@ -66,7 +68,7 @@ class Router:
         start: NodeId,
         goal: NodeId,
         blocked: Collection[tuple[NodeId, NodeId]] = (),
-        penalties: Mapping[EdgeId, float] | None = None,
+        wary: Collection[tuple[NodeId, NodeId]] = (),
         start_from_robot: Pose2 | None = None,
     ) -> RouteAnswer:
         """Find the cheapest way.
@@ -75,7 +77,8 @@ class Router:
             start: a node that the robot knows itself by.
             goal: where it shall be.
             blocked: pairs of nodes, in either order, between which the robot cannot drive.
-            penalties: extra cost of edges, m.
+            wary: pairs of nodes, in either order, between which another robot did not get through: they are
+                driven only where every other way is much longer.
             start_from_robot: where the robot is. It may see the start node from afar, then the route begins
                 at a node that is nearer and better placed; None if it stands at the start node.
 
@@ -88,6 +91,7 @@ class Router:
                 return RouteAnswer((), f"{name} {node} is not in the merged map")
         if self._merged.component_of(start) != self._merged.component_of(goal):
             return RouteAnswer((), f"{start} and {goal} are in parts of the map that nothing joins yet")
+        penalties = self._penalties(wary)
         best: Route | None = None
         reason, best_cost = "", math.inf
         for entry, cost in self._entries(start, start_from_robot, blocked):
@@ -125,6 +129,12 @@ class Router:
             if (distance <= s.entry_reach or node == start) and frozenset((start, node)) not in barred
         ]
         return entries[:ENTRIES]
+
+    def _penalties(self, wary: Collection[tuple[NodeId, NodeId]]) -> Mapping[EdgeId, float]:
+        if not wary:
+            return {}
+        pairs, cost = {frozenset(pair) for pair in wary}, self._settings.wary_cost
+        return {edge.id: cost for edge in self._union.edges.values() if frozenset((edge.a, edge.b)) in pairs}
 
     def _relative(self, a: NodeId, b: NodeId) -> PoseGaussian:
         if a == b:

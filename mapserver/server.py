@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue
 import threading
 import time
@@ -13,6 +14,7 @@ from types import TracebackType
 
 from hybridmap.change import Change
 from hybridmap.errors import MapweaveError, NotConnected
+from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.ingest import Ingest
 from mapserver.known import Known
 from mapserver.merger import Merger
@@ -92,6 +94,9 @@ class MapServer:
         self._merger = Merger()
         self._lock = threading.Lock()
         self._changes: queue.SimpleQueue[Change | threading.Event | None] = queue.SimpleQueue()
+        # Wall time says nothing of simulated time, and what it decided would not repeat itself.
+        forget = BlockageSettings(forget=math.inf) if self._settings.lockstep else BlockageSettings()
+        self._blockages = Blockages(forget)
         self._answers = self._new_answers(MergedMap.empty())
         self._dirty = False
         self._stop = threading.Event()
@@ -208,8 +213,11 @@ class MapServer:
     def _route(self, payload: bytes) -> bytes:
         request = decode_route_request(payload)
         self._in_step()
+        with self._lock:
+            self._blockages.report(request.blocked, time.monotonic())
+            wary = self._blockages.known(time.monotonic())
         answer = self._answers.router.route(
-            request.start, request.goal, request.blocked, start_from_robot=request.start_from_robot
+            request.start, request.goal, request.blocked, wary, request.start_from_robot
         )
         return encode_route_answer(answer)
 

@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from agent.fleet import AgentReport, encode_mission
+from agent.fleet import encode_mission
 from agent.mission import Carried, Explore, Idle, Mission
+from agent.report import AgentReport
 from hybridmap.errors import InvalidValue, NotConnected
 from mapweave.trial import actions
 from mapweave.trial.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage

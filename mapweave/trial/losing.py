@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from agent.fleet import AgentReport
 from agent.mission import GoTo, Mission
+from agent.report import AgentReport
 from hybridmap.errors import NotConnected
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.fleet import AgentReport, decode_report
+from agent.report import AgentReport, decode_report
 from hybridmap.errors import InvalidMessage, NotConnected
 from hybridmap.node import MapId
 from mapweave.trial.recording import Trajectory

@@ -12,16 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.fleet import (
-    MAX_WORDS,
-    NO_ANSWER,
-    AgentReport,
-    FleetLink,
-    decode_mission,
-    decode_report,
-    encode_mission,
-    encode_report,
-)
+from agent.fleet import NO_ANSWER, FleetLink, decode_mission, encode_mission
 from agent.mission import (
     Answer,
     Carried,
@@ -35,6 +26,8 @@ from agent.mission import (
     WhichWay,
 )
 from agent.pipeline import Status
+from agent.report import MAX_WORDS, AgentReport, decode_report, encode_report
+from agent.tally import Tally
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidMessage
 from hybridmap.node import MapId, NodeId
@@ -70,12 +63,13 @@ node_ids = st.builds(NodeId, names, st.integers(0, 2**53), st.integers(0, 2**40)
 missions = st.one_of(st.just(Idle()), st.just(Explore()), st.just(Carried()), st.builds(GoTo, node_ids))
 finite = st.floats(-1e6, 1e6)
 words = st.text(st.characters(categories=["L", "N", "P", "Zs"]).filter(str.isprintable), max_size=200)
+counts = st.integers(0, 10**4)
 statuses = st.builds(
     Status,
     doing=words, detail=words, nodes=st.integers(0, 10**6), tracked=st.integers(0, 500),
     map_from_robot=st.builds(Pose2, finite, finite, finite), finished=st.booleans(), mission=words,
     fix_node=st.none() | node_ids, node_from_robot=st.builds(Pose2, finite, finite, finite),
-    legs=st.integers(0, 1000),
+    legs=st.integers(0, 1000), tally=st.builds(Tally, counts, counts, counts, counts),
 )  # fmt: skip
 
 

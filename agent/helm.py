@@ -1,0 +1,115 @@
+"""What a behaviour can do: stand, turn, drive on, ask. Each is a generator that yields a command a tick."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+
+from agent.mission import Answer, Question
+from agent.observation import Command, Observation, RobotDescription
+from agent.room import room
+from hybridmap.pose import Pose2
+
+Behaviour = Generator[Command, None, None]
+NO_ANSWER = "nobody answered: is the map server up?"
+
+
+class Helm:
+    """Ties behaviours, which read from top to bottom, to observations and answers, which come tick by tick.
+
+    Attributes:
+        odom_from_robot: where the wheels have brought the robot since the helm was made.
+        now: simulated or real time since then, s.
+    """
+
+    def __init__(self, description: RobotDescription, patience: int) -> None:
+        """Take the body.
+
+        Args:
+            description: of the robot.
+            patience: ticks that an answer may take before the question counts as lost.
+        """
+        self.odom_from_robot = Pose2()
+        self.now = 0.0
+        self._description = description
+        self._patience = patience
+        self._observation: Observation | None = None
+        self._answers: dict[int, Answer] = {}
+        self._questions: list[Question] = []
+        self._next_number = 1
+
+    @property
+    def observation(self) -> Observation:
+        """What the robot senses now."""
+        assert self._observation is not None, "take_in comes first"
+        return self._observation
+
+    def take_in(self, observation: Observation, answers: tuple[Answer, ...]) -> None:
+        """Begin a tick."""
+        self._observation = observation
+        self._answers.update({answer.number: answer for answer in answers})
+        self._questions = []
+        self.odom_from_robot = self.odom_from_robot @ observation.odometry.motion()
+        self.now += self._description.tick
+
+    def questions(self) -> list[Question]:
+        """What was asked in this tick."""
+        return self._questions
+
+    def number(self) -> int:
+        """For the next question."""
+        self._next_number += 1
+        return self._next_number - 1
+
+    # Behaviours
+
+    def ask(self, question: Question) -> Generator[Command, None, Answer]:
+        """Ask the fleet's map, and stand until the answer comes or is overdue."""
+        self._questions.append(question)
+        for _ in range(self._patience):
+            yield Command()
+            if question.number in self._answers:
+                return self._answers.pop(question.number)
+        return Answer(question.number, None, NO_ANSWER)
+
+    def stand(self, seconds: float) -> Behaviour:
+        """Stand still."""
+        for _ in range(max(1, round(seconds / self._description.tick))):
+            yield Command()
+
+    def turn(self, angle: float, rate: float) -> Behaviour:
+        """Turn on the spot by the wheels; a robot that cannot turn gives up after three times the time.
+
+        Args:
+            angle: rad.
+            rate: rad/s, not negative.
+        """
+        turned = 0.0
+        for _ in range(math.ceil(3.0 * abs(angle) / rate / self._description.tick) + 1):
+            if abs(turned) >= abs(angle):
+                return
+            yield Command(0.0, math.copysign(rate, angle))
+            turned += self.observation.odometry.turn
+
+    def drive_on(self, way: float, speed: float) -> Behaviour:
+        """Drive straight on, no further than the rangers see room.
+
+        Args:
+            way: m.
+            speed: m/s.
+        """
+        begin = self.odom_from_robot
+        for _ in range(math.ceil(2.0 * way / speed / self._description.tick)):
+            left = way - begin.distance(self.odom_from_robot)
+            if left < 0.02 or self.room(0.0) < 0.02:
+                return
+            yield Command(speed, 0.0)
+
+    def room(self, direction: float) -> float:
+        """How far the robot may move in a direction (rad, 0 ahead), m; 0 where no ranger looks."""
+        return room(self._description, self.observation.proximity, direction, 0.0)
+
+    def freest(self) -> tuple[float, float]:
+        """Room and direction (m, rad) where there is most."""
+        ways = [(self.room(bearing), bearing) for bearing in self._description.ranger_bearings]
+        return max(ways, key=lambda one: one[0], default=(0.0, 0.0))

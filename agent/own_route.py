@@ -1,0 +1,43 @@
+"""A way through the robot's own map, for when no map server answers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from itertools import pairwise
+
+import numpy as np
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import RouteAnswer, RouteLeg
+from hybridmap.route import find_route
+
+
+def own_route(
+    own_map: HybridMap,
+    start: NodeId,
+    goal: NodeId,
+    blocked: Collection[tuple[NodeId, NodeId]] = (),
+) -> RouteAnswer:
+    """Find the cheapest way between two nodes of the own map.
+
+    Relative postures are those of the edges: nothing is optimised here, so a long way is as exact as its
+    hops together.
+
+    Args:
+        own_map: of this robot.
+        start: node that the robot knows itself by.
+        goal: where it shall be.
+        blocked: pairs of nodes, in either order, between which the robot cannot drive.
+    """
+    found = find_route(own_map, start, goal, blocked=blocked)
+    if not found.nodes:
+        return RouteAnswer((), f"own map: {found.reason}")
+    here = PoseGaussian(Pose2(), np.zeros((3, 3)))
+    legs = [RouteLeg(own_map.nodes[start], here, None)]
+    for (before, node), edge in zip(pairwise(found.nodes), found.edges, strict=True):
+        relative = own_map.edge_between(before, node)
+        assert relative is not None, "the route runs along edges"
+        legs.append(RouteLeg(own_map.nodes[node], relative, own_map.edges[edge].kind))
+    return RouteAnswer(tuple(legs), f"own map: {found.reason}")

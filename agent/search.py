@@ -1,0 +1,182 @@
+"""A lost robot's search for itself: look, recognise, ask, turn, and drive on where all views are alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from agent.fix import Fix
+from agent.helm import Behaviour, Helm
+from agent.localizer import Localizer, LocalizerSettings
+from agent.mission import WhereAmI
+from agent.observation import Command, RobotDescription
+from agent.recall import exact_enough, recall_all
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Node
+from hybridmap.pose import PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer
+from hybridmap.recognition import Recognition
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How a lost robot finds itself.
+
+    Attributes:
+        still: seconds that it stands still before a look.
+        look_turn: between two looks, rad.
+        turn_rate: of that turn, rad/s.
+        least_features: a view with fewer is not worth a question.
+        sure: standard deviations up to which it believes a recognition at once, m and rad; the longer it has
+            looked around, the less it asks for: twice as much after a whole turn.
+        rival: another node of the own map with this share of the best one's inliers has a say too;
+        apart: if it puts the robot further away than this, m, the view is ambiguous.
+        move: after a whole turn in vain it looks from elsewhere: this far away, m, if there is room,
+        least_move: and at least this far, m; else it goes on turning.
+        speed: of that drive, m/s.
+        localizer: tracking and filtering of the landmarks that it has found.
+    """
+
+    still: float = 0.2
+    look_turn: float = 0.5
+    turn_rate: float = 0.6
+    least_features: int = 8
+    sure: tuple[float, float] = (0.06, 0.03)
+    rival: float = 0.6
+    apart: float = 0.5
+    move: float = 0.8
+    least_move: float = 0.2
+    speed: float = 0.2
+    localizer: LocalizerSettings = field(default_factory=LocalizerSettings)
+
+
+class Search:
+    """Finds out where the robot is. Of two places that look the same it takes neither.
+
+    Attributes:
+        detail: what it sees, in words.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        sift: Sift,
+        own_map: HybridMap,
+        helm: Helm,
+        settings: SearchSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Take the means.
+
+        Args:
+            description: of the robot.
+            lens: of its camera.
+            sift: finds features.
+            own_map: is asked before the fleet's.
+            helm: what moves the robot, and asks.
+            settings: how.
+            rng: for verification.
+        """
+        self.detail = ""
+        self._description = description
+        self._lens = lens
+        self._sift = sift
+        self._own_map = own_map
+        self._helm = helm
+        self._settings = settings
+        self._rng = rng
+        self._ambiguous = ""
+
+    def look_around(self) -> Generator[Command, None, Fix]:
+        """Look, ask, turn a little, and drive on after each whole turn, until somebody knows the view."""
+        s, looked = self._settings, 0.0
+        self.detail, self._ambiguous = "looking", ""
+        while True:
+            yield from self._helm.stand(s.still)
+            fix = yield from self.look(1.0 + looked / math.tau)
+            if fix is not None:
+                return fix
+            yield from self._helm.turn(s.look_turn, s.turn_rate)
+            before, looked = looked, looked + s.look_turn
+            if looked // math.tau > before // math.tau:
+                yield from self._move_on()
+
+    def look(self, leniency: float) -> Generator[Command, None, Fix | None]:
+        """Recognise the current view on the own map, else ask the fleet's.
+
+        Args:
+            leniency: by how much a recognition may be less exact than `sure`.
+        """
+        s, image = self._settings, self._helm.observation.image
+        if image is None:
+            self.detail = "no image from the camera"
+            return None
+        features = self._sift.extract(image)
+        if len(features) < s.least_features:
+            self.detail = f"only {len(features)} features in view"
+            return None
+        view = features.view(self._description.camera)
+        own = self._known(recall_all(self._own_map, view, self._rng))
+        if own is not None and self._exact(own[1].node_from_robot, leniency):
+            node, recognition = own
+            self.detail = f"own map: node {node.id}, {recognition.inliers} landmarks agree"
+            return Fix.of(
+                Localizer(self._description, self._lens, node, image, features, recognition, s.localizer)
+            )
+        answer = yield from self._helm.ask(WhereAmI(self._helm.number(), view))
+        if not isinstance(answer.content, RelocalizeAnswer):
+            self.detail = answer.error or "no answer"
+            return None
+        self.detail = answer.content.reason
+        if answer.content.certainty is Certainty.AMBIGUOUS:
+            self._ambiguous = answer.content.reason
+            self.detail = f"ambiguous: {self._ambiguous}"
+        if answer.content.certainty is not Certainty.FOUND:
+            return None
+        best = answer.content.candidates[0]
+        if not self._exact(best.node_from_robot, leniency):
+            self.detail += ", but not exactly enough"
+            return None
+        # The robot has stood still while the answer was on its way.
+        return Fix(best.node, best.node_from_robot)
+
+    def _known(self, recalled: list[tuple[Node, Recognition]]) -> tuple[Node, Recognition] | None:
+        """The own node that is seen best, unless another one, elsewhere, is seen about as well."""
+        s = self._settings
+        if not recalled:
+            return None
+        node, best = recalled[0]
+        here = node.map_from_robot.mean @ best.node_from_robot.mean
+        for other, also in recalled[1:]:
+            there = other.map_from_robot.mean @ also.node_from_robot.mean
+            if also.inliers >= s.rival * best.inliers and here.distance(there) > s.apart:
+                self._ambiguous = f"nodes {node.id} and {other.id} look the same"
+                return None
+        return node, best
+
+    def _exact(self, posture: PoseGaussian, leniency: float) -> bool:
+        """Whether a recognition is exact enough to drive by; else another look, elsewhere, costs little."""
+        return exact_enough(posture, self._settings.sure, leniency)
+
+    def _move_on(self) -> Behaviour:
+        """All views from here are unknown or alike: look from where there is room.
+
+        Whatever tells two places apart is to be seen from somewhere: a door that stands elsewhere, a
+        picture around the corner.
+        """
+        s = self._settings
+        way, direction = self._helm.freest()
+        if way < s.least_move:
+            self.detail = "no room to look from elsewhere"
+            return
+        why = f"ambiguous, {self._ambiguous}" if self._ambiguous else "nothing here is known"
+        self.detail = f"{why}: driving on to look from elsewhere"
+        self._ambiguous = ""
+        yield from self._helm.turn(math.remainder(direction, math.tau), s.turn_rate)
+        yield from self._helm.drive_on(min(way, s.move), s.speed)

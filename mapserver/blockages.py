@@ -1,0 +1,56 @@
+"""Ways that robots could not drive, kept for the others: whoever asks for a route is led around them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from hybridmap.node import NodeId
+
+Pair = tuple[NodeId, NodeId]
+
+
+@dataclass(frozen=True)
+class BlockageSettings:
+    """How long what a robot said counts for the others.
+
+    Attributes:
+        forget: after it was said last, s; infinite where only simulated time passes, which no server knows.
+        most: so many pairs are kept, those that were said last.
+    """
+
+    forget: float = 120.0
+    most: int = 256
+
+
+class Blockages:
+    """Pairs of nodes between which some robot did not get through, with when it said so.
+
+    A robot says it in the question for its next route. That robot bars the pair for itself; for all others
+    it is only dear: what stood in one robot's way may have gone, and need not be in another's.
+    """
+
+    def __init__(self, settings: BlockageSettings | None = None) -> None:
+        """Nothing is blocked."""
+        self._settings = settings or BlockageSettings()
+        self._said: dict[Pair, float] = {}
+
+    def report(self, pairs: Collection[Pair], now: float) -> None:
+        """A robot could not get through here.
+
+        Args:
+            pairs: of nodes, in either order.
+            now: of the server's clock, s.
+        """
+        for a, b in pairs:
+            pair = (a, b) if a <= b else (b, a)
+            self._said.pop(pair, None)
+            self._said[pair] = now
+        while len(self._said) > self._settings.most:
+            del self._said[next(iter(self._said))]
+
+    def known(self, now: float) -> list[Pair]:
+        """What still counts at a time of the server's clock, s."""
+        forget = self._settings.forget
+        self._said = {pair: said for pair, said in self._said.items() if now - said < forget}
+        return list(self._said)
