@@ -101,6 +101,11 @@ class Mapper:
         return "the camera gives no new image" if self.doubtful else ""
 
     @property
+    def health(self) -> str:
+        """What is wrong with the estimate of the posture, in words; empty if nothing is."""
+        return self._tracking.health[1] if self.started else ""
+
+    @property
     def anchor_from_robot(self) -> Pose2:
         """Posture since the anchor view."""
         return self._tracking.pose.mean

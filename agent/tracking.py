@@ -12,12 +12,16 @@ from agent.continuity import Continuity, ContinuitySettings, Sight, relit, turne
 from agent.dispute import Dispute, DisputeSettings
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings, MappingFilter
+from agent.ekf.report import Health
 from agent.observation import Observation, RobotDescription
+from agent.strikes import Strikes
 from agent.track_history import TrackHistory
 from agent.view import View, associate, even_choice
+from agent.vision.hidden import Hidden, HiddenSettings
 from agent.vision.lens import Lens
 from agent.vision.report import TrackReport
 from agent.vision.sift import Features
+from agent.vision.template import Templates
 from agent.vision.tracker import Tracker, TrackerSettings
 from hybridmap.pose import Array, Pose2, PoseGaussian
 
@@ -32,6 +36,8 @@ class TrackingSettings:
         filtered: landmarks in the EKF; further tracks are triangulated against its trajectory.
         refill: with fewer left than this, further tracks are taken into the EKF: those that were chosen first
             may all be on the side that the robot turns away from.
+        hidden: landmarks that somebody hides wait in the EKF, and are looked for where they should be.
+        most_filtered: landmarks in the EKF, hidden ones and those that came in their stead included.
         least_filtered: with fewer landmarks in view the wheels are trusted alone.
         least_spread: likewise if they cover less than this share of the image's width.
         associate_px: a feature this near to a track is the same point.
@@ -52,6 +58,8 @@ class TrackingSettings:
     filter: FilterSettings = field(default_factory=FilterSettings)
     filtered: int = 36
     refill: int = 18
+    hidden: HiddenSettings = field(default_factory=HiddenSettings)
+    most_filtered: int = 54
     least_filtered: int = 5
     least_spread: float = 0.2
     associate_px: float = 1.5
@@ -83,9 +91,10 @@ class Tracking:
     def __init__(self, description: RobotDescription, lens: Lens, settings: TrackingSettings) -> None:
         """Start with nothing in view."""
         self.history = TrackHistory()
-        self._camera = description.camera
+        self._camera, self._lens = description.camera, lens
         self._settings = settings
         self._tracker = Tracker(lens, settings.tracker)
+        self._hidden = Hidden(settings.hidden)
         own = replace(settings.filter, side_slip=description.side_slip)
         self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
         # Two images are compared by points that live for one step: nothing to hold them to.
@@ -96,7 +105,7 @@ class Tracking:
         self._believed: NDArray[np.uint8] | None = None
         self._since_believed = Pose2()
         self._misses_px: Array = np.zeros((0, 2))
-        self._strikes: dict[int, int] = {}
+        self._strikes = Strikes(settings.strikes)
         self._expected_depth = 1.0
         self._next_track = 1
 
@@ -120,6 +129,11 @@ class Tracking:
     def pose(self) -> PoseGaussian:
         """`anchor_from_robot`."""
         return self._filter.pose
+
+    @property
+    def health(self) -> tuple[Health, str]:
+        """What holds the posture up, and in words what is wrong; empty if nothing is."""
+        return self._filter.health
 
     @property
     def doubtful(self) -> bool:
@@ -155,10 +169,13 @@ class Tracking:
             self.missing += self._believed is not None
             return
         self.missing = 0
+        ids, templates = self._tracker.ids, self._tracker.templates
         if not self._follow(observation.image):
             return
-        # A landmark whose track is lost stays out: what it taught is in the posture already.
-        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
+        self._seek_hidden(observation.image, ids, templates)
+        # A landmark that is gone stays out: what it taught is in the posture already.
+        alive = np.concatenate([self._tracker.ids, self._hidden.ids])
+        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive)])
         filtered = np.isin(self._tracker.ids, self._filter.ids)
         pixels = self._tracker.pixels[filtered]
         self._misses_px = np.zeros((0, 2))
@@ -166,8 +183,10 @@ class Tracking:
             ids = self._tracker.ids[filtered]
             update = self._filter.update(ids, pixels)
             self._misses_px = update.innovations_px[update.accepted]
-            self._judge(ids, update.accepted)
-        if len(self._filter.ids) < self._settings.refill:
+            refused = self._strikes.judge(ids, update.accepted)
+            self._filter.remove(refused)
+            self._tracker.keep(~np.isin(self._tracker.ids, refused))
+        if len(self._filter.ids) - len(self._hidden.ids) < self._settings.refill:
             self._fill()
         self.remember()
 
@@ -187,7 +206,7 @@ class Tracking:
         self._next_track += len(ids)
         view.tracks[new] = ids
         self._tracker.add(ids, view.features.raw[new])
-        self._strikes = {int(track): 0 for track in self._tracker.ids}
+        self._strikes.forget()
         self._expected_depth = expected_depth
         self._fill(first=int(ids[0]) if len(ids) else self._next_track)
         self.remember(force=True)
@@ -204,7 +223,8 @@ class Tracking:
 
         What was seen of them before is in the history alone: to the filter they are new.
         """
-        room = self._settings.filtered - len(self._filter.ids)
+        s, held = self._settings, len(self._filter.ids)
+        room = min(s.filtered - held + len(self._hidden.ids), s.most_filtered - held)
         inside = np.isin(self._tracker.ids, self._filter.ids)
         candidates = ~inside & (self._tracker.ids >= first)
         if room <= 0 or not candidates.any():
@@ -215,6 +235,25 @@ class Tracking:
         nearest = self._settings.prior_near / max(self._camera.mount_height, 0.05)
         sigmas = np.maximum(self._settings.prior_spread * inverse_depths, nearest)
         self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
+
+    def _seek_hidden(self, image: NDArray[np.uint8], ids: NDArray[np.int64], templates: Templates) -> None:
+        """Of the tracks that were followed until now, ids (N,), hide those just lost; find others again."""
+        lost = ~np.isin(ids, self._tracker.ids) & np.isin(ids, self._filter.ids)
+        if self._settings.tracker.anchored:
+            self._hidden.take(ids[lost], templates.chosen(lost))
+        self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
+        if not len(self._hidden.ids):
+            return
+        expected = self._filter.predict_pixels(self._hidden.ids)
+        # What has left the view, or is leaving it, is not hidden.
+        margin = self._settings.tracker.border_px + self._settings.hidden.template.half_px
+        far_in = np.array([self._camera.width, self._camera.height]) - margin
+        inside = ((expected >= margin) & (expected < far_in)).all(axis=1)
+        self._hidden.keep(inside)
+        expected = expected[inside]
+        found, raw, patches = self._hidden.seek(image, self._lens.distort(expected))
+        if len(found):
+            self._tracker.add(found, raw, patches)
 
     def _frozen(self, image: NDArray[np.uint8]) -> bool:
         """Whether an image is the last one again, to the last grey level, although the wheels have moved.
@@ -277,16 +316,3 @@ class Tracking:
         s = self._settings
         spread = float(np.ptp(pixels[:, 0])) if len(pixels) else 0.0
         return len(pixels) >= s.least_filtered and spread >= s.least_spread * self._camera.width
-
-    def _judge(self, ids: NDArray[np.int64], accepted: NDArray[np.bool_]) -> None:
-        """Give up tracks that the filter keeps refusing: they are on something that moves, or have slid."""
-        given_up = []
-        for track, good in zip(ids.tolist(), accepted.tolist(), strict=True):
-            strikes = 0 if good else self._strikes.get(track, 0) + 1
-            self._strikes[track] = strikes
-            if strikes >= self._settings.strikes:
-                given_up.append(track)
-        if given_up:
-            gone = np.array(given_up, np.int64)
-            self._filter.remove(gone)
-            self._tracker.keep(~np.isin(self._tracker.ids, gone))

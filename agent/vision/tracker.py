@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.vision.lens import Lens
-from agent.vision.template import TemplateMatcher, TemplateSettings
+from agent.vision.template import TemplateMatcher, Templates, TemplateSettings
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array
 
@@ -55,6 +55,7 @@ class Tracker:
         ages: (N,) int64, images into which they were followed so far.
         held: (N,) whether they were found by the patch in which they were first seen, or from frame to frame
             alone.
+        templates: the patches; none if points are not held to any.
     """
 
     def __init__(self, lens: Lens, settings: TrackerSettings | None = None) -> None:
@@ -67,7 +68,7 @@ class Tracker:
         self.ages: NDArray[np.int64] = np.zeros(0, np.int64)
         self.held: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._matcher = TemplateMatcher(self._settings.template)
-        self._templates = self._matcher.none()
+        self.templates = self._matcher.none()
 
     @property
     def pixels(self) -> Array:
@@ -120,16 +121,17 @@ class Tracker:
         self.keep(kept)
         self.ages = self.ages + 1
         if s.anchored:
-            match = self._matcher.match(self._templates, image, self.raw)
-            self.raw, self.held, self._templates = match.raw, match.held, match.templates
+            match = self._matcher.match(self.templates, image, self.raw)
+            self.raw, self.held, self.templates = match.raw, match.held, match.templates
         return lost
 
-    def add(self, ids: NDArray[np.int64], raw: Array) -> None:
+    def add(self, ids: NDArray[np.int64], raw: Array, templates: Templates | None = None) -> None:
         """Follow more points of the last image.
 
         Args:
             ids: (N,) that no point has yet.
             raw: (N, 2) px in the real image.
+            templates: their patches if they were seen before; else they are cut from the image.
 
         Raises:
             InvalidValue: there was no image yet.
@@ -141,7 +143,8 @@ class Tracker:
         self.ages = np.concatenate([self.ages, np.zeros(len(ids), np.int64)])
         self.held = np.concatenate([self.held, np.full(len(ids), self._settings.anchored)])
         if self._settings.anchored:
-            self._templates = self._templates.joined(self._matcher.cut(self._image, raw))
+            cut = self._matcher.cut(self._image, raw) if templates is None else templates
+            self.templates = self.templates.joined(cut)
 
     def relight(self, image: NDArray[np.uint8]) -> None:
         """Take the last image as it is in another light: (H, W) grey, from the same place."""
@@ -154,7 +157,7 @@ class Tracker:
         self.ids, self.raw = self.ids[mask], self.raw[mask]
         self.ages, self.held = self.ages[mask], self.held[mask]
         if self._settings.anchored:
-            self._templates = self._templates.chosen(mask)
+            self.templates = self.templates.chosen(mask)
 
     def clear(self) -> None:
         """Follow nothing."""
