@@ -9,7 +9,8 @@ import numpy as np
 
 from agent.cartographer import HERE, Cartographer, CartographerSettings
 from agent.observation import Observation, RobotDescription
-from agent.tracking import Tracking, TrackingSettings
+from agent.track_settings import TrackingSettings
+from agent.tracking import Tracking
 from agent.view import View
 from agent.vision.lens import Lens
 from agent.vision.report import TrackReport

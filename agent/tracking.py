@@ -3,75 +3,28 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.continuity import Continuity, ContinuitySettings, Sight, relit, turned
-from agent.dispute import Dispute, DisputeSettings
+from agent.continuity import Continuity, Sight, relit, turned
+from agent.dispute import Dispute
 from agent.ekf.landmarks import LandmarkEstimates
-from agent.ekf.mapping import FilterSettings, MappingFilter
+from agent.ekf.mapping import MappingFilter
 from agent.ekf.report import Health
 from agent.observation import Observation, RobotDescription
 from agent.strikes import Strikes
 from agent.track_history import TrackHistory
+from agent.track_settings import TrackingSettings
 from agent.view import View, associate, even_choice
-from agent.vision.hidden import Hidden, HiddenSettings
+from agent.vision.hidden import Hidden
 from agent.vision.lens import Lens
 from agent.vision.report import TrackReport
 from agent.vision.sift import Features
 from agent.vision.template import Templates
-from agent.vision.tracker import Tracker, TrackerSettings
+from agent.vision.tracker import Tracker
 from hybridmap.pose import Array, Pose2, PoseGaussian
-
-
-@dataclass(frozen=True)
-class TrackingSettings:
-    """How landmarks are followed.
-
-    Attributes:
-        tracker: of image points.
-        filter: the mapping EKF.
-        filtered: landmarks in the EKF; further tracks are triangulated against its trajectory.
-        refill: with fewer left than this, further tracks are taken into the EKF: those that were chosen first
-            may all be on the side that the robot turns away from.
-        hidden: landmarks that somebody hides wait in the EKF, and are looked for where they should be.
-        most_filtered: landmarks in the EKF, hidden ones and those that came in their stead included.
-        least_filtered: with fewer landmarks in view the wheels are trusted alone.
-        least_spread: likewise if they cover less than this share of the image's width.
-        associate_px: a feature this near to a track is the same point.
-        strikes: a track that the filter refuses this often in a row is given up.
-        prior_spread: sigma of a new landmark's inverse depth, as a share of the expected one ...
-        prior_near: ... but no less than this over the camera's height: a landmark may always be about as near
-            as the floor. A robot before a bare wall would else take its nearness for a slip of the wheels.
-        continuity: whether an image continues the one before.
-        dispute: when wheels and images contradict each other.
-        patience: images that show other things than they should, one after the other, before the robot
-            takes itself for carried off. A person who walks by is gone by then.
-        blank_patience: likewise images that show nothing: somebody has switched off the light.
-        dropped: images that may be missing, one after the other, before the robot should wait for the next.
-        stale: m and rad; once the wheels have moved this much, nothing can be said of an image before.
-    """
-
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    filter: FilterSettings = field(default_factory=FilterSettings)
-    filtered: int = 36
-    refill: int = 18
-    hidden: HiddenSettings = field(default_factory=HiddenSettings)
-    most_filtered: int = 54
-    least_filtered: int = 5
-    least_spread: float = 0.2
-    associate_px: float = 1.5
-    strikes: int = 3
-    prior_spread: float = 0.6
-    prior_near: float = 0.45
-    continuity: ContinuitySettings = field(default_factory=ContinuitySettings)
-    dispute: DisputeSettings = field(default_factory=DisputeSettings)
-    patience: int = 30
-    blank_patience: int = 100
-    dropped: int = 3
-    stale: tuple[float, float] = (0.4, 0.5)
 
 
 class Tracking:
@@ -248,7 +201,7 @@ class Tracking:
         # What has left the view, or is leaving it, is not hidden.
         margin = self._settings.tracker.border_px + self._settings.hidden.template.half_px
         far_in = np.array([self._camera.width, self._camera.height]) - margin
-        inside = ((expected >= margin) & (expected < far_in)).all(axis=1)
+        inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < far_in)).all(axis=1))
         self._hidden.keep(inside)
         expected = expected[inside]
         found, raw, patches = self._hidden.seek(image, self._lens.distort(expected))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from agent.continuity import Continuity, ContinuitySettings, Sight, relit, turned
 from agent.mapper import Mapper, MapperSettings
 from agent.observation import Observation, Odometry
-from agent.tracking import TrackingSettings
+from agent.track_settings import TrackingSettings
 from agent.vision.lens import Lens
 from agent.vision.tracker import TrackerSettings
 from hybridmap.camera import Camera

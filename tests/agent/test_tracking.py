@@ -8,7 +8,8 @@ import numpy as np
 
 from agent.cartographer import HERE
 from agent.observation import Observation, Odometry
-from agent.tracking import Tracking, TrackingSettings
+from agent.track_settings import TrackingSettings
+from agent.tracking import Tracking
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.pose import Pose2
