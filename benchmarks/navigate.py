@@ -39,6 +39,9 @@ from hybridmap.errors import InvalidValue, MapweaveError
 from sim.floorplan import FloorPlan
 from sim.robots import RobotSetup
 
+WIDTH = 140
+"""Of what is printed into a file or a pipe, characters."""
+
 Figures = dict[str, float | int | None]
 
 
@@ -47,6 +50,8 @@ def main() -> None:
     arguments = _arguments()
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json)
+    if not console.is_terminal:
+        console = Console(stderr=arguments.json, width=WIDTH)
     try:
         outcomes, mapped, plan = _run(arguments, console)
         pictures = draw(outcomes, mapped, plan, arguments.out)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 
-from benchmarks.navigate_floor import Floor, Ways
+from benchmarks.navigate_floor import Floor
 from benchmarks.navigate_office import Mapped
 from hybridmap.errors import InvalidValue
 from hybridmap.node import NodeId
@@ -69,8 +69,11 @@ def draw_plot(mapped: Mapped, plan: FloorPlan, floor: Floor, rng: np.random.Gene
             continue
         if not _unmapped(mapped, start):
             continue
+        far = _goals(mapped, start)
+        if not far:
+            continue
         ways = floor.ways_from(start)
-        goals = _goals(mapped, start, ways)
+        goals = [one for one in far if math.isfinite(ways.to(mapped.truth[one[0]]))]
         if goals:
             goal, edges = goals[int(rng.integers(len(goals)))]
             return Plot(start, goal, mapped.truth[goal], edges, ways.to(mapped.truth[goal]))
@@ -86,8 +89,8 @@ def _unmapped(mapped: Mapped, start: Pose2) -> bool:
     )
 
 
-def _goals(mapped: Mapped, start: Pose2, ways: Ways) -> list[tuple[NodeId, int]]:
-    """Goals with the edges that lead to them from the node next to the start."""
+def _goals(mapped: Mapped, start: Pose2) -> list[tuple[NodeId, int]]:
+    """Goals with a view, with the edges that lead to them from the node next to the start."""
     graph = mapped.nodes.graph
     beside = min(mapped.truth, key=lambda node: (mapped.truth[node].distance(start), node))
     hops = nx.single_source_shortest_path_length(graph, beside)
@@ -97,5 +100,4 @@ def _goals(mapped: Mapped, start: Pose2, ways: Ways) -> list[tuple[NodeId, int]]
         if edges >= LEAST_EDGES
         and node in mapped.truth
         and len(mapped.nodes.nodes[node].landmarks) >= LEAST_LANDMARKS
-        and math.isfinite(ways.to(mapped.truth[node]))
     ]

@@ -1,0 +1,158 @@
+"""The navigation benchmark: shortest ways against geometry, starts and goals keep their word, figures."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from agent.pipeline import Status
+from agent.tally import Tally
+from benchmarks.navigate import main, summary
+from benchmarks.navigate_drives import Outcome, _reason
+from benchmarks.navigate_floor import Floor
+from benchmarks.navigate_office import Mapped
+from benchmarks.navigate_plots import LEAST_EDGES, Plot, draw_plot
+from hybridmap.change import EdgePut, NodePut
+from hybridmap.errors import InvalidValue
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId
+from hybridmap.pose import Pose2, wrap_angle
+from hybridmap.synthetic import room, take_map
+from mapweave.scoring import crossed
+from sim.floorplan import FloorPlan, Rectangle
+
+RADIUS = 0.17
+WALL = Rectangle.spanning(2.9, 0.0, 3.1, 3.0, "wall")
+PLAN = FloorPlan((Rectangle.spanning(0, 0, 6, 4, "room"),), (WALL,))
+"""A room with a wall from the south that leaves 1 m at the north."""
+
+
+@pytest.fixture(scope="module")
+def floor() -> Floor:
+    return Floor.of(PLAN, RADIUS)
+
+
+@pytest.fixture(scope="module")
+def mapped() -> Mapped:
+    """Ten nodes west of the wall, in a chain."""
+    rng = np.random.default_rng(1)
+    truth = [Pose2(0.5 + 0.2 * k, 0.6 + 0.25 * k, 0.7 * k) for k in range(10)]
+    nodes, edges = take_map(room(0, 0, 2.9, 4, 900, rng), MapId("r0", 1), truth, rng)
+    contents = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    return Mapped(contents, {node.id: pose for node, pose in zip(nodes, truth, strict=True)})
+
+
+def test_the_shortest_way_leads_around_the_corner(floor: Floor) -> None:
+    """Against the taut string around the wall's two corners, at the robot's radius."""
+    start, goal = Pose2(1.5, 1.0), Pose2(4.5, 1.0)
+    corners = np.array([[2.9, 3.0], [3.1, 3.0]])
+
+    def taut(a: np.ndarray, corner: np.ndarray) -> tuple[float, float]:
+        """Length of the tangent from a point to the circle, and the angle where it touches."""
+        reach = float(np.linalg.norm(corner - a))
+        return math.sqrt(reach**2 - RADIUS**2), math.acos(RADIUS / reach)
+
+    left = np.array([start.x, start.y])
+    length, touch = taut(left, corners[0])
+    toward = math.atan2(*(left - corners[0])[::-1])
+    arc = wrap_angle(toward - touch - math.pi / 2)
+    expected = 2 * (length + RADIUS * abs(arc)) + 0.2
+    found = floor.ways_from(start).to(goal)
+    assert expected - 0.06 <= found <= 1.03 * expected + 0.06
+
+
+def test_free_ways_are_about_straight_and_symmetric(floor: Floor) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        a, b = (Pose2(*rng.uniform((0.3, 0.3), (2.6, 3.7))) for _ in range(2))
+        there, back = floor.ways_from(a).to(b), floor.ways_from(b).to(a)
+        assert there == pytest.approx(back, abs=1e-9)
+        assert a.distance(b) - 1e-9 <= there <= 1.03 * a.distance(b) + 0.08
+
+
+def test_no_way_leads_into_a_wall_or_outside(floor: Floor) -> None:
+    assert math.isinf(floor.ways_from(Pose2(1.0, 1.0)).to(Pose2(8.0, 1.0)))
+    assert math.isinf(floor.ways_from(Pose2(-3.0, 1.0)).to(Pose2(1.0, 1.0)))
+    closed = FloorPlan(PLAN.rooms, (Rectangle.spanning(2.9, 0.0, 3.1, 4.0),))
+    assert math.isinf(Floor.of(closed, RADIUS).ways_from(Pose2(1.0, 1.0)).to(Pose2(5.0, 1.0)))
+
+
+def test_plots_are_what_they_promise(mapped: Mapped, floor: Floor) -> None:
+    starts = set()
+    for seed in range(20):
+        plot = draw_plot(mapped, PLAN, floor, np.random.default_rng(seed))
+        start = plot.world_from_robot
+        starts.add(start)
+        assert PLAN.is_free(start.x, start.y, 0.3)
+        for taken in mapped.truth.values():
+            turned = abs(wrap_angle(start.heading - taken.heading))
+            assert start.distance(taken) >= 0.15 or turned >= math.radians(15)
+        beside = min(mapped.truth, key=lambda node: mapped.truth[node].distance(start))
+        assert nx.shortest_path_length(mapped.nodes.graph, beside, plot.goal) == plot.edges >= LEAST_EDGES
+        line = np.array([[mapped.truth[beside].x, mapped.truth[beside].y], [start.x, start.y]])
+        assert not crossed(line[:1], line[1:], PLAN.walls)[0]
+        assert plot.shortest >= start.distance(plot.world_from_goal)
+    assert len(starts) == 20, "another seed is another start"
+
+
+def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: Floor) -> None:
+    few = sorted(mapped.truth)[:LEAST_EDGES]
+    small = Mapped(mapped.nodes, {node: mapped.truth[node] for node in few})
+    with pytest.raises(InvalidValue, match="explore for longer"):
+        draw_plot(small, PLAN, floor, np.random.default_rng(0))
+
+
+def outcome(mapped: Mapped, **other: object) -> Outcome:
+    goal = max(mapped.truth)
+    plot = Plot(Pose2(0.5, 0.5), goal, mapped.truth[goal], 5, 2.0)
+    status = Status("parked at the goal", "", 10, 0, Pose2(), True, tally=Tally(4, 1, 2, 0))
+    picture = np.zeros((4, 4), np.uint8)
+    one = Outcome(plot, status, "", 1.0, 30.0, 0.004, 0.3, 0, 3.0, (), picture, picture, np.zeros((2, 2)))
+    return replace(one, **other)  # type: ignore[arg-type]
+
+
+def test_figures_count_failures_as_such(mapped: Mapped) -> None:
+    away = Status("driving along the route", "", 10, 0, Pose2(), False, tally=Tally(1, 0, 1, 3))
+    outcomes = [
+        outcome(mapped),
+        outcome(mapped, error_m=0.006, driven=2.2),
+        outcome(mapped, status=away, reason="not there", error_m=3.0, collisions=2, found_s=None),
+    ]
+    figures = summary(outcomes)
+    assert figures["success"] == pytest.approx(2 / 3, abs=1e-4) and figures["arrived"] == 2
+    assert figures["goal_error_m_median"] == 0.005, "who never arrived has no goal error, but no success"
+    assert figures["collisions"] == 2 and figures["path_over_shortest"] == pytest.approx(1.3)
+    assert (figures["edges_driven"], figures["nodes_skipped"]) == (9, 2)
+    assert (figures["relocalizations"], figures["blocks"]) == (5, 3)
+    nobody = summary(outcomes[2:])
+    assert nobody["success"] == 0.0 and nobody["goal_error_m_median"] is None
+
+
+def test_a_drive_fails_for_each_reason(mapped: Mapped) -> None:
+    there, away = outcome(mapped).status, Status("looking around", "dark", 1, 0, Pose2(), False)
+    assert _reason(there, 0.01, 1.0, 0) == ""
+    assert "touched" in _reason(there, 0.01, 1.0, 1)
+    assert "looking around; dark" in _reason(away, 0.01, 1.0, 0)
+    assert "says that it has arrived" in _reason(there, 0.2, 1.0, 0)
+    assert "says that it has arrived" in _reason(there, 0.01, 20.0, 0)
+
+
+@pytest.mark.parametrize("wrong", [["--runs", "0"], ["--seed", "-1"]])
+def test_bad_input_gets_one_line(
+    wrong: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["navigate", "--out", str(tmp_path), *wrong])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and said[0].startswith(f"navigate: {wrong[0]} {wrong[1]}")

@@ -1,0 +1,69 @@
+"""What one robot could not drive is dear for the others, for a while, and never out of the question."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hybridmap.change import Change, EdgePut, NodePut
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.synthetic import room, take_map
+from mapserver.blockages import Blockages, BlockageSettings
+from mapserver.merger import Merger
+from mapserver.routes import Router
+
+A, B, C = (NodeId("a", 1, number) for number in (1, 3, 5))
+ME = MapId("a", 1)
+
+
+def test_a_blockage_is_forgotten_after_it_was_said_last() -> None:
+    blockages = Blockages(BlockageSettings(forget=100.0))
+    blockages.report([(B, A)], 0.0)
+    blockages.report([(A, B), (B, C)], 50.0)
+    assert set(blockages.known(149.0)) == {(A, B), (B, C)}
+    assert blockages.known(150.0) == []
+    assert blockages.known(0.0) == [], "what was forgotten does not come back"
+
+
+def test_without_a_clock_nothing_is_forgotten_but_the_oldest() -> None:
+    blockages = Blockages(BlockageSettings(forget=math.inf, most=2))
+    for pair in ((A, B), (B, C), (A, B), (A, C)):
+        blockages.report([pair], 0.0)
+    assert blockages.known(1e9) == [(A, B), (A, C)]
+
+
+@pytest.fixture(scope="module")
+def ring() -> tuple[Router, list[NodeId]]:
+    """Nine nodes on a circle of 0.8 m radius; the chain's ends stand close together, and so are joined."""
+    rng = np.random.default_rng(0)
+    angles = np.linspace(0.0, 1.95 * math.pi, 9)
+    tour = [Pose2(3 + 0.8 * math.cos(a), 3 + 0.8 * math.sin(a), a) for a in angles]
+    nodes, edges = take_map(room(0, 0, 6, 6, 900, rng), ME, tour, rng, sigma_xy=0.005, sigma_heading=0.005)
+    merger = Merger()
+    for number, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
+        merger.on_change(Change(ME, number, 0, body))
+    return Router(merger.merged()), [node.id for node in nodes]
+
+
+def test_others_are_led_around_a_blockage_and_through_it_where_there_is_no_other_way(
+    ring: tuple[Router, list[NodeId]],
+) -> None:
+    router, nodes = ring
+
+    def way(**arguments: object) -> list[NodeId]:
+        answer = router.route(nodes[0], nodes[2], **arguments)  # type: ignore[arg-type]
+        return [leg.node.id for leg in answer.legs]
+
+    hop = (nodes[2], nodes[1])
+    assert way() == nodes[:3]
+    around = way(wary=[hop])
+    assert around[0] == nodes[0] and around[-1] == nodes[2]
+    assert all({a, b} != set(hop) for a, b in pairwise(around)) and len(around) > 3
+    # Dear on both sides is still a way; barred on both sides is none.
+    other = (nodes[5], nodes[6])
+    assert way(wary=[hop, other]) == nodes[:3]
+    assert way(blocked=[hop, other]) == []
