@@ -192,14 +192,15 @@ class Navigator:
         """Something is in the way: say what, give it time to go, then let another way be found."""
         self._blocks.add(a, b, self._helm.now)
         self.tally = self.tally.blocked()
-        self.stage, self.detail = Stage.BLOCKED, f"between {a} and {b}: {self._in_the_way()}"
+        where = f"between {a} and {b}" if a != b else f"on the way to {b}"
+        self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way()}"
         yield from self._helm.stand(self._settings.pause)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > self._settings.trusted:
             self.fix = None
 
     def _make_sure(self) -> Behaviour:
         """No landmark was in sight for a while: one look from here, else the robot counts as lost."""
-        self._searching = True
+        self._searching, self._search.detail = True, self.detail
         yield from self._helm.stand(self._settings.search.still)
         self.fix = yield from self._search.look(1.0)
         self._found()

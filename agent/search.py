@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agent.fix import Fix
-from agent.helm import Behaviour, Helm
+from agent.helm import NO_ANSWER, Behaviour, Helm
 from agent.localizer import Localizer, LocalizerSettings
-from agent.mission import WhereAmI
+from agent.mission import Answer, WhereAmI
 from agent.observation import Command, RobotDescription
 from agent.recall import exact_enough, recall_all
 from agent.vision.lens import Lens
@@ -19,7 +19,7 @@ from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node
 from hybridmap.pose import PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer
+from hybridmap.query import Certainty, RelocalizeAnswer, View
 from hybridmap.recognition import Recognition
 
 
@@ -39,6 +39,7 @@ class SearchSettings:
         move: after a whole turn in vain it looks from elsewhere: this far away, m, if there is room,
         least_move: and at least this far, m; else it goes on turning.
         speed: of that drive, m/s.
+        silence: after a question that nobody answered the own map alone is asked for so long, s.
         localizer: tracking and filtering of the landmarks that it has found.
     """
 
@@ -52,6 +53,7 @@ class SearchSettings:
     move: float = 0.8
     least_move: float = 0.2
     speed: float = 0.2
+    silence: float = 20.0
     localizer: LocalizerSettings = field(default_factory=LocalizerSettings)
 
 
@@ -78,7 +80,7 @@ class Search:
             description: of the robot.
             lens: of its camera.
             sift: finds features.
-            own_map: is asked before the fleet's.
+            own_map: what the robot knows itself.
             helm: what moves the robot, and asks.
             settings: how.
             rng: for verification.
@@ -92,6 +94,7 @@ class Search:
         self._settings = settings
         self._rng = rng
         self._ambiguous = ""
+        self._silent_until = 0.0
 
     def look_around(self) -> Generator[Command, None, Fix]:
         """Look, ask, turn a little, and drive on after each whole turn, until somebody knows the view."""
@@ -108,7 +111,7 @@ class Search:
                 yield from self._move_on()
 
     def look(self, leniency: float) -> Generator[Command, None, Fix | None]:
-        """Recognise the current view on the own map, else ask the fleet's.
+        """Recognise the current view, by the own map and by the fleet's, which must not contradict it.
 
         Args:
             leniency: by how much a recognition may be less exact than `sure`.
@@ -123,28 +126,50 @@ class Search:
             return None
         view = features.view(self._description.camera)
         own = self._known(recall_all(self._own_map, view, self._rng))
-        if own is not None and self._exact(own[1].node_from_robot, leniency):
+        if own is not None and not self._exact(own[1].node_from_robot, leniency):
+            own = None
+        answer = yield from self._ask(view)
+        told = answer.content if isinstance(answer.content, RelocalizeAnswer) else None
+        self.detail = (answer.error or "no answer") if told is None else told.reason
+        if told is not None and told.certainty is Certainty.AMBIGUOUS:
+            self._ambiguous = told.reason
+            self.detail = f"ambiguous: {told.reason}"
+            return None
+        if own is not None and not self._contradicts(told, own):
             node, recognition = own
             self.detail = f"own map: node {node.id}, {recognition.inliers} landmarks agree"
+            # The robot has stood still while the answer was on its way.
             return Fix.of(
                 Localizer(self._description, self._lens, node, image, features, recognition, s.localizer)
             )
-        answer = yield from self._helm.ask(WhereAmI(self._helm.number(), view))
-        if not isinstance(answer.content, RelocalizeAnswer):
-            self.detail = answer.error or "no answer"
+        if told is None or told.certainty is not Certainty.FOUND:
             return None
-        self.detail = answer.content.reason
-        if answer.content.certainty is Certainty.AMBIGUOUS:
-            self._ambiguous = answer.content.reason
-            self.detail = f"ambiguous: {self._ambiguous}"
-        if answer.content.certainty is not Certainty.FOUND:
-            return None
-        best = answer.content.candidates[0]
+        best = told.candidates[0]
         if not self._exact(best.node_from_robot, leniency):
             self.detail += ", but not exactly enough"
             return None
-        # The robot has stood still while the answer was on its way.
         return Fix(best.node, best.node_from_robot)
+
+    def _ask(self, view: View) -> Generator[Command, None, Answer]:
+        """Ask the fleet, which knows whether another robot's room looks the same; not in vain each time."""
+        if self._helm.now < self._silent_until:
+            return Answer(0, None, NO_ANSWER)
+        answer = yield from self._helm.ask(WhereAmI(self._helm.number(), view))
+        if answer.content is None:
+            self._silent_until = self._helm.now + self._settings.silence
+        return answer
+
+    def _contradicts(self, told: RelocalizeAnswer | None, own: tuple[Node, Recognition]) -> bool:
+        """Whether the fleet puts the robot elsewhere. It may not know yet what the own map knows."""
+        if told is None or told.certainty is not Certainty.FOUND:
+            return False
+        best = told.candidates[0]
+        known = self._own_map.nodes.get(best.node)
+        if known is None:
+            return True
+        there = known.map_from_robot.mean @ best.node_from_robot.mean
+        here = own[0].map_from_robot.mean @ own[1].node_from_robot.mean
+        return here.distance(there) > self._settings.apart
 
     def _known(self, recalled: list[tuple[Node, Recognition]]) -> tuple[Node, Recognition] | None:
         """The own node that is seen best, unless another one, elsewhere, is seen about as well."""

@@ -193,6 +193,36 @@ def test_two_own_nodes_that_look_the_same_are_not_told_apart_by_guessing(home):
     assert any(isinstance(question, WhereAmI) for question in trial.asked)
 
 
+def test_a_place_that_another_robot_knows_a_twin_of_is_not_taken_either(home, own_map):
+    """The own map alone would be sure; the fleet knows another room that looks the same."""
+    eyes = Eyes(home, TOUR[0])
+    trial = Trial(
+        navigator(eyes, own_map, C), eyes,
+        lambda question: found(question, here(min(own_map.nodes), Pose2()), here(B, Pose2())),
+    )  # fmt: skip
+    trial.run(30.0)
+    assert not trial.navigator.tally.relocalizations
+
+
+def test_the_fleet_is_believed_where_it_contradicts_the_own_map(home, own_map):
+    eyes = Eyes(home, TOUR[0])
+    trial = Trial(
+        navigator(eyes, own_map, C), eyes, lambda question: found(question, here(B, Pose2(0.1, 0.0, 0.2)))
+    )
+    trial.run(2.0, lambda: trial.navigator.fix is not None)
+    assert trial.navigator.fix is not None and trial.navigator.fix.node == B
+
+
+def test_a_silent_fleet_is_not_waited_for_at_each_look(home):
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    navigator_ = navigator(eyes, NOWHERE, C)
+    trial = Trial(navigator_, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
+    trial.run(18.0)
+    assert len(trial.asked) == 1
+    trial.run(15.0)
+    assert len(trial.asked) == 2
+
+
 # Blocked
 
 
