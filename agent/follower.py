@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from agent.detour import Detour
 from agent.fix import Fix
-from agent.localizer import Localizer, LocalizerSettings
+from agent.localizer import Localizer
 from agent.lookout import Expected, Lookout, LookoutSettings
 from agent.observation import Command, Observation, RobotDescription
 from agent.servo.blind import BlindDrive
@@ -57,11 +57,6 @@ class FollowerSettings:
     patience: float = 6.0
     parking_patience: float = 30.0
     near: float = 0.35
-
-    @property
-    def localizer(self) -> LocalizerSettings:
-        """How a node's landmarks are tracked and filtered."""
-        return self.lookout.localizer
 
 
 class Progress(StrEnum):
