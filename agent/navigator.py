@@ -99,6 +99,7 @@ class Navigator:
         self._helm = Helm(description, s.answer_patience)
         self._search = Search(description, lens, sift, own_map, self._helm, s.search, self._rng)
         self._blocks = Blocks(s.blocks)
+        self._believed: Pose2 | None = None
         self._following = self._searching = False
         self._behaviour = self._go()
 
@@ -135,7 +136,8 @@ class Navigator:
 
     def _find(self) -> Behaviour:
         self.stage, self._searching = Stage.LOST, True
-        self.fix = yield from self._search.look_around()
+        believed, self._believed = self._believed, None
+        self.fix = yield from self._search.look_around(believed)
         self._found()
 
     def _found(self) -> None:
@@ -196,14 +198,24 @@ class Navigator:
         self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way()}"
         yield from self._helm.stand(self._settings.pause)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > self._settings.trusted:
-            self.fix = None
+            self.fix, self._believed = None, self._on_own_map(self.fix)
 
     def _make_sure(self) -> Behaviour:
         """No landmark was in sight for a while: one look from here, else the robot counts as lost."""
         self._searching, self._search.detail = True, self.detail
         yield from self._helm.stand(self._settings.search.still)
-        self.fix = yield from self._search.look(1.0)
+        before = self.fix
+        self.fix = yield from self._search.look(self._settings.search.lenient)
+        if self.fix is None:
+            self._believed = self._on_own_map(before)
         self._found()
+
+    def _on_own_map(self, fix: Fix | None) -> Pose2 | None:
+        """`map_from_robot` in the own map, if the fix is on one of its nodes."""
+        known = None if fix is None else self._own_map.nodes.get(fix.node)
+        if fix is None or known is None:
+            return None
+        return known.map_from_robot.mean @ fix.node_from_robot.mean
 
     def _in_the_way(self) -> str:
         """What keeps the robot from getting on, as far as it can tell."""

@@ -18,7 +18,7 @@ from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node
-from hybridmap.pose import PoseGaussian
+from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from hybridmap.query import Certainty, RelocalizeAnswer, View
 from hybridmap.recognition import Recognition
 
@@ -34,6 +34,10 @@ class SearchSettings:
         least_features: a view with fewer is not worth a question.
         sure: standard deviations up to which it believes a recognition at once, m and rad; the longer it has
             looked around, the less it asks for: twice as much after a whole turn.
+        lenient: by how much less exact it may be where the robot has only just lost sight of everything.
+        familiar: so many headings of nodes nearby are tried before a turn all around,
+        nearby: of nodes within this, m,
+        rich: with so many landmarks.
         rival: another node of the own map with this share of the best one's inliers has a say too;
         apart: if it puts the robot further away than this, m, the view is ambiguous.
         move: after a whole turn in vain it looks from elsewhere: this far away, m, if there is room,
@@ -48,6 +52,10 @@ class SearchSettings:
     turn_rate: float = 0.6
     least_features: int = 8
     sure: tuple[float, float] = (0.06, 0.03)
+    lenient: float = 2.0
+    familiar: int = 3
+    nearby: float = 0.8
+    rich: int = 40
     rival: float = 0.6
     apart: float = 0.5
     move: float = 0.8
@@ -96,10 +104,21 @@ class Search:
         self._ambiguous = ""
         self._silent_until = 0.0
 
-    def look_around(self) -> Generator[Command, None, Fix]:
-        """Look, ask, turn a little, and drive on after each whole turn, until somebody knows the view."""
+    def look_around(self, believed: Pose2 | None = None) -> Generator[Command, None, Fix]:
+        """Look, ask, turn a little, and drive on after each whole turn, until somebody knows the view.
+
+        Args:
+            believed: `map_from_robot` in the own map by the wheels, if the robot has only just lost sight of
+                everything: then it looks first where nodes nearby have looked.
+        """
         s, looked = self._settings, 0.0
         self.detail, self._ambiguous = "looking", ""
+        for heading in self._familiar(believed):
+            yield from self._helm.turn(wrap_angle(heading - self._helm.odom_from_robot.heading), s.turn_rate)
+            yield from self._helm.stand(s.still)
+            fix = yield from self.look(s.lenient)
+            if fix is not None:
+                return fix
         while True:
             yield from self._helm.stand(s.still)
             fix = yield from self.look(1.0 + looked / math.tau)
@@ -188,6 +207,24 @@ class Search:
     def _exact(self, posture: PoseGaussian, leniency: float) -> bool:
         """Whether a recognition is exact enough to drive by; else another look, elsewhere, costs little."""
         return exact_enough(posture, self._settings.sure, leniency)
+
+    def _familiar(self, believed: Pose2 | None) -> list[float]:
+        """Headings in the wheels' frame, rad, in which own nodes nearby have looked; the nearest first."""
+        if believed is None:
+            return []
+        s, here = self._settings, self._helm.odom_from_robot.heading
+        postures = [n.map_from_robot.mean for n in self._own_map.nodes.values() if len(n.landmarks) >= s.rich]
+        turns = [
+            wrap_angle(there.heading - believed.heading)
+            for there in postures
+            if believed.distance(there) <= s.nearby
+        ]
+        chosen: list[float] = []
+        # It has just looked straight on.
+        for turn in sorted(turns, key=abs):
+            if all(abs(wrap_angle(turn - other)) >= s.look_turn for other in (0.0, *chosen)):
+                chosen.append(turn)
+        return [wrap_angle(here + turn) for turn in chosen[: s.familiar]]
 
     def _move_on(self) -> Behaviour:
         """All views from here are unknown or alike: look from where there is room.

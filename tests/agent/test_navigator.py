@@ -16,6 +16,7 @@ from agent.mission import Answer, Question, WhereAmI, WhichWay
 from agent.navigator import Navigator, NavigatorSettings, Stage
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.own_route import own_route
+from agent.search import Search, SearchSettings
 from agent.tally import Tally
 from agent.vision.lens import Lens
 from agent.vision.sift import Features
@@ -320,6 +321,37 @@ def test_without_a_server_its_own_map_leads_the_way(home, own_map):
     nodes = sorted(own_map.nodes)
     assert "blocked" in own_route(own_map, nodes[0], goal, [(nodes[2], nodes[1])]).reason
     assert "not in the map" in own_route(own_map, nodes[0], C).reason
+
+
+# On the way
+
+
+def test_a_robot_that_has_lost_sight_of_everything_looks_where_nodes_nearby_have_looked(home, own_map):
+    """It stands at a node, turned away from what that shows: one turn finds it, not a turn all around."""
+    turned = 2.4
+    eyes = Eyes(home, TOUR[1] @ Pose2(0.05, 0.0, turned))
+    helm = Helm(BODY, 50)
+    search = Search(
+        BODY, Lens(BODY), eyes, own_map, helm, SearchSettings(), np.random.default_rng(0)  # type: ignore[arg-type]
+    )  # fmt: skip
+    # The wheels' belief is off by a little.
+    believed = TOUR[0].inverse() @ TOUR[1] @ Pose2(0.1, -0.05, turned + 0.08)
+    behaviour, moved, way, fix = search.look_around(believed), Odometry(0.0, 0.0), 0.0, None
+    answers: tuple[Answer, ...] = ()
+    for tick in range(200):
+        helm.take_in(Observation(tick * 100_000_000, moved, IMAGE, FREE), answers)
+        try:
+            command = next(behaviour)
+        except StopIteration as stop:
+            fix = stop.value
+            break
+        answers = tuple(map(found, helm.questions()))
+        moved, way = Odometry(0.0, command.turn * BODY.tick), way + command.turn * BODY.tick
+        eyes.pose = eyes.pose @ moved.motion()
+    assert fix is not None
+    assert way == pytest.approx(-turned, abs=0.3), "the shorter way round, and no further"
+    true = own_map.nodes[fix.node].map_from_robot.mean.inverse() @ (TOUR[0].inverse() @ eyes.pose)
+    assert fix.node_from_robot.mean.distance(true) < 0.1
 
 
 # The helm
