@@ -30,6 +30,8 @@ class TrackingSettings:
         prior_spread: sigma of a new landmark's inverse depth, as a share of the expected one ...
         prior_near: ... but no less than this over the camera's height: a landmark may always be about as near
             as the floor. A robot before a bare wall would else take its nearness for a slip of the wheels.
+        doubt: sigmas of triangulated depths are taken for so many times what they say
+        most_chi2: and depths of tracks whose mean squared residual is above this, not at all; 1 is expected.
         continuity: whether an image continues the one before.
         dispute: when wheels and images contradict each other.
         patience: images that show other things than they should, one after the other, before the robot
@@ -51,6 +53,8 @@ class TrackingSettings:
     strikes: int = 3
     prior_spread: float = 0.6
     prior_near: float = 0.45
+    doubt: float = 2.0
+    most_chi2: float = 4.0
     continuity: ContinuitySettings = field(default_factory=ContinuitySettings)
     dispute: DisputeSettings = field(default_factory=DisputeSettings)
     patience: int = 30

@@ -13,6 +13,7 @@ from agent.dispute import Dispute
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import MappingFilter
 from agent.ekf.report import Health
+from agent.ekf.triangulation import triangulate
 from agent.observation import Observation, RobotDescription
 from agent.strikes import Strikes
 from agent.track_history import TrackHistory
@@ -172,10 +173,7 @@ class Tracking:
         return moved
 
     def _fill(self, first: int = 0) -> None:
-        """Give the filter an even choice of the tracks that it does not hold, from a first one on.
-
-        What was seen of them before is in the history alone: to the filter they are new.
-        """
+        """Give the filter an even choice of the tracks that it does not hold, from a first one on."""
         s, held = self._settings, len(self._filter.ids)
         room = min(s.filtered - held + len(self._hidden.ids), s.most_filtered - held)
         inside = np.isin(self._tracker.ids, self._filter.ids)
@@ -184,10 +182,26 @@ class Tracking:
             return
         ids, pixels = self._tracker.ids[candidates], self._tracker.pixels[candidates]
         chosen = even_choice(pixels, self._tracker.pixels[inside], room)
-        inverse_depths = np.full(len(chosen), 1.0 / self._expected_depth)
-        nearest = self._settings.prior_near / max(self._camera.mount_height, 0.05)
-        sigmas = np.maximum(self._settings.prior_spread * inverse_depths, nearest)
+        inverse_depths, sigmas = self._first_depths(ids[chosen])
         self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
+
+    def _first_depths(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
+        """(N,) inverse depths 1/m with which tracks come into the filter, and their sigmas.
+
+        Tracks that were followed outside of it are triangulated against its trajectory. Its errors enter all
+        of them alike, which their covariances do not know.
+        """
+        s = self._settings
+        inverse_depths = np.full(len(ids), 1.0 / self._expected_depth)
+        nearest = s.prior_near / max(self._camera.mount_height, 0.05)
+        sigmas = np.maximum(s.prior_spread * inverse_depths, nearest)
+        poses, pixels = self.history.sightings(ids)
+        if len(poses) >= 2:
+            solved = triangulate(poses, pixels, self._camera, s.filter.pixel_sigma, self.pose.mean.vector)
+            better = s.doubt * np.sqrt(solved.ray_covariances[:, 2, 2])
+            fits = (solved.chi2 < s.most_chi2) & (better < sigmas)
+            inverse_depths[fits], sigmas[fits] = solved.rays[fits, 2], better[fits]
+        return inverse_depths, sigmas
 
     def _seek_hidden(self, image: NDArray[np.uint8], ids: NDArray[np.int64], templates: Templates) -> None:
         """Of the tracks that were followed until now, ids (N,), hide those just lost; find others again."""

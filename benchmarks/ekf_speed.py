@@ -113,7 +113,11 @@ class Theirs:
 def plain(run: MappingRun) -> FilterSettings:
     """Settings under which our filter does what a textbook's does."""
     return FilterSettings(
-        pixel_sigma=run.pixel_sigma, relinearisations=0, gate_probability=_BELIEVE_ALL, widest_slope=np.inf
+        pixel_sigma=run.pixel_sigma,
+        relinearisations=0,
+        gate_probability=_BELIEVE_ALL,
+        widest_slope=np.inf,
+        adaptation=0.0,
     )
 
 

@@ -19,6 +19,9 @@ from hybridmap.pose import Array
 
 Mask = NDArray[np.bool_]
 
+MEDIAN = 2.0 * math.log(2.0)
+"""Of a chi-square with two degrees of freedom."""
+
 
 def pixel_gate(probability: float) -> float:
     """Threshold of a chi-square with two degrees of freedom that inliers stay under with a probability."""
@@ -68,7 +71,7 @@ def one_point_consensus(innovations: Array, covariance: Array, gate: float) -> M
     return np.asarray(agrees[:, int(np.argmax(np.where(plausible, score, -1.0)))], np.bool_)
 
 
-def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array]:
+def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
     """Which innovations to accept.
 
     If each agrees with all the others, all of them. Else the one-point consensus, from which the worst is
@@ -80,20 +83,23 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
         gate: chi-square threshold.
 
     Returns:
-        (N,) accepted; and the inverse of the accepted ones' joint covariance, (2K, 2K).
+        (N,) accepted; the inverse of the accepted ones' joint covariance, (2K, 2K); and how the median of all
+        leave-one-out distances compares with what it should be: 1 if the noise is what it is said to be.
     """
     accepted: Mask = np.ones(len(innovations), np.bool_)
     innovations = np.ascontiguousarray(innovations)
     information = inverse(covariance)
-    if (leave_one_out(innovations, information) <= gate).all():
-        return accepted, information
+    distances = leave_one_out(innovations, information)
+    excess = float(np.sort(distances)[len(distances) // 2]) / MEDIAN
+    if (distances <= gate).all():
+        return accepted, information, excess
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:
         chosen = np.flatnonzero(np.repeat(accepted, 2))
         information = inverse(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
         distances = leave_one_out(innovations[accepted], information)
         if not len(distances) or distances.max() <= gate:
-            return accepted, information
+            return accepted, information, excess
         accepted[np.flatnonzero(accepted)[int(np.argmax(distances))]] = False
 
 

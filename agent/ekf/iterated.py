@@ -86,7 +86,7 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         innovations = seen.slopes - sight.rays[:, :2] - back
         if first is None:
             first = innovations
-            accepted, information = believe(innovations, spread, seen.gate)
+            accepted, information, _ = believe(innovations, spread, seen.gate)
             if not accepted.any():
                 return Fit(state, accepted, first, float("nan"))
         else:

@@ -29,6 +29,12 @@ __all__ = ["FilterSettings", "LandmarkEstimates", "MappingFilter"]
 SAME_STEP = (1e-3, 4e-4)
 """m and rad; a step is not linearised again for less: what is then left of second order is below 1e-4 px."""
 
+MANY = 10
+"""With fewer landmarks in view nothing is learned of the pixels' noise."""
+
+MOST_EXCESS = 16.0
+"""Pixels are never taken for worse than this times what is said, in variance."""
+
 
 class MappingFilter:
     """Extended Kalman filter over [posture (3), landmarks (n x 3)].
@@ -57,7 +63,8 @@ class MappingFilter:
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._gate = pixel_gate(self.settings.gate_probability)
-        self._slope_variances = np.square(self.settings.pixel_sigma / self._focal)
+        self._nominal_variances = np.square(self.settings.pixel_sigma / self._focal)
+        self._excess = self._next_excess = 1.0
         self._posture_variances = np.square(np.array(self.settings.posture_noise, np.float64))
         self._settled = MovingState.at_anchor()
         self._step: Step | None = None
@@ -133,6 +140,8 @@ class MappingFilter:
         """
         s = self.settings
         self._steps_unseen = 0
+        # What is learned of the noise holds from the next image on: one image has one noise.
+        self._excess = self._next_excess
         slots, rows = self._slots(ids, pixels)
         if not len(slots):
             self._last = Health.BLIND, "no landmark of the filter is in view"
@@ -250,6 +259,11 @@ class MappingFilter:
             slots, rows = slots[seen], rows[seen]
         return slots, rows
 
+    @property
+    def _slope_variances(self) -> Array:
+        """(2,) of a measured slope: as it is said to be, or larger if images have told so for a while."""
+        return self._excess * self._nominal_variances
+
     def _spread(self, slots: NDArray[np.intp]) -> Array:
         """(2N, 2N) joint covariance of the innovations of some landmarks."""
         spread: Array = kernels.spread(self.state.covariance, slots, self._slope_variances)
@@ -260,7 +274,7 @@ class MappingFilter:
     ) -> tuple[NDArray[np.bool_], Array, Health, str]:
         """Which of the landmarks seen to correct by, the inverse of their S, and what that tells."""
         s, seen = self.settings, len(slots)
-        believed, information = believe(innovations, self._spread(slots), self._gate)
+        believed, information, excess = believe(innovations, self._spread(slots), self._gate)
         agreeing = int(np.count_nonzero(believed))
         health, reason = Health.GOOD, ""
         if agreeing < s.least_agreeing_share * seen:
@@ -268,7 +282,7 @@ class MappingFilter:
             if self._step is not None:
                 # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
                 step, self._step = self._step, self._step.again(wheel_root=np.diag(s.slip))
-                then_believed, then_information = believe(innovations, self._spread(slots), self._gate)
+                then_believed, then_information, _ = believe(innovations, self._spread(slots), self._gate)
                 agreeing = int(np.count_nonzero(then_believed))
                 if agreeing >= max(s.least_agreeing, s.least_agreeing_share * seen):
                     self._distrust = s.distrust
@@ -277,6 +291,10 @@ class MappingFilter:
                 self._step = step
             # A few that agree among many that do not may as well be the wrong ones.
             believed[:] = False
+        elif seen >= MANY:
+            # In logarithms, so that images that are twice as good and twice as bad as said cancel.
+            learned = self._excess * min(excess, MOST_EXCESS) ** s.adaptation
+            self._next_excess = min(max(learned, 1.0), MOST_EXCESS)
         elif agreeing < s.least_agreeing:
             health, reason = (
                 Health.FEW,

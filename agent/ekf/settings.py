@@ -11,6 +11,8 @@ class FilterSettings:
 
     Attributes:
         pixel_sigma: standard deviation of a tracked pixel, px.
+        adaptation: how much of an image's noise beyond what is said is taken over at once, 0 ... 1: a floor
+            that is not flat, shaking and blur make all pixels worse than any tracker knows.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
         side_slip: standard deviation of the slip aside of a step, as a share of the wheels' way.
         posture_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
@@ -33,6 +35,7 @@ class FilterSettings:
     """
 
     pixel_sigma: float = 0.7
+    adaptation: float = 0.1
     wheel_floor: float = 1e-5
     side_slip: float = 0.0
     posture_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -153,3 +153,23 @@ def test_a_blind_filter_is_lost_slowly_and_found_again() -> None:
     assert traces[-1] < traces[158] / 3
     assert max(distances) < CHI2_3
     assert filter_.converged().mean() > 0.5
+
+
+def test_pixels_that_are_worse_than_said_are_found_out() -> None:
+    """The image is blurred: pixels err three times as much as the tracker knows."""
+    apart = []
+    for seed in range(8):
+        run = draw_run(np.random.default_rng([31, seed]), SHAPES[seed % 4], END, pixel_sigma=2.1)
+        run = replace(run, pixel_sigma=0.7)
+        _, health, _, distances = drive(run, recorded)
+        plain = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(0.7, adaptation=0.0))
+        plain.add(np.arange(30), run.pixels[0])
+        for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
+            plain.predict(odometry)
+            plain.update(np.arange(30), pixels)
+        apart.append((distances[-1], plain.pose.mahalanobis2(run.poses[END])))
+        assert health[100:].count(Health.DISAGREEMENT) == 0
+    ours, without = np.mean(apart, axis=0)
+    # What was learned in the first second, before the noise was known, stays too sure of itself.
+    assert ours < 25.0
+    assert ours < 0.4 * without, (ours, without)

@@ -50,7 +50,7 @@ def test_outliers_hidden_by_a_shared_error_are_found() -> None:
         # Too small to be seen alone beside the shared 30 px.
         angle = rng.uniform(0, 2 * np.pi, 8)
         innovations[wrong] += rng.uniform(12, 25, (8, 1)) * np.column_stack([np.cos(angle), np.sin(angle)])
-        accepted, information = believe(innovations, s, gate)
+        accepted, information, _ = believe(innovations, s, gate)
         assert not accepted[wrong].any()
         assert accepted.sum() >= 11
         chosen = np.flatnonzero(np.repeat(accepted, 2))
@@ -80,6 +80,6 @@ def test_consensus_is_that_of_the_best_single_landmark() -> None:
 
 def test_nothing_plausible_means_nothing_believed() -> None:
     innovations = np.full((4, 2), 100.0) * np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
-    accepted, information = believe(innovations, np.eye(8), pixel_gate(0.999))
+    accepted, information, _ = believe(innovations, np.eye(8), pixel_gate(0.999))
     assert not accepted.any()
     assert information.shape == (0, 0)

@@ -76,7 +76,7 @@ def test_slip_aside_moves_robot_and_landmarks_alike() -> None:
 def test_update_is_the_textbook_kalman_update() -> None:
     """Without a step before it there is nothing to linearise again: a plain linear update."""
     run = a_run()
-    filter_ = start(run)
+    filter_ = start(run, adaptation=0.0)
     drive(filter_, run, last=60)
     before = filter_.state
     seen = CAMERA.project(run.poses[60].inverse().apply(run.points))
