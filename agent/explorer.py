@@ -86,6 +86,7 @@ class Explorer:
 
     def _explore(self) -> Iterator[Command]:
         yield from self._moves.begin()
+        self._ask()
         while True:
             if (
                 seen_around(self._views, self._moves.position, self._settings.known_reach)
