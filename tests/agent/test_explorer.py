@@ -69,14 +69,14 @@ def test_no_answer_changes_nothing(walls, error):
 
 
 def test_where_others_have_looked_around_it_does_not(walls):
-    alone = doings(live(walls, ExplorerSettings(), 60, {}))
+    alone = doings(live(walls, ExplorerSettings(), 12, {}))
     assert alone[:2] == [Phase.LOOKING, Phase.DRIVING]
-    told = live(walls, ExplorerSettings(), 60, {0: Answer(-1, KnownAnswer(ALL_AROUND, ""))})
+    told = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND, ""))})
     assert doings(told)[1] == Phase.SCANNING
-    half = live(walls, ExplorerSettings(), 60, {0: Answer(-1, KnownAnswer(ALL_AROUND[:4], ""))})
+    half = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND[:4], ""))})
     assert doings(half)[1] == Phase.DRIVING
     far = ALL_AROUND + np.array([2.0, 0.0, 0.0, 0.0])
-    elsewhere = live(walls, ExplorerSettings(), 60, {0: Answer(-1, KnownAnswer(far, ""))})
+    elsewhere = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(far, ""))})
     assert doings(elsewhere)[1] == Phase.DRIVING
 
 
@@ -100,7 +100,7 @@ def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
     assert Phase.TRAVELLING in doings(steps)
     assert questions(steps) == []
     commands = [step.command for step in steps]
-    assert commands == [step.command for step in live(walls, by_chance, 250, {})]
+    assert commands[:50] == [step.command for step in live(walls, by_chance, 50, {})]
     assert commands != [step.command for step in live(walls, by_chance, 250, {}, seed=1)]
 
 
