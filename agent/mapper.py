@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agent.cartographer import HERE, Cartographer, CartographerSettings
+from agent.ekf.report import Health
 from agent.observation import Observation, RobotDescription
 from agent.track_settings import TrackingSettings
 from agent.tracking import Tracking
@@ -103,8 +104,12 @@ class Mapper:
 
     @property
     def health(self) -> str:
-        """What is wrong with the estimate of the posture, in words; empty if nothing is."""
-        return self._tracking.health[1] if self.started else ""
+        """What is wrong with the estimate of the posture, in words; empty if nothing is.
+
+        That depths are unknown before the robot has moved goes without saying.
+        """
+        health, reason = self._tracking.health
+        return reason if self.started and health is not Health.NO_PARALLAX else ""
 
     @property
     def anchor_from_robot(self) -> Pose2:

@@ -274,8 +274,9 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
                 finished = self._navigator.arrived
-        if warning:
-            detail = f"{detail}; {warning}" if detail else warning
+        mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
+        for more in (self._mapper.health if mapping else "", warning):
+            detail = "; ".join(part for part in (detail, more) if part)
         nodes = len(self.map.nodes)
         if not nodes and isinstance(self._mission, Explore | Carried):
             detail = f"no nodes yet: {detail or self._mapper.track_report}"

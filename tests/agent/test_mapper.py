@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from agent.mapper import Mapper
+from agent.observation import Odometry
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 
@@ -72,3 +75,24 @@ def test_standing_still_gives_no_depth(walls, description):
     last = drive(mapper, walls, [0.0] * 30)
     mapper.finish(last)
     assert not mapper.map.nodes
+
+
+def test_a_covered_lens_and_lost_encoders_are_named(walls, description):
+    mapper = Mapper(MapId("r", 1), description)
+    pose = Pose2()
+    mapper.step(walls.observe(pose, pose, 0))
+    mapper.begin(walls.observe(pose, pose, 0))
+    assert mapper.health == ""
+    told = []
+    for tick in range(1, 40):
+        before, pose = pose, Pose2(0.02 * tick, 0.0, 0.05 * np.sin(0.4 * tick))
+        seen = walls.observe(before, pose, tick)
+        if 20 <= tick < 26:
+            seen = replace(seen, odometry=Odometry(0.0, 0.0))
+        elif tick >= 30:
+            seen = replace(seen, image=None)
+        mapper.step(seen)
+        told.append(mapper.health)
+    assert not any(told[:18])
+    assert sum("refute" in health for health in told[19:26]) >= 4
+    assert told[-1] == "no image for 10 steps"
