@@ -56,7 +56,7 @@ def draw_plot(mapped: Mapped, plan: FloorPlan, floor: Floor, rng: np.random.Gene
         InvalidValue: the map is too small for such a drive.
     """
     nodes = sorted(mapped.truth)
-    for _ in range(TRIES):
+    for _ in range(TRIES if nodes else 0):
         near = mapped.truth[nodes[int(rng.integers(len(nodes)))]]
         angle, away = float(rng.uniform(-math.pi, math.pi)), NEAR * math.sqrt(float(rng.random()))
         start = Pose2(

@@ -11,21 +11,25 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from agent.mission import GoTo
 from agent.pipeline import Status
+from agent.report import AgentReport
 from agent.tally import Tally
 from benchmarks.navigate import main, summary
-from benchmarks.navigate_drives import Outcome, _reason
+from benchmarks.navigate_drives import PATIENCE, Outcome, _reason, drive
 from benchmarks.navigate_floor import Floor
 from benchmarks.navigate_office import Mapped
 from benchmarks.navigate_plots import LEAST_EDGES, Plot, draw_plot
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
+from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.synthetic import room, take_map
 from mapweave.scoring import crossed
+from sim.control import RobotStatus, SimStatus
 from sim.floorplan import FloorPlan, Rectangle
+from sim.snapshot import Snapshot
 
 RADIUS = 0.17
 WALL = Rectangle.spanning(2.9, 0.0, 3.1, 3.0, "wall")
@@ -104,8 +108,9 @@ def test_plots_are_what_they_promise(mapped: Mapped, floor: Floor) -> None:
 def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: Floor) -> None:
     few = sorted(mapped.truth)[:LEAST_EDGES]
     small = Mapped(mapped.nodes, {node: mapped.truth[node] for node in few})
-    with pytest.raises(InvalidValue, match="explore for longer"):
-        draw_plot(small, PLAN, floor, np.random.default_rng(0))
+    for too_small in (small, Mapped(HybridMap(), {})):
+        with pytest.raises(InvalidValue, match="explore for longer"):
+            draw_plot(too_small, PLAN, floor, np.random.default_rng(0))
 
 
 def outcome(mapped: Mapped, **other: object) -> Outcome:
@@ -141,6 +146,63 @@ def test_a_drive_fails_for_each_reason(mapped: Mapped) -> None:
     assert "looking around; dark" in _reason(away, 0.01, 1.0, 0)
     assert "says that it has arrived" in _reason(there, 0.2, 1.0, 0)
     assert "says that it has arrived" in _reason(there, 0.01, 20.0, 0)
+
+
+class FakeOffice:
+    """Time passes; the robot finds itself after 1 s and drives 0.1 m a second along x, to x = 3 at most."""
+
+    def __init__(self, arrives: bool) -> None:
+        self.ticks, self.arrives, self.going = 40, arrives, False
+        self.control = self
+        self.begin = 0
+        self.poses = [Pose2()] * 41
+        self.collisions = 3
+
+    def command(self, mission: object) -> None:
+        self.going, self.begin = isinstance(mission, GoTo), self.ticks
+
+    def kidnap(self, robot: str, pose: Pose2) -> None:
+        self.poses[-1] = pose
+
+    def advance(self, seconds: float) -> AgentReport:
+        for _ in range(round(10 * seconds)):
+            step = 0.01 if self.going and self.ticks - self.begin > 10 else 0.0
+            pose = self.poses[-1]
+            self.poses.append(Pose2(min(pose.x + step, 3.0), pose.y, pose.heading))
+            self.ticks += 1
+        there = self.arrives and self.poses[-1].x == 3.0
+        lost = not self.going or self.ticks - self.begin < 10
+        status = Status(
+            "parked" if there else "looking" if lost else "driving", "so far", 5, 0, Pose2(), there,
+            fix_node=None if lost else NodeId("r0", 1, 1),
+        )  # fmt: skip
+        return AgentReport(status, 0)
+
+    def status(self) -> SimStatus:
+        return SimStatus(self.ticks, 0, {"r0": RobotStatus(self.poses[-1], self.collisions, True)})
+
+    def trajectory(self, robot: str) -> tuple[np.ndarray, np.ndarray]:
+        return np.arange(self.ticks + 1), np.array([pose.vector for pose in self.poses])
+
+    def snapshot(self) -> Snapshot:
+        seen = np.full((4, 4), round(10 * self.poses[-1].x), np.uint8)
+        return Snapshot(self.ticks, 0, {"r0": self.poses[-1]}, (), (), {"r0": seen})
+
+
+@pytest.mark.parametrize("arrives", [True, False])
+def test_a_drive_is_timed_measured_and_ended(arrives: bool) -> None:
+    office = FakeOffice(arrives)
+    plot = Plot(Pose2(1.0, 0.0), NodeId("r0", 1, 9), Pose2(3.01, 0.0, 0.02), 5, 1.6)
+    one = drive(office, plot, lambda now, doing: None)  # type: ignore[arg-type]
+    assert one.found_s == 1.0 and one.collisions == 0
+    assert one.driven == pytest.approx(2.0) and one.path_over_shortest == pytest.approx(1.25)
+    assert (one.error_m, one.error_deg) == pytest.approx((0.01, math.degrees(0.02)), abs=1e-3)
+    assert one.desired[0, 0] == 30 and one.reached[0, 0] == 30
+    assert [words.split(":")[0] for _, words in one.story][:2] == ["looking", "driving"]
+    if arrives:
+        assert one.success and one.time_s == pytest.approx(21.5, abs=0.6)
+    else:
+        assert "not there within 240 s: driving" in one.reason and one.time_s == PATIENCE
 
 
 @pytest.mark.parametrize("wrong", [["--runs", "0"], ["--seed", "-1"]])
