@@ -37,13 +37,22 @@ def transition(
     return moved_posture, moved.rays, moved.scale, blocks, by_input
 
 
-def propagate(covariance: Array, transitions: Array, root: Array, variances: Array) -> Array:
-    """A P A^T + G G^T + Q of a motion whose A is block diagonal, symmetric to the last bit.
+def propagate(
+    covariance: Array,
+    transitions: Array,
+    by_input: Array,
+    wheel_root: Array,
+    side_slip: float,
+    variances: Array,
+) -> Array:
+    """A P A^T + B S B^T + Q of a motion whose A is block diagonal, symmetric to the last bit.
 
     Args:
         covariance: P before.
         transitions: (1 + n, 3, 3) blocks of A: of the posture, then of each landmark.
-        root: (3 + 3n, 3) G, how the errors of the wheels and the slip aside enter.
+        by_input: (3 + 3n, 3) B, by (u1, u2, u3).
+        wheel_root: (2, 2) root of the covariance of (u1, u2).
+        side_slip: sigma of u3, m.
         variances: (3,) of the posture, the diagonal of Q.
     """
     blocks, size = len(transitions), len(covariance)
@@ -52,6 +61,7 @@ def propagate(covariance: Array, transitions: Array, root: Array, variances: Arr
     moved = (transitions @ half.T.reshape(blocks, 3, size)).reshape(size, size)
     out: Array = moved + moved.T
     out *= 0.5
+    root = np.column_stack([by_input[:, :2] @ wheel_root, side_slip * by_input[:, 2]])
     out += root @ root.T
     out[[0, 1, 2], [0, 1, 2]] += variances
     return out

@@ -101,12 +101,24 @@ def transition(
     return posture_after, after, scale, blocks, by_input
 
 
-@_compiled(_MATRIX, _MATRIX, _CUBE, _MATRIX, _VECTOR)
-def propagate(covariance: Array, transitions: Array, root: Array, variances: Array) -> Array:
+@_compiled(_MATRIX, _MATRIX, _CUBE, _MATRIX, _MATRIX, "float64", _VECTOR)
+def propagate(
+    covariance: Array,
+    transitions: Array,
+    by_input: Array,
+    wheel_root: Array,
+    side_slip: float,
+    variances: Array,
+) -> Array:
     """See agent.ekf.algebra."""
     size, blocks = covariance.shape[0], transitions.shape[0]
     half = np.empty((size, size))
     out = np.empty((size, size))
+    root = np.empty((size, 3))
+    for i in range(size):
+        root[i, 0] = by_input[i, 0] * wheel_root[0, 0] + by_input[i, 1] * wheel_root[1, 0]
+        root[i, 1] = by_input[i, 0] * wheel_root[0, 1] + by_input[i, 1] * wheel_root[1, 1]
+        root[i, 2] = by_input[i, 2] * side_slip
     for i in range(blocks):
         for r in range(3):
             t0, t1, t2 = transitions[i, r, 0], transitions[i, r, 1], transitions[i, r, 2]

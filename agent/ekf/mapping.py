@@ -63,7 +63,7 @@ class MappingFilter:
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._gate = pixel_gate(self.settings.gate_probability)
-        self._nominal_variances = np.square(self.settings.pixel_sigma / self._focal)
+        self._slope_variances = np.square(self.settings.pixel_sigma / self._focal)
         self._excess = self._next_excess = 1.0
         self._posture_variances = np.square(np.array(self.settings.posture_noise, np.float64))
         self._settled = MovingState.at_anchor()
@@ -141,7 +141,9 @@ class MappingFilter:
         s = self.settings
         self._steps_unseen = 0
         # What is learned of the noise holds from the next image on: one image has one noise.
-        self._excess = self._next_excess
+        if self._next_excess != self._excess:
+            self._slope_variances = self._slope_variances * (self._next_excess / self._excess)
+            self._excess = self._next_excess
         slots, rows = self._slots(ids, pixels)
         if not len(slots):
             self._last = Health.BLIND, "no landmark of the filter is in view"
@@ -154,7 +156,9 @@ class MappingFilter:
         believed, information, health, reason = self._believe(slots, innovations)
         nis = math.nan
         if believed.any():
-            nis, slip = self._correct(slots[believed], slopes[believed], information)
+            if not believed.all():
+                slots, slopes = slots[believed], slopes[believed]
+            nis, slip = self._correct(slots, slopes, information)
             if slip and health is Health.GOOD:
                 health, reason = Health.SLIP, slip
         else:
@@ -162,7 +166,7 @@ class MappingFilter:
             self._step = by_wheels
             self._settle(self.state)
         accepted = np.zeros(len(ids), np.bool_)
-        accepted[rows[believed]] = True
+        accepted[rows] = believed
         innovations_px = np.full((len(ids), 2), np.nan)
         innovations_px[rows] = innovations * self._focal
         self._last = health, reason
@@ -258,11 +262,6 @@ class MappingFilter:
             seen = np.isfinite(pixels[rows]).all(axis=1)
             slots, rows = slots[seen], rows[seen]
         return slots, rows
-
-    @property
-    def _slope_variances(self) -> Array:
-        """(2,) of a measured slope: as it is said to be, or larger if images have told so for a while."""
-        return self._excess * self._nominal_variances
 
     def _spread(self, slots: NDArray[np.intp]) -> Array:
         """(2N, 2N) joint covariance of the innovations of some landmarks."""

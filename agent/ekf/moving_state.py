@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +107,7 @@ class WheelErrors:
         return math.sqrt(max(r * x * x - 2.0 * q * x * y + p * y * y, 0.0) / max(p * r - q * q, 1e-300))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Step:
     """One step of the wheels, linearised where it seems to have gone, until an image has judged it.
 
@@ -139,6 +138,7 @@ class Step:
     scale: Array
     blocks: Array
     by_input: Array
+    _state: MovingState | None = field(default=None, init=False)
 
     @staticmethod
     def predict(
@@ -163,14 +163,16 @@ class Step:
             scale, blocks, by_input,
         )  # fmt: skip
 
-    @cached_property
+    @property
     def state(self) -> MovingState:
-        """After the step: P- = A P A^T + B S B^T + Q of paper-notes."""
-        mixing = np.zeros((3, 3))
-        mixing[:2, :2], mixing[2, 2] = self.wheel_root, self.side_slip
-        root = self.by_input @ mixing
-        covariance = kernels.propagate(self.before.covariance, self.blocks, root, self.posture_variances)
-        return MovingState(self.posture, self.rays, covariance)
+        """After the step: P- = A P A^T + B S B^T + Q of paper-notes; computed when first asked for."""
+        if self._state is None:
+            covariance = kernels.propagate(
+                self.before.covariance, self.blocks, self.by_input, self.wheel_root, self.side_slip,
+                self.posture_variances,
+            )  # fmt: skip
+            self._state = MovingState(self.posture, self.rays, covariance)
+        return self._state
 
     def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> Step:
         """The same step linearised elsewhere, or with the wheels believed less."""

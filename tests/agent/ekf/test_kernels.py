@@ -57,14 +57,21 @@ def test_transition(size: tuple[int, int], step: tuple[float, float, float]) -> 
 def test_propagate(size: tuple[int, int]) -> None:
     n, _ = size
     rng, _, _, covariance = scene(*size)
-    blocks, root, variances = rng.normal(size=(n + 1, 3, 3)), rng.normal(size=(3 + 3 * n, 3)), rng.random(3)
+    blocks, by_input, variances = (
+        rng.normal(size=(n + 1, 3, 3)),
+        rng.normal(size=(3 + 3 * n, 3)),
+        rng.random(3),
+    )
+    wheel_root, side_slip = rng.normal(size=(2, 2)), rng.random()
+    inputs = np.zeros((3, 3))
+    inputs[:2, :2], inputs[2, 2] = wheel_root @ wheel_root.T, side_slip**2
     dense = np.zeros_like(covariance)
     for i in range(n + 1):
         dense[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = blocks[i]
-    expected = dense @ covariance @ dense.T + root @ root.T
+    expected = dense @ covariance @ dense.T + by_input @ inputs @ by_input.T
     expected[:3, :3] += np.diag(variances)
     for form in FORMS:
-        got = form.propagate(covariance, blocks, root, variances)
+        got = form.propagate(covariance, blocks, by_input, wheel_root, side_slip, variances)
         close(got, expected, expected)
         assert np.array_equal(got, got.T)
 
