@@ -17,6 +17,7 @@ from agent.ekf.gating import believe, pixel_gate
 from agent.ekf.landmarks import Ids, LandmarkEstimates
 from agent.ekf.motion import WheelNoise
 from agent.ekf.moving_state import MovingState, Step
+from agent.ekf.pixel_noise import PixelNoise
 from agent.ekf.report import Health, UpdateReport
 from agent.ekf.settings import FilterSettings
 from agent.observation import Odometry
@@ -31,9 +32,6 @@ SAME_STEP = (1e-3, 4e-4)
 
 MANY = 10
 """With fewer landmarks in view nothing is learned of the pixels' noise."""
-
-MOST_EXCESS = 16.0
-"""Pixels are never taken for worse than this times what is said, in variance."""
 
 
 class MappingFilter:
@@ -63,8 +61,7 @@ class MappingFilter:
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._gate = pixel_gate(self.settings.gate_probability)
-        self._slope_variances = np.square(self.settings.pixel_sigma / self._focal)
-        self._excess = self._next_excess = 1.0
+        self._noise = PixelNoise(self.settings.pixel_sigma, self._focal, self.settings.adaptation)
         self._posture_variances = np.square(np.array(self.settings.posture_noise, np.float64))
         self._settled = MovingState.at_anchor()
         self._step: Step | None = None
@@ -140,10 +137,7 @@ class MappingFilter:
         """
         s = self.settings
         self._steps_unseen = 0
-        # What is learned of the noise holds from the next image on: one image has one noise.
-        if self._next_excess != self._excess:
-            self._slope_variances = self._slope_variances * (self._next_excess / self._excess)
-            self._excess = self._next_excess
+        self._noise.begin_image()
         slots, rows = self._slots(ids, pixels)
         if not len(slots):
             self._last = Health.BLIND, "no landmark of the filter is in view"
@@ -265,7 +259,7 @@ class MappingFilter:
 
     def _spread(self, slots: NDArray[np.intp]) -> Array:
         """(2N, 2N) joint covariance of the innovations of some landmarks."""
-        spread: Array = kernels.spread(self.state.covariance, slots, self._slope_variances)
+        spread: Array = kernels.spread(self.state.covariance, slots, self._noise.variances)
         return spread
 
     def _believe(
@@ -291,9 +285,7 @@ class MappingFilter:
             # A few that agree among many that do not may as well be the wrong ones.
             believed[:] = False
         elif seen >= MANY:
-            # In logarithms, so that images that are twice as good and twice as bad as said cancel.
-            learned = self._excess * min(excess, MOST_EXCESS) ** s.adaptation
-            self._next_excess = min(max(learned, 1.0), MOST_EXCESS)
+            self._noise.learn(excess)
         elif agreeing < s.least_agreeing:
             health, reason = (
                 Health.FEW,
@@ -334,5 +326,5 @@ class MappingFilter:
                 break
             residual = (slopes - self._rays[slots, :2]).ravel()
             information = kernels.inverse(self._spread(slots))
-        self._settle(self.state.corrected(slots, residual, information, self._slope_variances))
+        self._settle(self.state.corrected(slots, residual, information, self._noise.variances))
         return float(residual @ information @ residual) / len(residual), slip

@@ -1,0 +1,45 @@
+"""How uncertain the slopes of an image are: as it is said, or more where images have told so for a while."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridmap.pose import Array
+
+MOST_EXCESS = 16.0
+"""Pixels are never taken for worse than this times what is said, in variance."""
+
+
+class PixelNoise:
+    """Learns from image to image. What is learned holds from the next on: one image has one noise.
+
+    Attributes:
+        variances: (2,) of a measured slope, horizontal and vertical.
+    """
+
+    def __init__(self, pixel_sigma: float, focal: Array, adaptation: float) -> None:
+        """Begin with what is said.
+
+        Args:
+            pixel_sigma: standard deviation of a tracked pixel, px.
+            focal: (2,) px.
+            adaptation: share of an image's excess that is taken over at once, 0 ... 1.
+        """
+        self.variances: Array = np.square(pixel_sigma / focal)
+        self._said = self.variances
+        self._adaptation = adaptation
+        self._excess = self._next = 1.0
+
+    def begin_image(self) -> None:
+        """What was learned from the images before holds now."""
+        if self._next != self._excess:
+            self._excess = self._next
+            self.variances = self._said * self._excess
+
+    def learn(self, excess: float) -> None:
+        """Learn that the squared residuals of an image are `excess` times what its noise allows.
+
+        In logarithms, so that images that are twice as good and twice as bad as said cancel.
+        """
+        learned = self._excess * min(excess, MOST_EXCESS) ** self._adaptation
+        self._next = min(max(learned, 1.0), MOST_EXCESS)
