@@ -26,6 +26,8 @@ from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import RouteAnswer, RouteLeg
 
+NOTHING_NEAR = "it gets no further, though nothing is near"
+
 
 @dataclass(frozen=True)
 class NavigatorSettings:
@@ -185,6 +187,9 @@ class Navigator:
         match follower.progress:
             case Progress.ARRIVED:
                 self.tally = self.tally.passed([0.0])
+            case Progress.BLOCKED if self._only_parking(route, follower.fix):
+                # Nothing keeps it from its goal but its own precision: that is no block for anybody.
+                self.detail = "parking came to no end: once more"
             case Progress.BLOCKED:
                 yield from self._meet_block(*follower.blocked)
             case Progress.UNSURE:
@@ -195,7 +200,7 @@ class Navigator:
         self._blocks.add(a, b, self._helm.now)
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
-        self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way()}"
+        self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way() or NOTHING_NEAR}"
         yield from self._helm.stand(self._settings.pause)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > self._settings.trusted:
             self.fix, self._believed = None, self._on_own_map(self.fix)
@@ -218,7 +223,7 @@ class Navigator:
         return known.map_from_robot.mean @ fix.node_from_robot.mean
 
     def _in_the_way(self) -> str:
-        """What keeps the robot from getting on, as far as it can tell."""
+        """What keeps the robot from getting on; empty if nothing is near."""
         ranges = self._helm.observation.proximity
         bearings = self._description.ranger_bearings
         if len(ranges) == len(bearings) and len(bearings):
@@ -226,7 +231,12 @@ class Navigator:
             if ranges[nearest] < 2.0 * self._settings.detour.tight:
                 side = math.degrees(math.remainder(bearings[nearest], math.tau))
                 return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
-        return f"no headway in {self._settings.follower.patience:.0f} s, with nothing near"
+        return ""
+
+    def _only_parking(self, route: tuple[RouteLeg, ...], fix: Fix) -> bool:
+        """Whether the robot is about at the route's last node, with nothing in its way."""
+        distance = _distances(route, len(route) - 1, len(route), fix)[0]
+        return distance <= self._settings.follower.near and not self._in_the_way()
 
 
 def _distances(route: tuple[RouteLeg, ...], before: int, after: int, fix: Fix) -> list[float]:

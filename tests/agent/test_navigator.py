@@ -290,6 +290,25 @@ def test_it_goes_around_by_another_way(home):
     assert nav.tally.edges == 1 and nav.tally.skipped == 0, "it drove to the node in between"
 
 
+def test_parking_that_comes_to_no_end_is_no_block_and_is_tried_anew(home):
+    """Almost at the goal, held there by nothing that anybody else could meet."""
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    follower = FollowerSettings(blind=1e9, parking_patience=3.0)
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(follower=follower))
+    routes: list[WhichWay] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        routes.append(question)
+        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
+
+    trial = Trial(nav, eyes, fleet, held=True)
+    trial.run(20.0, lambda: len(routes) == 3)
+    assert len(routes) == 3 and all(not question.blocked for question in routes)
+    assert nav.tally.blocks == 0
+
+
 def test_blocks_are_kept_for_a_time_that_doubles():
     blocks = Blocks(BlockSettings(forget=10.0, longest=25.0))
     blocks.add(B, A, 0.0)
