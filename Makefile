@@ -14,7 +14,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV) (about a minute) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	@$(BIN)/python -c 'import agent.ekf.kernels'  # compiles the filters once, not in the first drive
+	@$(BIN)/python -c 'from agent.ekf import kernels; kernels.load()'  # compiles the filters once, not in the first drive
 	@touch $(STAMP)
 
 demo: setup

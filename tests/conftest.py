@@ -8,5 +8,9 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
+from hypothesis import settings
 
+# How long an example takes says nothing on a machine that does other things as well.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 cv2.setNumThreads(1)

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.kernels import inverse, leave_one_out
+from agent.ekf import kernels
 from hybridmap.pose import Array
 
 Mask = NDArray[np.bool_]
@@ -88,16 +88,16 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
     """
     accepted: Mask = np.ones(len(innovations), np.bool_)
     innovations = np.ascontiguousarray(innovations)
-    information = inverse(covariance)
-    distances = leave_one_out(innovations, information)
+    information = kernels.inverse(covariance)
+    distances = kernels.leave_one_out(innovations, information)
     excess = float(np.sort(distances)[len(distances) // 2]) / MEDIAN
     if (distances <= gate).all():
         return accepted, information, excess
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:
         chosen = np.flatnonzero(np.repeat(accepted, 2))
-        information = inverse(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
-        distances = leave_one_out(innovations[accepted], information)
+        information = kernels.inverse(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
+        distances = kernels.leave_one_out(innovations[accepted], information)
         if not len(distances) or distances.max() <= gate:
             return accepted, information, excess
         accepted[np.flatnonzero(accepted)[int(np.argmax(distances))]] = False

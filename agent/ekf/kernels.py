@@ -1,25 +1,44 @@
-"""Which form of the costly products runs: compiled where numba is installed, else NumPy's."""
+"""Which form of the costly products runs: compiled where numba is installed, else NumPy's.
+
+The choice is made when the first filter is made, not when this is imported: who asks for help on the command
+line does not wait for a compiler.
+"""
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import Any
+
 from agent.ekf import algebra
 
-try:
-    import numba
-    import scipy.linalg  # noqa: F401
+PRODUCTS = (
+    "transition", "propagate", "ahead",
+    "finite_rows", "spread", "inverse", "leave_one_out", "pull", "condition",
+)  # fmt: skip
 
-    COMPILED = bool(numba.__version__)
-except ImportError:
-    COMPILED = False
-"""Whether this installation has what the compiled form needs: the extra `fast`."""
 
-if COMPILED:
+def load() -> None:
+    """Choose, and compile if that was never done here."""
+    if "COMPILED" not in globals():
+        form = _compiled()
+        globals().update({name: getattr(form or algebra, name) for name in PRODUCTS})
+        globals()["COMPILED"] = form is not None
+
+
+def _compiled() -> ModuleType | None:
+    try:
+        import numba  # noqa: F401
+        import scipy.linalg  # noqa: F401
+    except ImportError:
+        return None
     from agent.ekf import compiled
 
-    transition, propagate, spread = compiled.transition, compiled.propagate, compiled.spread
-    inverse, leave_one_out, condition = compiled.inverse, compiled.leave_one_out, compiled.condition
-    finite_rows, ahead, pull = compiled.finite_rows, compiled.ahead, compiled.pull
-else:
-    transition, propagate, spread = algebra.transition, algebra.propagate, algebra.spread
-    inverse, leave_one_out, condition = algebra.inverse, algebra.leave_one_out, algebra.condition
-    finite_rows, ahead, pull = algebra.finite_rows, algebra.ahead, algebra.pull
+    return compiled
+
+
+def __getattr__(name: str) -> Any:
+    """One of the products, or COMPILED: whether this installation has what the compiled form needs."""
+    if name in PRODUCTS or name == "COMPILED":
+        load()
+        return globals()[name]
+    raise AttributeError(name)

@@ -53,6 +53,7 @@ class MappingFilter:
             wheel_noise: standard deviation of a wheel's way as a share of the way.
             settings: see there.
         """
+        kernels.load()
         self.settings = settings or FilterSettings()
         self.ids: Ids = np.zeros(0, np.int64)
         self.lost = 0

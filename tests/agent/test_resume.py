@@ -25,6 +25,9 @@ from wire.codec import encode_body
 ROBOT = "r0"
 SEED = 3
 
+LOOKS = 30.0
+"""Seconds: two looks that agree, where it was killed, and a view mapped."""
+
 
 class Life:
     """One robot in a world that outlives its agents, and the truth of all that it maps.
@@ -138,7 +141,8 @@ def check_resumed(begun: Begun, life: Life, truth: dict[NodeId, Pose2]) -> None:
 @pytest.fixture(scope="module")
 def again(begun: Begun, tmp_path_factory: pytest.TempPathFactory) -> tuple[Life, dict[NodeId, Pose2]]:
     """A second agent that was started where the first one was killed."""
-    return resumed(begun, tmp_path_factory.mktemp("again"), begun.standing, 16.0)
+    life, _ = resumed(begun, tmp_path_factory.mktemp("again"), begun.standing, LOOKS)
+    return life, begun.truth | life.truth()
 
 
 def test_an_agent_that_was_killed_goes_on_with_its_map(
@@ -172,7 +176,7 @@ def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, 
 def test_resuming_again_is_the_same_to_the_last_bit(
     begun: Begun, again: tuple[Life, dict[NodeId, Pose2]], tmp_path: Path
 ) -> None:
-    once, twice = again[0], resumed(begun, tmp_path, begun.standing, 16.0)[0]
+    once, twice = again[0], resumed(begun, tmp_path, begun.standing, LOOKS)[0]
     one, two = ([encode_body(b) for b in life.pipeline.map.contents()] for life in (once, twice))
     assert one == two
     assert once.sim.truth(ROBOT) == twice.sim.truth(ROBOT)
