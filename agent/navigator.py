@@ -26,6 +26,7 @@ from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import RouteAnswer, RouteLeg
 
+HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
 NOTHING_NEAR = "it gets no further, though nothing is near"
 
 
@@ -41,6 +42,9 @@ class NavigatorSettings:
         answer_patience: ticks that an answer may take before the question counts as lost.
         pause: seconds that it waits before what is in its way, and before it asks again for a route.
         trusted: after a block it still knows where it is if it has driven less than this blindly, m.
+        further: where it looks in vain on its way, it drives on by wheels and looks again after this, m: they
+            are off by a few percent, and to turn back to what it knows, and about again, takes longer.
+        looks: so often in a row; then it is lost.
     """
 
     search: SearchSettings = field(default_factory=SearchSettings)
@@ -50,6 +54,8 @@ class NavigatorSettings:
     answer_patience: int = 100
     pause: float = 2.0
     trusted: float = 1.0
+    further: float = 1.0
+    looks: int = 2
 
 
 class Stage(StrEnum):
@@ -102,6 +108,8 @@ class Navigator:
         self._search = Search(description, lens, sift, own_map, self._helm, s.search, self._rng)
         self._blocks = Blocks(s.blocks)
         self._believed: Pose2 | None = None
+        self._vain_looks = 0
+        self._goal_hidden = False
         self._following = self._searching = False
         self._behaviour = self._go()
 
@@ -137,7 +145,7 @@ class Navigator:
             yield Command()
 
     def _find(self) -> Behaviour:
-        self.stage, self._searching = Stage.LOST, True
+        self.stage, self._searching, self._goal_hidden = Stage.LOST, True, False
         believed, self._believed = self._believed, None
         self.fix = yield from self._search.look_around(believed)
         self._found()
@@ -180,6 +188,8 @@ class Navigator:
             command = follower.step(self._helm.observation)
             self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
             self.tally = self.tally.passed(_distances(route, leg, follower.leg, follower.fix))
+            if follower.fix.in_sight:
+                self._vain_looks = 0
             if follower.progress not in (Progress.DRIVING, Progress.PARKING):
                 break
             yield command
@@ -192,7 +202,12 @@ class Navigator:
                 self.detail = "parking came to no end: once more"
             case Progress.BLOCKED:
                 yield from self._meet_block(*follower.blocked)
+            case Progress.UNSURE if self._goal_hidden and follower.fix.blind < self._settings.follower.blind:
+                self.stage, self.detail = Stage.ARRIVED, HIDDEN
+                self.tally = self.tally.passed([0.0])
             case Progress.UNSURE:
+                # Not blind for long, it stands at the goal by what it has seen before, and sees none of it.
+                self._goal_hidden = follower.fix.blind < self._settings.follower.blind
                 yield from self._make_sure()
 
     def _meet_block(self, a: NodeId, b: NodeId) -> Behaviour:
@@ -206,13 +221,19 @@ class Navigator:
             self.fix, self._believed = None, self._on_own_map(self.fix)
 
     def _make_sure(self) -> Behaviour:
-        """No landmark was in sight for a while: one look from here, else the robot counts as lost."""
+        """No landmark was in sight for a while: one look from here; if in vain, on by wheels a little."""
         self._searching, self._search.detail = True, self.detail
         yield from self._helm.stand(self._settings.search.still)
-        before = self.fix
-        self.fix = yield from self._search.look(self._settings.search.lenient)
+        before, s = self.fix, self._settings
+        self.fix = yield from self._search.look(s.search.lenient)
+        if self.fix is None and before is not None and self._vain_looks < s.looks:
+            self._vain_looks, self._searching = self._vain_looks + 1, False
+            blind = max(s.follower.blind - s.further, 0.0)
+            self.fix = Fix(before.node, before.node_from_robot, None, blind)
+            return
         if self.fix is None:
             self._believed = self._on_own_map(before)
+        self._vain_looks = 0
         self._found()
 
     def _on_own_map(self, fix: Fix | None) -> Pose2 | None:

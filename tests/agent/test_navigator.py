@@ -373,6 +373,51 @@ def test_a_robot_that_has_lost_sight_of_everything_looks_where_nodes_nearby_have
     assert fix.node_from_robot.mean.distance(true) < 0.1
 
 
+def test_a_goal_that_shows_nothing_is_reached_by_its_neighbours_and_said_to_be(home):
+    """The goal has no landmarks: the robot stands there by what it knows of A, looks again, has arrived."""
+    eyes = Eyes(home, Pose2(2.0, 2.0))
+    start = eyes.pose
+    nav = navigator(eyes, NOWHERE, B)
+    goal = bare(B)
+    looks: list[float] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay):
+            leg = RouteLeg(goal, PoseGaussian(Pose2(0.6) if question.start == A else Pose2(), EXACT), None)
+            return Answer(question.number, RouteAnswer((leg,), "a way"))
+        looks.append((start.inverse() @ eyes.pose).x)
+        return found(question, here(A, start.inverse() @ eyes.pose))
+
+    trial = Trial(nav, eyes, fleet)
+    trial.run(60.0, lambda: nav.arrived)
+    assert nav.arrived and "its own landmarks" in nav.detail
+    assert (start @ Pose2(0.6)).distance(eyes.pose) < 0.03
+    assert len(looks) == 2 and looks[1] == pytest.approx(0.6, abs=0.03), "it has looked again at the goal"
+
+
+def test_where_it_sees_nothing_it_knows_it_drives_on_a_little_before_it_counts_as_lost(home):
+    """A long way without a view: by wheels as far as `blind`, twice `further`, and only then it is lost."""
+    eyes = Eyes(home, Pose2(0.5, 2.0))
+    settings = NavigatorSettings(follower=FollowerSettings(blind=1.0), further=0.5, looks=2)
+    nav = navigator(eyes, NOWHERE, B, settings)
+    looks: list[float] = []
+    ahead = RouteLeg(bare(B), PoseGaussian(Pose2(9.0), EXACT), None)
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay):
+            here_first = PoseGaussian(Pose2(), EXACT) if question.start == B else ahead.previous_from_node
+            legs = (replace(ahead, previous_from_node=here_first),)
+            return Answer(question.number, RouteAnswer(legs, "a way"))
+        looks.append(eyes.pose.x - 0.5)
+        return found(question, here(A, Pose2())) if len(looks) == 1 else found(question)
+
+    trial = Trial(nav, eyes, fleet)
+    trial.run(60.0, lambda: nav.stage == Stage.LOST and len(looks) > 3)
+    assert looks[1:4] == pytest.approx([1.0, 1.5, 2.0], abs=0.1)
+    assert nav.stage == Stage.LOST and nav.fix is None
+    assert nav.tally.relocalizations == 1
+
+
 # The helm
 
 
