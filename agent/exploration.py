@@ -23,7 +23,10 @@ class ExplorerSettings:
         travel_step: a new node at least this often on the way, m.
         spacing: places are at least this far from each other, m.
         reach: the longest way to a next place, m.
-        sight: what can be seen from a place is judged within this radius, m.
+        sight: what lies around a place, and what others know around theirs, is judged within this radius, m.
+        view: a look around shows floor up to this far, m.
+        look_time: about what a look around takes, s.
+        least_area: new floor that is worth one, m^2.
         known_reach: nodes within this of a place show it, m.
         known: a place around which nodes look into this share of all directions is not mapped again.
         patience: seconds without getting on before a way is given up.
@@ -44,6 +47,9 @@ class ExplorerSettings:
     spacing: float = 1.7
     reach: float = 7.0
     sight: float = 1.6
+    view: float = 3.0
+    look_time: float = 60.0
+    least_area: float = 1.0
     known_reach: float = 0.7
     known: float = 0.75
     patience: float = 4.0

@@ -130,18 +130,11 @@ class Explorer:
             turned += 0.05 + (yield from self._moves.turn_to_next_view(self._side, Phase.SCANNING))
 
     def _way_on(self) -> list[Array]:
-        """Corners of the way to the next place; empty if there is none.
-
-        What others have looked around at is left to them, as long as there is anything else.
-        """
+        """Corners of the way to the next place; empty if there is none."""
         s = self._settings
         been = np.array(self.places + self._avoid)
         theirs = self._hearsay.places(self._views, s.known_reach, s.known)
-        for others in (theirs, theirs[:0]):
-            path = next_place(self._floor, self._moves.position, been, others, s.reach, s.sight, s.spacing)
-            if path or not len(theirs):
-                break
-        return path
+        return next_place(self._floor, self._moves.position, been, theirs, s)
 
     @property
     def _views(self) -> Array:

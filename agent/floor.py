@@ -35,6 +35,10 @@ class FloorSettings:
     most: float = 3.0
 
 
+RAYS = 48
+"""Directions in which a look around is tried."""
+
+
 class Floor:
     """A grid of log-odds that a cell is occupied; 0 is unknown."""
 
@@ -103,11 +107,39 @@ class Floor:
             radius: half the side of the square that is looked at, m.
             told: (N, 2) m in map; somebody else knows the floor within the radius of these.
         """
+        unknown = self._unknown(told, radius)
+        side = 2 * round(radius / self._settings.cell) + 1
+        return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
+
+    def unknown_in_sight(self, points: Array, told: Array, known: float, reach: float) -> Array:
+        """How much unknown floor would be seen from each of some points, looking all around, (N,) m^2.
+
+        What was seen to be occupied hides what is behind it; unknown floor hides nothing.
+
+        Args:
+            points: (N, 2) m in map.
+            told: (M, 2) m in map; somebody else knows the floor around these.
+            known: up to this far, m.
+            reach: how far one can see, m.
+        """
+        cell, unknown, hidden = self._settings.cell, self._unknown(told, known), self._odds > 0.3
+        angles = np.arange(RAYS) * (math.tau / RAYS)
+        along = np.arange(0.5 * cell, reach, cell)
+        ray = along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
+        pieces = along * cell * (math.tau / RAYS)
+        areas = np.zeros(len(points))
+        for k, point in enumerate(points):
+            at = self.cells(point + ray)
+            seen = ~np.logical_or.accumulate(hidden[at[..., 0], at[..., 1]], axis=1)
+            areas[k] = (unknown[at[..., 0], at[..., 1]] * seen * pieces).sum()
+        return areas
+
+    def _unknown(self, told: Array, radius: float) -> NDArray[np.float32]:
+        """1 where a cell is unknown and none of (N, 2) points in map is within the radius (m), else 0."""
         unknown = (np.abs(self._odds) <= 0.3).astype(np.float32)
         for row, column in self.cells(told):
             cv2.circle(unknown, (int(column), int(row)), round(radius / self._settings.cell), 0.0, -1)
-        side = 2 * round(radius / self._settings.cell) + 1
-        return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
+        return unknown
 
     def corners(self, start: Array, goal: Array, reach: float) -> list[Array]:
         """Corners of the shortest way to a position, or as near to it as one can get; unknown floor is tried.

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agent.exploration import ExplorerSettings
 from agent.floor import Floor
 from agent.hearsay import Hearsay
 from agent.mission import Answer, WhatIsKnown
@@ -134,13 +135,46 @@ def test_the_next_place_is_where_nobody_has_been():
     been = here[None]
 
     def end(others: np.ndarray) -> np.ndarray:
-        return next_place(floor, here, been, others, 7.0, 1.6, 1.7)[-1]
+        return next_place(floor, here, been, others, ExplorerSettings())[-1]
 
     assert abs(end(NOBODY)[0]) > 1.7, "one of the two ends of what it has seen"
     left = np.array([[-2.5, 0.0]])
     assert end(left)[0] > 1.7
     assert end(-left)[0] < -1.7
-    assert next_place(floor, here, been, np.concatenate([left, -left]), 7.0, 1.6, 1.7) == []
+    # Where others are everywhere, the way on leads past them.
+    assert abs(end(np.concatenate([left, -left]))[0]) > 1.7
+    everywhere = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-1, 2)), axis=-1).reshape(-1, 2) * 1.0
+    assert next_place(floor, here, everywhere, NOBODY, ExplorerSettings()) == []
+
+
+def test_what_walls_hide_makes_no_place_worth_a_way():
+    """Along a corridor everything behind its walls is unknown for ever; a wide unknown end is worth more."""
+    floor = corridor()
+    middle, end = floor.unknown_in_sight(np.array([[0.0, 0.0], [2.5, 0.0]]), NOBODY, 1.6, 3.0)
+    assert middle < 0.5
+    assert end > 3.0
+    around = floor.unknown_around(1.6, NOBODY)
+    assert around[tuple(floor.cells(np.zeros(2)))] > 0.1, "which a square around it does not tell"
+    told = floor.unknown_in_sight(np.array([[2.5, 0.0]]), np.array([[4.0, 0.0]]), 1.6, 3.0)
+    assert told[0] < end
+
+
+def test_floor_in_sight_against_looking_at_each_cell():
+    """Every cell is looked at along a line of its own, in steps of a centimetre."""
+    floor, here, reach = corridor(), np.array([2.05, 0.35]), 2.5
+    unknown = floor.unknown_around(0.0, NOBODY) > 0.5
+    occupied = floor.room() == 0.0
+    area = 0.0
+    for row, column in np.argwhere(unknown):
+        cell = floor.centre((int(row), int(column)))
+        away = math.dist(cell, here)
+        if away <= reach:
+            line = here + np.arange(0.0, 1.0, 0.01 / away)[:, None] * (cell - here)
+            at = floor.cells(line)
+            area += 0.01 * (not occupied[at[:, 0], at[:, 1]].any())
+    (found,) = floor.unknown_in_sight(here[None], NOBODY, 1.6, reach)
+    assert area > 2.0
+    assert found == pytest.approx(area, rel=0.1)
 
 
 def test_floor_that_others_know_is_not_unknown():
