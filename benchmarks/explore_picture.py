@@ -45,7 +45,7 @@ def draw(done: Mapping[str, Mapping[int, Exploration]], minutes: float, seed: in
         axes.set_xlabel("minutes")
         axes.set_xlim(0.0, minutes)
         axes.set_ylim(0.0, 1.05 * whole)
-        axes.legend(loc="lower right", frameon=False)
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.93), frameon=False)
     panels[0].set_ylabel("floor that nodes show, m²")
     figure.suptitle(f"office, seed {seed}")
     out.mkdir(parents=True, exist_ok=True)
