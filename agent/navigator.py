@@ -110,7 +110,7 @@ class Navigator:
         self._believed: Pose2 | None = None
         self._vain_looks = 0
         self._goal_hidden = False
-        self._following = self._searching = False
+        self._following = self._searching = self._parked_anew = False
         self._behaviour = self._go()
 
     @property
@@ -197,11 +197,14 @@ class Navigator:
         match follower.progress:
             case Progress.ARRIVED:
                 self.tally = self.tally.passed([0.0])
-            case Progress.BLOCKED if self._only_parking(route, follower.fix):
+            case Progress.BLOCKED if not self._parked_anew and self._only_parking(route, follower.fix):
                 # Nothing keeps it from its goal but its own precision: that is no block for anybody.
-                self.detail = "parking came to no end: once more"
+                self.detail, self._parked_anew = "parking came to no end: once more", True
             case Progress.BLOCKED:
                 yield from self._meet_block(*follower.blocked)
+                if self._parked_anew:
+                    # Twice: it begins from another heading, by what it sees then.
+                    self.fix, self._believed, self._parked_anew = None, self._on_own_map(self.fix), False
             case Progress.UNSURE if self._goal_hidden and follower.fix.blind < self._settings.follower.blind:
                 self.stage, self.detail = Stage.ARRIVED, HIDDEN
                 self.tally = self.tally.passed([0.0])

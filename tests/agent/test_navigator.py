@@ -290,7 +290,7 @@ def test_it_goes_around_by_another_way(home):
     assert nav.tally.edges == 1 and nav.tally.skipped == 0, "it drove to the node in between"
 
 
-def test_parking_that_comes_to_no_end_is_no_block_and_is_tried_anew(home):
+def test_parking_that_comes_to_no_end_is_tried_anew_before_it_is_a_block(home):
     """Almost at the goal, held there by nothing that anybody else could meet."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
     follower = FollowerSettings(blind=1e9, parking_patience=3.0)
@@ -305,8 +305,8 @@ def test_parking_that_comes_to_no_end_is_no_block_and_is_tried_anew(home):
 
     trial = Trial(nav, eyes, fleet, held=True)
     trial.run(20.0, lambda: len(routes) == 3)
-    assert len(routes) == 3 and all(not question.blocked for question in routes)
-    assert nav.tally.blocks == 0
+    assert [question.blocked for question in routes] == [(), (), ((A, B),)], "nobody is told at first"
+    assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself anew"
 
 
 def test_blocks_are_kept_for_a_time_that_doubles():
