@@ -8,6 +8,7 @@ elsewhere it was at most 8 %, or 30 % where the same wall was still ahead.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -57,6 +58,11 @@ class ContinuitySettings:
         least_texture: mean squared gradient around a corner in its weakest direction, (grey/px)^2.
         least_corners: an image with fewer corners shows nothing,
         most_clipped: and so does one of which a larger share is black or white.
+        few: with fewer points than this in the image, all of it is compared besides.
+        coarse: side of the squares, px, over which images are averaged to be compared by and large.
+        alike: they are the same if they then correlate by more than this,
+        least_spread: and vary by more than this, grey levels: all blank walls are alike;
+        same_light: and are equally bright on average, to within this, grey levels.
     """
 
     least: int = 8
@@ -66,6 +72,11 @@ class ContinuitySettings:
     least_texture: float = 8.0
     least_corners: int = 6
     most_clipped: float = 0.5
+    few: int = 30
+    coarse: int = 8
+    alike: float = 0.95
+    least_spread: float = 8.0
+    same_light: float = 10.0
 
 
 class Continuity:
@@ -106,6 +117,11 @@ class Continuity:
             same = self._corners_agree(now, before, -turn)
         if same is not False:
             return Sight.SAME
+        # A dozen tracks on smooth shapes can all be lost at once; then the whole image has its say.
+        inside = int(self._camera.contains(expected, self._settings.border_px).sum())
+        few = self._settings.least <= inside < self._settings.few
+        if few and self._alike(before, now, turn):
+            return Sight.SAME
         clipped = float(((now <= BLACK) | (now >= WHITE)).mean())
         blank = (
             clipped > self._settings.most_clipped or len(self._corners(now)) < self._settings.least_corners
@@ -120,6 +136,24 @@ class Continuity:
             return None
         near = np.linalg.norm(found[inside] - expected[inside], axis=1) <= s.astray_px
         return bool(near.mean() >= s.share)
+
+    def _alike(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool:
+        """Whether the images are the same by and large, where smooth shapes leave little to be tracked."""
+        s, (height, width) = self._settings, before.shape
+        aside = round(self._camera.fx * math.tan(turn))
+        if abs(aside) > width // 2:
+            return False
+        # A turn to the left moves all to the right.
+        first = before[:, max(-aside, 0) : width - max(aside, 0)]
+        second = now[:, max(aside, 0) : width - max(-aside, 0)]
+        size = (first.shape[1] // s.coarse, height // s.coarse)
+        one = cv2.resize(first, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+        two = cv2.resize(second, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+        if abs(float(one.mean() - two.mean())) > s.same_light:
+            return False
+        one, two = one - one.mean(), two - two.mean()
+        spread = float(one.std() * two.std())
+        return spread > s.least_spread**2 and float((one * two).mean()) > s.alike * spread
 
     def _corners_agree(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool | None:
         corners = self._corners(before)

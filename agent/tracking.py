@@ -60,6 +60,7 @@ class Tracking:
         self._since_believed = Pose2()
         self._misses_px: Array = np.zeros((0, 2))
         self._strikes = Strikes(settings.strikes)
+        self._unused: int | None = None
         self._expected_depth = 1.0
         self._next_track = 1
 
@@ -87,7 +88,11 @@ class Tracking:
     @property
     def health(self) -> tuple[Health, str]:
         """What holds the posture up, and in words what is wrong; empty if nothing is."""
-        return self._filter.health
+        if self._unused is None or self.missing or self.strange or self.blank:
+            return self._filter.health
+        if not self._unused:
+            return Health.BLIND, "no landmark in view"
+        return Health.FEW, f"{self._unused} landmarks in view are too few or too near to each other to go by"
 
     @property
     def doubtful(self) -> bool:
@@ -133,7 +138,8 @@ class Tracking:
         filtered = np.isin(self._tracker.ids, self._filter.ids)
         pixels = self._tracker.pixels[filtered]
         self._misses_px = np.zeros((0, 2))
-        if self._trusted(pixels):
+        self._unused = None if self._trusted(pixels) else len(pixels)
+        if self._unused is None:
             ids = self._tracker.ids[filtered]
             update = self._filter.update(ids, pixels)
             self._misses_px = update.innovations_px[update.accepted]
@@ -162,6 +168,7 @@ class Tracking:
         self._tracker.add(ids, view.features.raw[new])
         self._strikes.forget()
         self._expected_depth = expected_depth
+        self._unused = None if len(ids) else 0
         self._fill(first=int(ids[0]) if len(ids) else self._next_track)
         self.remember(force=True)
 

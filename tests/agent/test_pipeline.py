@@ -171,7 +171,7 @@ def test_images_without_features_make_no_node_and_say_so():
     grey = np.full((240, 320), 100, np.uint8)
     for tick in range(10):
         step = pipeline.step(Observation(tick, Odometry(0.05, 0.0), grey))
-    assert step.status.detail == "no nodes yet: only 0 features in view"
+    assert step.status.detail == "no nodes yet: only 0 features in view; no landmark in view"
     assert step.status.nodes == 0
 
 
