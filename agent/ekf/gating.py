@@ -83,24 +83,28 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
         gate: chi-square threshold.
 
     Returns:
-        (N,) accepted; the inverse of the accepted ones' joint covariance, (2K, 2K); and how the median of all
-        leave-one-out distances compares with what it should be: 1 if the noise is what it is said to be.
+        (N,) accepted; the inverse of the accepted ones' joint covariance, (2K, 2K); and how the median of
+        their leave-one-out distances compares with what it should be: 1 if the noise is as it is said.
     """
     accepted: Mask = np.ones(len(innovations), np.bool_)
     innovations = np.ascontiguousarray(innovations)
     information = kernels.inverse(covariance)
     distances = kernels.leave_one_out(innovations, information)
-    excess = float(np.sort(distances)[len(distances) // 2]) / MEDIAN
     if (distances <= gate).all():
-        return accepted, information, excess
+        return accepted, information, _excess(distances)
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:
         chosen = np.flatnonzero(np.repeat(accepted, 2))
         information = kernels.inverse(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
         distances = kernels.leave_one_out(innovations[accepted], information)
         if not len(distances) or distances.max() <= gate:
-            return accepted, information, excess
+            return accepted, information, _excess(distances)
         accepted[np.flatnonzero(accepted)[int(np.argmax(distances))]] = False
+
+
+def _excess(distances: Array) -> float:
+    """How the median of squared distances compares with that of a chi-square; 1 without any."""
+    return float(np.sort(distances)[len(distances) // 2]) / MEDIAN if len(distances) else 1.0
 
 
 def _blocks(matrix: Array) -> Array:
