@@ -235,45 +235,43 @@ def condition(
 ) -> tuple[Array, Array]:
     """See agent.ekf.algebra.
 
-    With M the measured entries, U the others and R the measurements' covariance, P - P_M S^-1 P_M^T falls
-    apart into R - R S^-1 R, P_UM S^-1 R and P_UU - P_UM S^-1 P_MU: only P_UM is multiplied, a third of P_M.
+    With M the measured entries, U the others and R the measurements' covariance, P_M - P_M S^-1 P_MM is P_M S^-1 R:
+    no difference of what is nearly equal. Only P_UU - P_UM S^-1 P_MU remains to be multiplied.
     """
     size, m2 = covariance.shape[0], 2 * slots.shape[0]
-    index, others = np.empty(m2, np.intp), np.empty(size - m2, np.intp)
-    free = np.ones(size, np.bool_)
+    # Measured entries first, then the others.
+    order, free = np.empty(size, np.intp), np.ones(size, np.bool_)
     for i in range(m2):
-        index[i] = 3 + 3 * slots[i // 2] + i % 2
-        free[index[i]] = False
-    k = 0
+        order[i] = 3 + 3 * slots[i // 2] + i % 2
+        free[order[i]] = False
+    k = m2
     for i in range(size):
         if free[i]:
-            others[k] = i
+            order[k] = i
             k += 1
-    shared = np.empty((k, m2))
-    for i in range(k):
-        row = covariance[others[i]]
+    columns = np.empty((size, m2))
+    for i in range(size):
+        row = covariance[order[i]]
         for j in range(m2):
-            shared[i, j] = row[index[j]]
-    gain = shared @ information
-    taken = gain @ shared.T
-    pull_at = information @ residual
+            columns[i, j] = row[order[j]]
+    gain = columns @ information
+    taken = gain[m2:] @ columns[m2:].T
     step, out = np.empty(size), np.empty((size, size))
-    # Row by row, each entry and its mirror by the same product: symmetric to the last bit.
-    for i in range(m2):
-        noise, new = variances[i % 2], out[index[i]]
-        # P_M S^-1 r = (S - R) S^-1 r.
-        step[index[i]] = residual[i] - noise * pull_at[i]
+    # Row by row, each entry and its mirror by the same sum: symmetric to the last bit.
+    for i in range(size):
+        old, new, moved = covariance[order[i]], out[order[i]], 0.0
         for j in range(m2):
-            new[index[j]] = -information[i, j] * (noise * variances[j % 2])
-        new[index[i]] += noise
-        for j in range(k):
-            new[others[j]] = gain[j, i] * noise
-    for i in range(k):
-        old, new, moved = covariance[others[i]], out[others[i]], 0.0
-        for j in range(m2):
-            new[index[j]] = gain[i, j] * variances[j % 2]
-            moved += shared[i, j] * pull_at[j]
-        step[others[i]] = moved
-        for j in range(k):
-            new[others[j]] = old[others[j]] - 0.5 * (taken[i, j] + taken[j, i])
+            moved += gain[i, j] * residual[j]
+        step[order[i]] = moved
+        if i < m2:
+            noise = variances[i % 2]
+            for j in range(m2):
+                new[order[j]] = 0.5 * (gain[i, j] * variances[j % 2] + gain[j, i] * noise)
+            for j in range(m2, size):
+                new[order[j]] = gain[j, i] * noise
+        else:
+            for j in range(m2):
+                new[order[j]] = gain[i, j] * variances[j % 2]
+            for j in range(m2, size):
+                new[order[j]] = old[order[j]] - 0.5 * (taken[i - m2, j - m2] + taken[j - m2, i - m2])
     return step, out

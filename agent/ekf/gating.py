@@ -90,7 +90,7 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
     innovations = np.ascontiguousarray(innovations)
     information = kernels.inverse(covariance)
     distances = kernels.leave_one_out(innovations, information)
-    if (distances <= gate).all():
+    if distances.max() <= gate:
         return accepted, information, _excess(distances)
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:

@@ -150,8 +150,9 @@ class MappingFilter:
         innovations = slopes - self._rays[slots, :2]
         believed, information, health, reason = self._believe(slots, innovations)
         nis = math.nan
-        if believed.any():
-            if not believed.all():
+        agreeing = int(np.count_nonzero(believed))
+        if agreeing:
+            if agreeing < len(slots):
                 slots, slopes = slots[believed], slopes[believed]
             nis, slip = self._correct(slots, slopes, information)
             if slip and health is Health.GOOD:

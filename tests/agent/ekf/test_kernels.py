@@ -6,7 +6,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from agent.ekf import algebra
@@ -78,6 +78,7 @@ def test_propagate(size: tuple[int, int]) -> None:
 
 @settings(deadline=None)
 @given(sizes)
+@example((12, 8437))
 def test_update_is_the_textbook_one(size: tuple[int, int]) -> None:
     n, _ = size
     rng, _, _, covariance = scene(*size)
