@@ -235,8 +235,8 @@ def condition(
 ) -> tuple[Array, Array]:
     """See agent.ekf.algebra.
 
-    With M the measured entries, U the others and R the measurements' covariance, P_M - P_M S^-1 P_MM is P_M S^-1 R:
-    no difference of what is nearly equal. Only P_UU - P_UM S^-1 P_MU remains to be multiplied.
+    With M the measured entries, U the others and R the measurements' covariance, P_M - P_M S^-1 P_MM is
+    P_M S^-1 R: no difference of what is nearly equal. Only P_UU - P_UM S^-1 P_MU remains to be multiplied.
     """
     size, m2 = covariance.shape[0], 2 * slots.shape[0]
     # Measured entries first, then the others.
