@@ -47,18 +47,32 @@ class Floor:
         self._settings = settings or FloorSettings()
         self._description = description
         self._half = round(self._settings.side / 2 / self._settings.cell)
+        self._middle = np.zeros(2, np.int64)
         self._odds: NDArray[np.float32] = np.zeros((2 * self._half, 2 * self._half), np.float32)
         self._bearings = np.array(description.ranger_bearings)
         self._steps = np.arange(0.5, description.ranger_reach / self._settings.cell) * self._settings.cell
 
     def cells(self, points: Array) -> NDArray[np.int64]:
         """(..., 2) m in map -> (..., 2) cell indices, clipped to the grid."""
-        index = np.floor(points / self._settings.cell).astype(np.int64) + self._half
-        return np.clip(index, 0, 2 * self._half - 1)
+        index = np.floor(points / self._settings.cell).astype(np.int64) + self._half - self._middle
+        return np.asarray(np.clip(index, 0, 2 * self._half - 1), np.int64)
 
     def centre(self, cell: tuple[int, int]) -> Array:
         """(2,) m in map, middle of a cell."""
-        return (np.array(cell, dtype=np.float64) - self._half + 0.5) * self._settings.cell
+        return (np.array(cell, dtype=np.float64) - self._half + self._middle + 0.5) * self._settings.cell
+
+    def roll(self, point: Array) -> None:
+        """Let the grid's middle be at a point, (2,) m in map; what falls over its border is forgotten."""
+        middle = np.round(np.asarray(point) / self._settings.cell).astype(np.int64)
+        rows, columns = (int(v) for v in middle - self._middle)
+        self._middle = middle
+        kept = np.zeros_like(self._odds)
+        size = len(kept)
+        if abs(rows) < size and abs(columns) < size:
+            into = slice(max(-rows, 0), size - max(rows, 0)), slice(max(-columns, 0), size - max(columns, 0))
+            from_ = slice(max(rows, 0), size - max(-rows, 0)), slice(max(columns, 0), size - max(-columns, 0))
+            kept[into] = self._odds[from_]
+        self._odds = kept
 
     def see(self, map_from_robot: Pose2, proximity: Array) -> None:
         """Enter what the rangers measure: free along the beam, occupied at its end.
@@ -140,34 +154,6 @@ class Floor:
         for row, column in self.cells(told):
             cv2.circle(unknown, (int(column), int(row)), round(radius / self._settings.cell), 0.0, -1)
         return unknown
-
-    def corners(self, start: Array, goal: Array, reach: float) -> list[Array]:
-        """Corners of the shortest way to a position, or as near to it as one can get; unknown floor is tried.
-
-        Args:
-            start: (2,) m in map.
-            goal: (2,) m in map.
-            reach: longest way, m.
-        """
-        ways = self.ways(start, reach, self.drivable(unknown=True))
-        if not len(ways.cells):
-            return []
-        nearest = int(np.linalg.norm(ways.positions - goal, axis=1).argmin())
-        return ways.path(ways.cells[nearest])
-
-    def clear(self, start: Array, goal: Array) -> bool:
-        """Whether the straight way between two positions ((2,) m in map) meets nothing that was seen."""
-        drivable = self.drivable(unknown=True)
-        count = int(np.linalg.norm(goal - start) / (0.5 * self._settings.cell)) + 1
-        points = start + np.linspace(0.0, 1.0, count + 1)[:, None] * (goal - start)
-        cells = self.cells(points)
-        good = drivable[cells[:, 0], cells[:, 1]]
-        if good.all() or not good.any():
-            return bool(good.all())
-        # Close to something already, the robot may still leave it, but come no closer.
-        first = int(good.argmax())
-        leaving = self.room()[cells[: first + 1, 0], cells[: first + 1, 1]]
-        return bool(good[first:].all() and (np.diff(leaving) > -1e-6).all())
 
     def ways(self, start: Array, reach: float, drivable: NDArray[np.bool_] | None = None) -> Ways:
         """Shortest ways over drivable cells to everything within reach of a position.

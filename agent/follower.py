@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -12,8 +11,10 @@ from numpy.typing import NDArray
 
 from agent.detour import Detour
 from agent.fix import Fix
+from agent.follower_settings import FollowerSettings
+from agent.headway import Headway
 from agent.localizer import Localizer
-from agent.lookout import Expected, Lookout, LookoutSettings
+from agent.lookout import Expected, Lookout
 from agent.observation import Command, Observation, RobotDescription
 from agent.servo.blind import BlindDrive
 from agent.servo.proximity import ranger_points
@@ -24,39 +25,6 @@ from agent.vision.sift import Sift
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import RouteLeg
-
-
-@dataclass(frozen=True)
-class FollowerSettings:
-    """How a route is followed.
-
-    Attributes:
-        lookout: when a node ahead counts as found; a posture may be off by as much again for each metre
-            driven blind.
-        passed: an intermediate node is passed within this distance, m.
-        sight_turn: a node's landmarks are looked for when the robot's heading is within this of it, rad.
-        sight_reach: and the robot within this distance of it, m.
-        look_every: ticks between two looks for the next nodes' landmarks.
-        skip: nodes further along the route that are looked for as well.
-        blind: way without any landmark in sight after which the robot must find itself again, m.
-        hidden: seconds at the goal without its landmarks in sight, or recognised, after which it is not
-            there, s.
-        patience: seconds without getting on before an edge counts as blocked.
-        parking_patience: likewise at the goal.
-        near: within this distance of the goal the last, blind turns are made if it is not in sight, m.
-    """
-
-    lookout: LookoutSettings = field(default_factory=LookoutSettings)
-    passed: float = 0.22
-    sight_turn: float = 0.6
-    sight_reach: float = 1.4
-    look_every: int = 4
-    skip: int = 2
-    blind: float = 2.0
-    hidden: float = 2.0
-    patience: float = 6.0
-    parking_patience: float = 30.0
-    near: float = 0.35
 
 
 class Progress(StrEnum):
@@ -124,8 +92,10 @@ class Follower:
         # The route may begin at a node that the robot does not stand at: then that is the first to reach.
         self.leg = min(1 if self._off_reference() < settings.passed else 0, self._last)
         self._tick = 0
-        self._best, self._waited = math.inf, 0.0
+        self._progressed = Headway()
         self._servoing = -1
+        self._headway = Headway()
+        self._servo_barred = 0.0
         self._approaching = False
         self._hidden = 0.0
         self._confirmed = False
@@ -153,7 +123,8 @@ class Follower:
         if self.fix.blind > s.blind and not (parking and distance < s.near):
             self.progress = Progress.UNSURE
             return Command()
-        if not self._getting_on(distance, s.parking_patience if parking else s.patience):
+        self._progressed.take(distance, self._description.tick)
+        if self._progressed.stood > (s.parking_patience if parking else s.patience):
             self.progress = Progress.BLOCKED
             return Command()
         return self._drive(target, distance, parking, observation)
@@ -164,11 +135,12 @@ class Follower:
         """Servo if the target's landmarks are in sight, else drive to its position, at the goal blindly."""
         obstacles = ranger_points(observation.proximity, self._description)
         localizer = self.fix.localizer
-        if localizer is not None and self._reference == self.leg and (parking or _lies_ahead(target)):
+        if localizer is not None and self._may_servo(target, distance, parking):
             points = self._route[self.leg].node.points_in_robot
             if self._servoing != self.leg:
                 self._servo.start(target, points)
                 self._servoing = self.leg
+                self._headway = Headway()
             step = self._servo.command(target, points, _mask(localizer, len(points)), obstacles)
             if parking:
                 self.progress = Progress.PARKING
@@ -193,6 +165,18 @@ class Follower:
             self.progress = Progress.UNSURE
         return step.command
 
+    def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
+        """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
+        s, tick = self._settings, self._description.tick
+        self._servo_barred = max(self._servo_barred - tick, 0.0)
+        if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
+            return False
+        if self._servoing == self.leg and not (parking and distance <= s.near):
+            self._headway.take(distance, tick)
+            if self._headway.stood > (s.stalled_parking if parking else s.stalled):
+                self._servo_barred = s.barred
+        return self._servo_barred == 0.0
+
     def _confirm(self, state: State, observation: Observation) -> None:
         """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
 
@@ -210,12 +194,6 @@ class Follower:
             if self._hidden > self._settings.hidden:
                 self.progress = Progress.UNSURE
 
-    def _getting_on(self, distance: float, patience: float) -> bool:
-        if distance < self._best - 0.03:
-            self._best, self._waited = distance, 0.0
-        self._waited += self._description.tick
-        return self._waited <= patience
-
     # Nodes ahead
 
     def _pass_nodes(self) -> None:
@@ -231,7 +209,7 @@ class Follower:
                 break
             self.leg += 1
         if self.leg != before:
-            self._best, self._waited = math.inf, 0.0
+            self._progressed = Headway()
 
     def _look_for(self, wanted: Sequence[Expected], observation: Observation) -> bool:
         """Look for landmarks, furthest first; returns whether some were found: then the fix is on them."""

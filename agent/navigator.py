@@ -12,7 +12,8 @@ import numpy as np
 from agent.blocks import Blocks, BlockSettings
 from agent.detour import Detour, DetourSettings
 from agent.fix import Fix
-from agent.follower import Follower, FollowerSettings, Progress
+from agent.follower import Follower, Progress
+from agent.follower_settings import FollowerSettings
 from agent.helm import Behaviour, Helm
 from agent.mission import Answer, Question, WhichWay
 from agent.observation import Command, Observation, RobotDescription

@@ -275,48 +275,24 @@ def test_no_way_out_of_a_trap_leads_through_a_wall():
         pose = Pose2(0, 0, 0.05 * k)
         floor.see(pose, measure(pose, box))
     assert len(floor.ways(np.zeros(2), 10.0).cells) == 0
-    assert floor.corners(np.zeros(2), np.array([2.0, 0.0]), 10.0) == []
 
 
-def test_corners_lead_over_unknown_floor_and_as_near_as_one_can_get():
-    fresh = Floor(ROBOT, SETTINGS)
-    (only,) = fresh.corners(np.array([0.05, 0.05]), np.array([2.05, 1.05]), 5.0)
-    assert np.linalg.norm(only - [2.05, 1.05]) < CELL
-    floor = known_room()
-    behind = np.array([2.0, -2.0])
-    way = floor.corners(np.array([-0.5, -2.0]), behind, 20.0)
-    assert np.linalg.norm(way[-1] - behind) < CELL
-    assert any(0.2 < corner[1] < 1.4 for corner in way), "by the door"
-    into = floor.corners(np.array([-0.5, -2.0]), np.array([1.1, -1.0]), 20.0)
-    assert ENOUGH - SLACK < np.linalg.norm(into[-1] - [1.1, -1.0]) < ENOUGH + 2 * CELL
-
-
-# Straight ways
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_clear_way_is_clear(seed):
-    rng = np.random.default_rng(seed)
-    floor = known_room(rng)
-    drivable = floor.drivable(unknown=True)
-    answers = []
-    for _ in range(150):
-        start, goal = rng.uniform([-3.5, -2.6], [3.5, 2.6], (2, 2))
-        if not drivable[tuple(floor.cells(start))]:
-            continue
-        gap = around(floor, dense(start, [goal])).min()
-        clear = floor.clear(start, goal)
-        assert not clear or gap > ENOUGH - SLACK
-        assert clear or gap < ENOUGH + SLACK
-        answers.append(clear)
-    assert 0.1 < np.mean(answers) < 0.9
-
-
-def test_a_straight_way_out_of_a_corner():
-    floor = known_room()
-    near_table = np.array([-1.46, -0.3])
-    assert not floor.drivable(unknown=True)[tuple(floor.cells(near_table))]
-    assert floor.clear(near_table, np.array([-0.2, -0.3])), "straight away from it"
-    assert not floor.clear(near_table, np.array([-3.2, -0.3])), "through it"
-    assert not floor.clear(np.array([-0.2, -0.3]), near_table), "to it"
-    assert floor.clear(np.array([-0.2, -0.3]), np.array([-0.2, -0.3]))
+def test_a_rolled_floor_knows_what_is_left_on_it():
+    """Against a floor that never rolls, cell by cell, wherever both reach."""
+    rng = np.random.default_rng(4)
+    whole, small = Floor(ROBOT, SETTINGS), Floor(ROBOT, FloorSettings(side=7.0))
+    at = np.zeros(2)
+    for _ in range(60):
+        at = np.clip(at + rng.uniform(-0.2, 0.2, 2), [-3.0, -2.4], [0.0, 2.4])
+        pose = Pose2(*at, rng.uniform(-3, 3))
+        small.roll(at)
+        ranges = measure(pose)
+        whole.see(pose, ranges)
+        small.see(pose, ranges)
+    near = at + rng.uniform(-0.5, 0.5, (200, 2))
+    assert np.array_equal(*(f.drivable(unknown=True)[tuple(f.cells(near).T)] for f in (whole, small)))
+    for point in near[:20]:
+        (cell,) = small.cells(point[None])
+        assert np.abs(small.centre(tuple(cell)) - point).max() <= CELL / 2 + 1e-9
+    small.roll(at + 50.0)
+    assert (small.room() > 3.0).all(), "far away it knows nothing any more"

@@ -5,7 +5,8 @@ import pytest
 
 from agent.detour import Detour
 from agent.fix import Fix
-from agent.follower import Follower, FollowerSettings, Progress
+from agent.follower import Follower, Progress
+from agent.follower_settings import FollowerSettings
 from agent.lookout import Expected, Lookout, LookoutSettings
 from agent.mapper import Mapper
 from agent.observation import Observation, Odometry, RobotDescription

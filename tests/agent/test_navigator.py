@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agent.blocks import Blocks, BlockSettings
-from agent.follower import FollowerSettings
+from agent.follower_settings import FollowerSettings
 from agent.helm import NO_ANSWER, Helm
 from agent.mission import Answer, Question, WhereAmI, WhichWay
 from agent.navigator import Navigator, NavigatorSettings, Stage
