@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from agent.homing.localizer import BearingLocalizer
 from agent.localizer import Localizer
 from agent.observation import Observation, RobotDescription
 from hybridmap.node import NodeId
@@ -26,11 +27,11 @@ class Fix:
 
     node: NodeId
     node_from_robot: PoseGaussian
-    localizer: Localizer | None = None
+    localizer: Localizer | BearingLocalizer | None = None
     blind: float = 0.0
 
     @staticmethod
-    def of(localizer: Localizer) -> Fix:
+    def of(localizer: Localizer | BearingLocalizer) -> Fix:
         """A fix on a node whose landmarks are in sight."""
         return Fix(localizer.node.id, localizer.pose, localizer)
 

@@ -7,19 +7,18 @@ from collections.abc import Sequence
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agent.detour import Detour
 from agent.fix import Fix
 from agent.follower_settings import FollowerSettings
 from agent.headway import Headway
-from agent.localizer import Localizer
+from agent.homing.localizer import BearingLocalizer
 from agent.lookout import Expected, Lookout
+from agent.node_servo import NodeServo
 from agent.observation import Command, Observation, RobotDescription
 from agent.servo.blind import BlindDrive
 from agent.servo.proximity import ranger_points
 from agent.servo.step import State
-from agent.servo.supervisor import Servo
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.node import NodeId
@@ -81,7 +80,9 @@ class Follower:
         self._route = route
         self._detour = detour
         self._settings = settings
-        self._servo = Servo(description)
+        # A landmark without a depth has one for the rest of the drive once the way has told it.
+        self._nodes = [leg.node for leg in route]
+        self._servo = NodeServo(description)
         self._blind_drive = BlindDrive(description)
         self._start = fix.node
         self._last = len(route) - 1
@@ -93,7 +94,6 @@ class Follower:
         self.leg = min(1 if self._off_reference() < settings.passed else 0, self._last)
         self._tick = 0
         self._progressed = Headway()
-        self._servoing = -1
         self._headway = Headway()
         self._servo_barred = 0.0
         self._approaching = False
@@ -111,6 +111,8 @@ class Follower:
         s = self._settings
         self._tick += 1
         self.fix.follow(observation, self._description)
+        if self.fix.localizer is not None:
+            self._nodes[self._reference] = self.fix.localizer.node
         if self._tick % s.look_every == 0:
             self._look_for(self._ahead(), observation)
         self._pass_nodes()
@@ -136,12 +138,9 @@ class Follower:
         obstacles = ranger_points(observation.proximity, self._description)
         localizer = self.fix.localizer
         if localizer is not None and self._may_servo(target, distance, parking):
-            points = self._route[self.leg].node.points_in_robot
-            if self._servoing != self.leg:
-                self._servo.start(target, points)
-                self._servoing = self.leg
+            if self._servo.leg != self.leg:
                 self._headway = Headway()
-            step = self._servo.command(target, points, _mask(localizer, len(points)), obstacles)
+            step = self._servo.command(self.leg, localizer, target, obstacles)
             if parking:
                 self.progress = Progress.PARKING
                 self.detail = f"{step.reason}, {distance * 1000:.0f} mm off"
@@ -149,7 +148,7 @@ class Follower:
             if step.state != "stuck":
                 self._approaching = False
                 return step.command
-        self._servoing = -1
+        self._servo.over()
         if not parking or distance > self._settings.near:
             self._approaching = False
             command = self._detour.toward(target.inverse())
@@ -171,7 +170,7 @@ class Follower:
         self._servo_barred = max(self._servo_barred - tick, 0.0)
         if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
             return False
-        if self._servoing == self.leg and not (parking and distance <= s.near):
+        if self._servo.leg == self.leg and not (parking and distance <= s.near):
             self._headway.take(distance, tick)
             if self._headway.stood > (s.stalled_parking if parking else s.stalled):
                 self._servo_barred = s.barred
@@ -240,7 +239,9 @@ class Follower:
     def _expected(self, index: int) -> Expected:
         """A leg's node, with where the robot should be from it."""
         there = self._from_reference(index) @ self.fix.node_from_robot.mean
-        return Expected(index, self._route[index].node, there, 1.0 + self.fix.blind)
+        localizer = self.fix.localizer
+        held = localizer if index == self._reference and isinstance(localizer, BearingLocalizer) else None
+        return Expected(index, self._nodes[index], there, 1.0 + self.fix.blind, held=held)
 
     def _target(self) -> Pose2:
         """`target_from_robot`."""
@@ -261,9 +262,3 @@ def _lies_ahead(target_from_robot: Pose2) -> bool:
     """Whether a posture can be servoed to without a manoeuvre: ahead, and facing alike."""
     there = target_from_robot.inverse()
     return abs(target_from_robot.heading) < 0.5 and there.x > 0.1 and abs(there.y) < 0.6 * there.x
-
-
-def _mask(localizer: Localizer, count: int) -> NDArray[np.bool_]:
-    mask = np.zeros(count, np.bool_)
-    mask[localizer.visible] = True
-    return mask

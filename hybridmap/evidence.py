@@ -50,7 +50,7 @@ def gather(
         "inliers_3d": float((seen_a.has_depth & seen_b.has_depth).sum()),
         "matches": float(matches),
         "share": len(inliers) / usable,
-        "cells": float(min(_cells(seen_a.pixels, camera_a), _cells(seen_b.pixels, camera_b))),
+        "cells": float(min(cells(seen_a.pixels, camera_a), cells(seen_b.pixels, camera_b))),
         "seen": max(
             _seen(a, camera_a, camera_b, fix.node_from_robot.mean, inliers[:, 0]),
             _seen(b, camera_b, camera_a, fix.node_from_robot.mean.inverse(), inliers[:, 1]),
@@ -85,7 +85,7 @@ def depth_agreement(forward: Sightings, fix: PlanarFix) -> float:
     return float((fits & fix.inliers[: len(forward)]).sum() / fits.sum())
 
 
-def _cells(pixels: NDArray[np.float32], camera: Camera) -> int:
+def cells(pixels: NDArray[np.float32], camera: Camera) -> int:
     """How many cells of the grid over the image are occupied."""
     column = np.clip(pixels[:, 0] * GRID[0] / camera.width, 0, GRID[0] - 1).astype(int)
     row = np.clip(pixels[:, 1] * GRID[1] / camera.height, 0, GRID[1] - 1).astype(int)

@@ -1,0 +1,111 @@
+"""The appearance-based servo: parks at a view of which only bearings are known (the paper's future work).
+
+What two views tell is the place up to its scale, and a way that keeps landmarks in view at one scale keeps
+them in view at any: visibility is a matter of angles. So the servo for known depths plans on what a trail
+(agent.homing) makes of the bearings so far, slowly until a few centimetres of wheels have told the scale; its
+plan is mended as the landmarks' depths emerge on the way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.observation import Command, RobotDescription
+from agent.servo.laws import saturate
+from agent.servo.settings import ServoSettings
+from agent.servo.step import ServoStep
+from agent.servo.supervisor import Servo
+from hybridmap.pose import Array, PoseGaussian
+
+
+@dataclass(frozen=True, slots=True)
+class AppearanceSettings:
+    """Settings of the appearance-based servo.
+
+    Attributes:
+        servo: of the servo that drives.
+        unsure: the scale counts as unknown while the standard deviation of the way that is left is more
+            than this share of it.
+        tentative: speed until then, m/s.
+        least_seen: landmarks without which nothing is driven.
+        lost_ticks: so many images in a row may show fewer before it is said.
+        exact: an arrival known no better than this is told as such, m.
+    """
+
+    servo: ServoSettings = field(default_factory=lambda: ServoSettings(field_margin=0.08))
+    unsure: float = 0.35
+    tentative: float = 0.1
+    least_seen: int = 4
+    lost_ticks: int = 10
+    exact: float = 0.01
+
+
+class AppearanceServo:
+    """Parks the robot at a place known by bearings. One for each drive: `start` begins anew."""
+
+    def __init__(self, description: RobotDescription, settings: AppearanceSettings | None = None) -> None:
+        """Prepare for a robot."""
+        self.settings = settings or AppearanceSettings()
+        self._description = description
+        self._servo = Servo(description, self.settings.servo)
+        self._lost = 0
+
+    @property
+    def switches(self) -> int:
+        """How often another law or plan has taken the wheels."""
+        return self._servo.switches
+
+    def start(self, goal_from_robot: PoseGaussian, points_in_goal: Array) -> bool:
+        """Take a new goal; see Servo.start."""
+        self._lost = 0
+        return self._servo.start(goal_from_robot.mean, points_in_goal)
+
+    def command(
+        self,
+        goal_from_robot: PoseGaussian,
+        points_in_goal: Array,
+        visible: NDArray[np.bool_],
+        obstacles: Array,
+    ) -> ServoStep:
+        """One tick.
+
+        Args:
+            goal_from_robot: what is known of where the robot is, in the goal's robot frame.
+            points_in_goal: (N, 3) m, what is known of the landmarks, likewise; NaN for those never seen.
+            visible: (N,) which are tracked now.
+            obstacles: (K, 2) m, in robot, points that the rangers hit now.
+        """
+        s, pose = self.settings, goal_from_robot.mean
+        self._lost = 0 if int(np.count_nonzero(visible)) >= s.least_seen else self._lost + 1
+        if self._lost > s.lost_ticks:
+            words = f"fewer than {s.least_seen} of the place's landmarks are in view"
+            return ServoStep(Command(), "stuck", None, words, 0)
+        step = self._servo.command(pose, points_in_goal, visible, obstacles)
+        left, sigma = math.hypot(pose.x, pose.y), self.spread(goal_from_robot)
+        if step.state == "arrived":
+            return self._arrived(step, sigma)
+        if sigma > s.unsure * max(left, 0.05) and step.command.forward != 0.0:
+            slow = saturate(
+                step.command.forward,
+                step.command.turn,
+                min(s.tentative, self._description.max_forward),
+                max(self._description.max_turn, 1e-3),
+            )
+            words = f"{step.reason}, slowly: how far it is is not known yet"
+            return ServoStep(Command(*slow), step.state, step.law, words, step.predicted_visible)
+        return step
+
+    @staticmethod
+    def spread(goal_from_robot: PoseGaussian) -> float:
+        """Largest standard deviation of the position, m."""
+        return math.sqrt(max(float(np.linalg.eigvalsh(goal_from_robot.covariance[:2, :2])[-1]), 0.0))
+
+    def _arrived(self, step: ServoStep, sigma: float) -> ServoStep:
+        if sigma <= self.settings.exact:
+            return step
+        words = f"at the goal as far as bearings tell: within {2.0 * sigma:.2f} m"
+        return ServoStep(step.command, "arrived", None, words, step.predicted_visible)
