@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, MapId, Node, NodeId
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapserver.placeindex import PlaceIndex
 from merge.candidates import CandidateSettings, Pair, choose_pairs
 from merge.links import Link, RefusedLink
@@ -121,7 +121,11 @@ class Merger:
         return self.merged().summary()
 
     def _edges(self) -> list[Edge]:
-        return [edge for one in self.maps.values() for edge in one.edges.values()]
+        """Edges that say which nodes lie so near to each other on a robot's way that to compare them tells
+        nothing new. A later drive says nothing of that; it may lead from map to map.
+        """
+        edges = (edge for one in self.maps.values() for edge in one.edges.values())
+        return [edge for edge in edges if edge.kind is not EdgeKind.DRIVEN]
 
     def _chosen(self, node_id: NodeId) -> list[Pair]:
         """The pairs of one node that would be chosen now; the edges of a new node come after it."""

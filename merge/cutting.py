@@ -1,10 +1,11 @@
 """Cutting maps into fragments, and testing what each robot says of its own map.
 
-That a robot drove or turned from one node to the next it has measured all the way. That it recognised a place
-(`loop`) is a claim: in a warehouse the next bay looks like this one. So a robot's own loops join the pieces
-that its way makes just as links join maps: sorted by consistency, then optimised, and a loop that strains is
-left out. Two things differ. One loop is enough, for the way speaks for it. And a map is never torn apart:
-where a robot resumed its map elsewhere, loops are all that ties the new part to the old one.
+That a robot drove or turned from one node to the next while mapping it has measured all the way. That it
+recognised a place (`loop`) is a claim: in a warehouse the next bay looks like this one. So is what it
+measured between two places that it recognised on a later drive (`driven`). So a robot's own claims join the
+pieces that its way makes just as links join maps: sorted by consistency, then optimised, and one that strains
+is left out. Two things differ. One claim is enough, for the way speaks for it. And a map is never torn apart:
+where a robot resumed its map elsewhere, claims are all that ties the new part to the old one.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import networkx as nx
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from merge.claims import CLAIMS, sort_claims
 from merge.consistency import ConsistencySettings, group_links, sort_links
 from merge.fragments import Fragment
 from merge.joining import Solver, join, optimise
-from merge.links import Link, RefusedLink, refuse
+from merge.links import RefusedLink, link_of
 from merge.posegraph import Measurement, solve_graph
 
-CLAIMS = (EdgeKind.LOOP, EdgeKind.MERGED)
-"""Edges that were recognised, not driven."""
+WORDS = {EdgeKind.LOOP: "loop", EdgeKind.MERGED: "link", EdgeKind.DRIVEN: "drive"}
 
 
 def fragments_of(
@@ -34,7 +35,7 @@ def fragments_of(
     Args:
         maps: by id. Edges whose ends are not both nodes of the same map are not theirs to say and are left
             out: maps are joined by links alone.
-        consistency: when a robot's own loops are believed.
+        consistency: when a robot's own claims are believed.
         strain: chi-square with 3 degrees of freedom above which one is refused after all.
     """
     s = consistency or ConsistencySettings()
@@ -53,20 +54,11 @@ def _pieces(one: HybridMap, s: ConsistencySettings, strain: float) -> list[Fragm
         key=lambda edge: edge.id,
     )
     strands = _strands(one, [edge for edge in own if edge.kind not in CLAIMS])
-    claims: dict[tuple[NodeId, NodeId], Edge] = {}
-    refusals: list[RefusedLink] = []
-    for edge in own:
-        if edge.kind in CLAIMS:
-            link = _link(edge)
-            earlier = claims.get(link.pair)
-            if earlier is not None:
-                again = refuse(_link(earlier), f"recognised again, which {edge.id} tells")
-                refusals.append(replace(again, edge=earlier.id))
-            claims[link.pair] = edge
+    claims, refusals = sort_claims(own, s)
     if not claims:
         return strands
     solver = Solver(strands)
-    loops = sorted((_link(edge) for edge in claims.values()), key=lambda link: link.pair)
+    loops = sorted((link_of(edges[0]) for edges in claims.values()), key=lambda link: link.pair)
     within, between = replace(s, least_links=1), replace(s, least_links=1, dominance=0.0)
     groups = {}
     refused: list[RefusedLink] = []
@@ -79,7 +71,9 @@ def _pieces(one: HybridMap, s: ConsistencySettings, strain: float) -> list[Fragm
     graphs, kept, more = optimise(solver, kept, strain)
     refused += more
     refusals += [
-        replace(r, reason=f"the robot's own loop {r.reason}", edge=claims[r.pair].id) for r in refused
+        replace(r, reason=f"the robot's own {WORDS[edge.kind]} {r.reason}", edge=edge.id)
+        for r in refused
+        for edge in claims[r.pair]
     ]
     pieces = []
     for graph in graphs:
@@ -104,8 +98,3 @@ def _strands(one: HybridMap, edges: list[Edge]) -> list[Fragment]:
         Fragment(name, solve_graph(name, one.nodes[name].map_from_robot.mean, inside), tuple(inside))
         for name, inside in measurements.items()
     ]
-
-
-def _link(edge: Edge) -> Link:
-    """An edge as a link, the smaller id first."""
-    return Link(edge.a, edge.b, edge.a_from_b, edge.shared, edge.evidence).canonical()

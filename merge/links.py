@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,17 @@ class RefusedLink:
         return self.a, self.b
 
 
+def link_of(edge: Edge) -> Link:
+    """An edge as a link, the smaller id first."""
+    return Link(edge.a, edge.b, edge.a_from_b, edge.shared, edge.evidence).canonical()
+
+
 def refuse(link: Link, reason: str) -> RefusedLink:
     """Refuse a link whose geometry was found."""
     link = link.canonical()
     return RefusedLink(link.a, link.b, reason, link)
+
+
+def refuse_edge(edge: Edge, reason: str) -> RefusedLink:
+    """Refuse what a robot says by an edge of its own."""
+    return replace(refuse(link_of(edge), reason), edge=edge.id)

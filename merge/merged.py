@@ -75,7 +75,7 @@ class MergedMap:
     def union(self) -> HybridMap:
         """All nodes and edges of all maps in one graph, with the links as edges.
 
-        Loops of a robot's own that were refused are left out: nobody shall drive them.
+        A robot's own claims and drives that were refused are left out: nobody shall rely on them.
         """
         whole = HybridMap()
         false = {refusal.edge for refusal in self.refused}

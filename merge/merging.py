@@ -1,11 +1,12 @@
 """Maps and verified links become a merged map: the whole of the merge after verification, as one function.
 
-1. Maps are cut into pieces that their own edges connect; a robot's own loops must agree with its way.
+1. Maps are cut into pieces that their own edges connect; a robot's own claims must agree with its way.
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
 3. Pieces are joined, best supported first. Links that would join what is joined already must agree with it.
 4. Each component is optimised; a link that then strains more than it should is refused, worst first.
 5. Where two robots would have been at the same place at the same time, the links that make them so are
    refuted, and it goes on at 2 with the rest.
+6. Drives of a robot among others' nodes are checked against the outcome.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from merge.consistency import ConsistencySettings, group_links
 from merge.cutting import fragments_of
+from merge.drives import refuse_drives
 from merge.exclusion import ExclusionSettings
 from merge.groups import LinkGroup
 from merge.joining import Solver, join, optimise
@@ -83,6 +85,7 @@ def merge_maps(
                 groups[key].sorted.kept, reason, s.consistency, refutation.verdict
             )
     refusals += [r for group in groups.values() for r in group.refused] + unjoined + strained
+    refusals += refuse_drives(maps, solved, s.consistency)
     postures = {
         node: Placement(number, posture)
         for number, graph in enumerate(solved)

@@ -1,4 +1,4 @@
-"""A robot's own loops are claims: false ones are left out and said so, the only bridge always stays."""
+"""A robot's own loops and drives are claims: false ones are left out and said so, the only bridge stays."""
 
 import numpy as np
 import pytest
@@ -60,6 +60,9 @@ class Aisles:
 
     def loop(self, i: int, j: int, shift: float = 0.0, inliers: int = 25) -> EdgeId:
         return self.put(i, j, self.measure(i, j, LOOP, shift), EdgeKind.LOOP, inliers)
+
+    def drive(self, i: int, j: int, shift: float = 0.0) -> EdgeId:
+        return self.put(i, j, self.measure(i, j, LOOP, shift), EdgeKind.DRIVEN)
 
     def error(self, fragment: Fragment) -> float:
         """RMS error of positions, held at the first node, m."""
@@ -144,6 +147,61 @@ def test_of_bridges_that_contradict_each_other_the_better_supported_stay() -> No
     [piece] = fragments_of({A: aisles.map})
     assert [r.edge for r in piece.refused] == [false] and len(piece) == 48
     assert aisles.error(piece) < 0.3
+
+
+@pytest.mark.parametrize(("i", "j"), [(8, 9), (4, 8), (8, 29)])
+def test_a_drive_between_wrong_places_is_left_out_and_bends_nothing(i: int, j: int) -> None:
+    """Also between neighbours on the map's own way, and nobody shall drive by it."""
+    aisles = Aisles(1)
+    for pair in GOOD:
+        aisles.loop(*pair)
+    [clean] = fragments_of({A: aisles.map})
+    false = aisles.drive(i, j, shift=0.5)
+    [piece] = fragments_of({A: aisles.map})
+    assert [(r.edge, r.reason) for r in piece.refused] == [
+        (false, "the robot's own drive contradicts the map's own way between its nodes")
+    ]
+    assert np.array_equal(piece.graph.means, clean.graph.means)
+    assert false not in merge_maps({A: aisles.map}, []).union().edges
+
+
+def test_drives_bring_the_map_nearer_to_the_truth_as_loops_do() -> None:
+    with_drives, without = [], []
+    for seed in range(6):
+        aisles = Aisles(seed)
+        without.append(aisles.error(fragments_of({A: aisles.map})[0]))
+        for i, j in GOOD:
+            aisles.drive(i, j)
+        [piece] = fragments_of({A: aisles.map})
+        assert not piece.refused
+        with_drives.append(aisles.error(piece))
+    assert np.mean(with_drives) < 0.8 * np.mean(without)
+
+
+@pytest.mark.parametrize("driven_first", [True, False])
+def test_what_was_recognised_and_driven_alike_stands_as_both_and_counts_once(driven_first: bool) -> None:
+    aisles = Aisles(1)
+    put = [aisles.drive, aisles.loop] if driven_first else [aisles.loop, aisles.drive]
+    both = {one(2, 26) for one in put}
+    [piece] = fragments_of({A: aisles.map})
+    assert not piece.refused and sum(m.robust for m in piece.measurements) == 1
+    assert both <= set(merge_maps({A: aisles.map}, []).union().edges)
+
+
+def test_where_both_are_refused_both_are_named() -> None:
+    aisles = Aisles(1)
+    false = {aisles.loop(8, 29, shift=1.8), aisles.drive(8, 29, shift=1.8)}
+    [piece] = fragments_of({A: aisles.map})
+    assert {r.edge for r in piece.refused} == false
+
+
+def test_a_view_is_believed_where_a_drive_contradicts_it() -> None:
+    aisles = Aisles(1)
+    seen, driven = aisles.loop(2, 26), aisles.drive(2, 26, shift=0.5)
+    [piece] = fragments_of({A: aisles.map})
+    [refusal] = piece.refused
+    assert refusal.edge == driven and refusal.reason == f"contradicts what was recognised, which {seen} tells"
+    assert sum(m.robust for m in piece.measurements) == 1
 
 
 @settings(max_examples=30, deadline=None)
