@@ -8,8 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.driven import driven_edge
 from agent.ekf.triangulation import triangulate
 from agent.observation import RobotDescription
+from agent.surveyor import Traverse
 from agent.tracking import Tracking
 from agent.view import View
 from hybridmap.change import ChangeBody, EdgePut, NodePut
@@ -173,6 +175,12 @@ class Cartographer:
         self.map_from_anchor = self.map_from_anchor @ moved
         if self._last is not None:
             self._last.node_from_anchor = self._last.node_from_anchor @ moved
+
+    def drove(self, traverse: Traverse) -> list[ChangeBody]:
+        """Write down that the robot got from one node to another; returns the change, already applied."""
+        change = EdgePut(driven_edge(self.map, traverse, self._number))
+        self.map.apply(change)
+        return [change]
 
     def _number(self) -> NodeId:
         number = NodeId(self._map_id.agent, self._map_id.epoch, self._next_number)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from agent.homing.localizer import BearingLocalizer
 from agent.localizer import Localizer
-from agent.observation import Observation, RobotDescription
+from agent.observation import Observation, Odometry, RobotDescription
 from hybridmap.node import NodeId
 from hybridmap.pose import PoseGaussian
 
@@ -48,8 +48,13 @@ class Fix:
                 self.node_from_robot, self.blind = self.localizer.pose, 0.0
                 return
             self.localizer = None
-        odometry, axle = observation.odometry, description.axle
-        way = description.wheel_noise * (abs(odometry.forward) + abs(odometry.turn) * axle)
-        step = PoseGaussian.from_sigmas(odometry.motion(), way + 1e-5, way / axle + 1e-5)
-        self.node_from_robot = self.node_from_robot @ step
-        self.blind += abs(odometry.forward) + TURN_SHARE * abs(odometry.turn)
+        step, blind = wheel_step(observation.odometry, description)
+        self.node_from_robot, self.blind = self.node_from_robot @ step, self.blind + blind
+
+
+def wheel_step(odometry: Odometry, description: RobotDescription) -> tuple[PoseGaussian, float]:
+    """One step by wheels alone: `before_from_after`, and the blind way that it counts for, m."""
+    axle = description.axle
+    way = description.wheel_noise * (abs(odometry.forward) + abs(odometry.turn) * axle)
+    step = PoseGaussian.from_sigmas(odometry.motion(), way + 1e-5, way / axle + 1e-5)
+    return step, abs(odometry.forward) + TURN_SHARE * abs(odometry.turn)

@@ -46,7 +46,12 @@ class Kept:
             if not entry.put:
                 hybrid.apply(EdgeRetired(entry.element))
                 hybrid.apply(NodeRetired(entry.element))
-        loose = [edge.id for edge in hybrid.edges.values() if {edge.a, edge.b} - hybrid.nodes.keys()]
+        loose = [
+            edge.id
+            for edge in hybrid.edges.values()
+            # Nodes of others, between which it may have driven, are not its own to keep.
+            if any(end.map == map_id and end not in hybrid.nodes for end in (edge.a, edge.b))
+        ]
         for edge in loose:
             hybrid.apply(EdgeRetired(edge))
         complaint = ""

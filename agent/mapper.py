@@ -10,6 +10,7 @@ import numpy as np
 from agent.cartographer import HERE, Cartographer, CartographerSettings
 from agent.ekf.report import Health
 from agent.observation import Observation, RobotDescription
+from agent.surveyor import Traverse
 from agent.track_settings import TrackingSettings
 from agent.tracking import Tracking
 from agent.view import View
@@ -150,6 +151,10 @@ class Mapper:
     def converged_share(self) -> float:
         """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
         return self._tracking.converged_share
+
+    def drove(self, traverse: Traverse | None) -> list[ChangeBody]:
+        """Take in what was measured on a drive while nothing was mapped; see Cartographer."""
+        return [] if traverse is None else self._cartographer.drove(traverse)
 
     # One tick, and what ends an episode
 

@@ -19,6 +19,7 @@ from agent.mission import Answer, Question, WhichWay
 from agent.observation import Command, Observation, RobotDescription
 from agent.own_route import own_route
 from agent.search import Search, SearchSettings
+from agent.surveyor import Surveyor, SurveyorSettings, Traverse
 from agent.tally import Tally
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
@@ -40,6 +41,7 @@ class NavigatorSettings:
         follower: along a route.
         detour: between nodes.
         blocks: how long it remembers where it could not get through.
+        surveyor: what it measures on its way.
         answer_patience: ticks that an answer may take before the question counts as lost.
         pause: seconds that it waits before what is in its way, and before it asks again for a route.
         trusted: after a block it still knows where it is if it has driven less than this blindly, m.
@@ -52,6 +54,7 @@ class NavigatorSettings:
     follower: FollowerSettings = field(default_factory=FollowerSettings)
     detour: DetourSettings = field(default_factory=DetourSettings)
     blocks: BlockSettings = field(default_factory=BlockSettings)
+    surveyor: SurveyorSettings = field(default_factory=SurveyorSettings)
     answer_patience: int = 100
     pause: float = 2.0
     trusted: float = 1.0
@@ -79,6 +82,7 @@ class Navigator:
         goal: where it shall be.
         legs: nodes on the first route that was given.
         tally: what the drive was made of so far.
+        traverse: from one node to another, if the last step has ended one.
     """
 
     def __init__(
@@ -98,6 +102,7 @@ class Navigator:
         self.goal = goal
         self.legs = 0
         self.tally = Tally()
+        self.traverse: Traverse | None = None
         self._description = description
         self._lens = lens
         self._sift = sift
@@ -108,6 +113,7 @@ class Navigator:
         self._helm = Helm(description, s.answer_patience)
         self._search = Search(description, lens, sift, own_map, self._helm, s.search, self._rng)
         self._blocks = Blocks(s.blocks)
+        self._surveyor = Surveyor(description, s.surveyor)
         self._believed: Pose2 | None = None
         self._vain_looks = 0
         self._goal_hidden = False
@@ -126,6 +132,7 @@ class Navigator:
         if self.fix is not None and not self._following:
             self.fix.follow(observation, self._description)
         command = next(self._behaviour)
+        self.traverse = self._surveyor.see(None if self._searching else self.fix, observation)
         if self._searching:
             self.detail = self._search.detail
         return command, self._helm.questions()

@@ -132,3 +132,21 @@ def test_another_agents_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidValue, match="has no map r1"):
         Kept.of(journal, MapId("r1", 1))
     journal.close()
+
+
+def test_drives_among_nodes_of_others_are_kept(tmp_path: Path) -> None:
+    """They are not in this journal, and not missing for that; an own node that is damaged is."""
+    here = PoseGaussian.from_sigmas(Pose2(1.0), 0.1, 0.1)
+    other = NodeId("r1", 1, 4)
+
+    def driven(number: int, a: NodeId) -> EdgePut:
+        return EdgePut(Edge(NodeId(*MAP, number), a, other, here, EdgeKind.DRIVEN))
+
+    log = [
+        node(1),
+        node(2),
+        driven(3, NodeId(*MAP, 1)),
+        driven(4, NodeId(*MAP, 2)),
+        driven(5, NodeId("r1", 1, 3)),
+    ]
+    assert numbers(kept_of(tmp_path / "j", log, damage=(2,))) == [1, 3, 5]
