@@ -38,7 +38,7 @@ from benchmarks.explore_area import Look, MappedFloor, mapped_floor
 from benchmarks.explore_start import office
 from hybridmap.errors import MapweaveError
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import NodeId
+from hybridmap.node import EdgeKind, NodeId
 from hybridmap.pose import Pose2
 from mapweave.scoring import score_map
 from mapweave.trial.fleet import TICKS_PER_SECOND, Stage
@@ -108,7 +108,7 @@ def _judged(stage: Stage, fleet: LocalFleet) -> Exploration:
             Look(node.stamp_ns / 1e9, pose, node.camera.semi_aperture)
             for node, pose in zip(nodes, poses, strict=True)
         ]
-    links = [edge for edge in whole.edges.values() if edge.a.map != edge.b.map]
+    links = [edge for edge in whole.edges.values() if edge.kind is EdgeKind.MERGED]
     score = score_map({node: (c, p.mean) for node, (c, p) in merged.postures.items()}, links, truth)
     robots = fleet.control.status().robots.values()
     return Exploration(

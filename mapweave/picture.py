@@ -170,7 +170,7 @@ def _draw_edges(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> N
         a, b = picture.postures[edge.a], picture.postures[edge.b]
         if edge.id in picture.false:
             label, colour, width, alpha, order, style = "false link", "#000000", 2.2, 1.0, 4.5, ":"
-        elif edge.a.map != edge.b.map:
+        elif edge.kind is EdgeKind.MERGED:
             label, colour, width, alpha, order, style = "link between maps", "#e6007e", 1.6, 0.9, 4.0, "-"
         elif edge.kind is EdgeKind.LOOP:
             label, colour, width, alpha, order, style = "loop within a map", "#7a7a7a", 1.0, 0.6, 2.0, "-"

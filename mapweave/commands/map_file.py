@@ -29,6 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from hybridmap.hybrid_map import HybridMap
+    from hybridmap.node import EdgeKind
     from mapweave.picture import MapPicture, draw_map
     from wire.mapfile import read_map_file
 
@@ -56,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         "maps": sorted({str(n.map) for n in hybrid.nodes}),
         "nodes": len(hybrid.nodes),
         "edges": kinds,
-        "links": sum(e.a.map != e.b.map for e in hybrid.edges.values()),
+        "links": sum(e.kind is EdgeKind.MERGED for e in hybrid.edges.values()),
         "components": len(sizes),
         "landmarks_per_node_median": float(np.median(landmarks)) if landmarks else 0.0,
     }

@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridmap.errors import InvalidFile
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
+from hybridmap.node import EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
 from mapweave.picture import Drive, MapPicture, draw_map, outline_of
 from mapweave.scoring import MapScore, is_false, score_map, write_tum
@@ -73,7 +73,7 @@ def _write_all(
 ) -> None:
     whole, truth = HybridMap(recording.merged.changes), node_truth(recording)
     postures = {n: (c, p.mean) for n, (c, p) in recording.merged.postures.items()}
-    links = [e for e in whole.edges.values() if e.a.map != e.b.map]
+    links = [e for e in whole.edges.values() if e.kind is EdgeKind.MERGED]
     merged = score_map(postures, links, truth)
     places = {n: merged.world_from_component[c] @ p for n, (c, p) in postures.items() if n in truth}
     scores = {}

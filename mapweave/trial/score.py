@@ -36,7 +36,7 @@ def score(recording: Recording) -> Figures:
     """
     whole = HybridMap(recording.merged.changes)
     truth = node_truth(recording)
-    links = [e for e in whole.edges.values() if e.a.map != e.b.map]
+    links = [e for e in whole.edges.values() if e.kind is EdgeKind.MERGED]
     own = [e for e in whole.edges.values() if e.a.map == e.b.map and e.a in truth and e.b in truth]
     loops = [e for e in own if e.kind is EdgeKind.LOOP]
     paths = {name: record.truth for name, record in recording.robots.items()}
