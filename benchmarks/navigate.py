@@ -7,7 +7,8 @@ again and again at random postures from which no image was taken, and sent to a 
 edges away. Agent, server and messages are the fleet's own, in one process; images are rendered, wheels slip.
 Errors are against where the goal's image was truly taken. A drive succeeds if the robot says within 240 s
 that it has arrived, is then within 5 cm and 5 degrees, and has touched nothing. The shortest way is that of a
-robot that knows the floor. DIR gets fig11.png (desired and reached views), drives.png, and the map, which a
+robot that knows the floor. Of the map it is told what the drives have measured and how far its nodes are off
+before and after them. DIR gets fig11.png (desired and reached views), drives.png, and the map, which a
 later call with the same DIR, seed and rooms takes up again.
 """
 
@@ -32,6 +33,7 @@ from rich.table import Table
 
 from benchmarks.navigate_drives import Outcome, drive
 from benchmarks.navigate_floor import Floor
+from benchmarks.navigate_map import Figures, map_figures
 from benchmarks.navigate_office import TRUTH, Mapped, Office
 from benchmarks.navigate_pictures import draw
 from benchmarks.navigate_plots import draw_plot
@@ -42,8 +44,6 @@ from sim.robots import RobotSetup
 WIDTH = 140
 """Of what is printed into a file or a pipe, characters."""
 
-Figures = dict[str, float | int | None]
-
 
 def main() -> None:
     """Map, drive, draw and print."""
@@ -53,12 +53,12 @@ def main() -> None:
     if not console.is_terminal:
         console = Console(stderr=arguments.json, width=WIDTH)
     try:
-        outcomes, mapped, plan = _run(arguments, console)
+        outcomes, mapped, plan, learned = _run(arguments, console)
         pictures = draw(outcomes, mapped, plan, arguments.out)
     except (MapweaveError, OSError) as error:
         print(f"navigate: {error}", file=sys.stderr)
         raise SystemExit(1) from None
-    figures = summary(outcomes)
+    figures = summary(outcomes) | learned
     console.print(_table(outcomes, arguments.seed))
     console.print(_totals(figures, len(mapped.truth)))
     console.print(f"pictures: {', '.join(str(path) for path in pictures)}")
@@ -107,7 +107,7 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _run(arguments: argparse.Namespace, console: Console) -> tuple[list[Outcome], Mapped, FloorPlan]:
+def _run(arguments: argparse.Namespace, console: Console) -> tuple[list[Outcome], Mapped, FloorPlan, Figures]:
     if arguments.runs < 1:
         raise InvalidValue(f"--runs {arguments.runs}: at least one drive")
     if arguments.seed < 0:
@@ -120,14 +120,15 @@ def _run(arguments: argparse.Namespace, console: Console) -> tuple[list[Outcome]
         task = progress.add_task("driving", total=arguments.runs, doing="")
         # Another day: the robot is switched on with the map on its disk, and nobody tells it where it is.
         with Office(folder, arguments.seed, arguments.rooms) as office:
-            mapped, plan = office.mapped(), office.control.plan()
+            mapped, plan, before = office.mapped(), office.control.plan(), office.merged()
             floor = Floor.of(plan, RobotSetup("r0").describe().radius)
             outcomes = []
             for run in range(arguments.runs):
                 plot = draw_plot(mapped, plan, floor, np.random.default_rng([arguments.seed, run, 0xD21]))
                 outcomes.append(drive(office, plot, _shown(progress, task, run + 1)))
                 progress.advance(task)
-    return outcomes, mapped, plan
+            learned = map_figures(before, office.merged(), mapped)
+    return outcomes, mapped, plan, learned
 
 
 def _map(folder: Path, arguments: argparse.Namespace, progress: Progress) -> None:
