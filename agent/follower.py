@@ -13,6 +13,7 @@ from agent.fix import Fix
 from agent.follower_settings import FollowerSettings
 from agent.headway import Headway
 from agent.homing.localizer import BearingLocalizer
+from agent.localizer import Localizer
 from agent.lookout import Expected, Lookout
 from agent.node_servo import NodeServo
 from agent.observation import Command, Observation, RobotDescription
@@ -22,7 +23,7 @@ from agent.servo.step import State
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, wrap_angle
+from hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from hybridmap.query import RouteLeg
 
 
@@ -99,6 +100,7 @@ class Follower:
         self._approaching = False
         self._hidden = 0.0
         self._confirmed = False
+        self._looks: list[PoseGaussian] = []
 
     @property
     def blocked(self) -> tuple[NodeId, NodeId]:
@@ -164,6 +166,12 @@ class Follower:
             self.progress = Progress.UNSURE
         return step.command
 
+    def _look_at_goal(self, observation: Observation) -> Localizer | BearingLocalizer | None:
+        if observation.image is None:
+            return None
+        found = self._lookout.find(observation.image, [self._expected(self._last)])
+        return None if found is None else found[1]
+
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
         """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
         s, tick = self._settings, self._description.tick
@@ -180,14 +188,19 @@ class Follower:
         """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
 
         A view from where the node's was taken shows its features at their own scale, so nothing tells better
-        where the robot is. Only if it then still stands at the goal is it there.
+        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there.
         """
         if state != "arrived":
-            self._confirmed, self._hidden = False, 0.0
+            self._confirmed, self._hidden, self._looks = False, 0.0, []
         elif self._confirmed:
             self.progress = Progress.ARRIVED
-        elif self._look_for([self._expected(self._last)], observation):
-            self._confirmed = True
+        elif (localizer := self._look_at_goal(observation)) is not None:
+            self._looks.append(localizer.pose)
+            # By bearings alone one look is as good as several: it goes on with all that was seen on the way.
+            if isinstance(localizer, BearingLocalizer) or len(self._looks) == self._settings.goal_looks:
+                if isinstance(localizer, Localizer):
+                    localizer.restart(averaged(self._looks))
+                self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
         else:
             self._hidden += self._description.tick
             if self._hidden > self._settings.hidden:

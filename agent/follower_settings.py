@@ -20,6 +20,7 @@ class FollowerSettings:
         look_every: ticks between two looks for the next nodes' landmarks.
         skip: nodes further along the route that are looked for as well.
         blind: way without any landmark in sight after which the robot must find itself again, m.
+        goal_looks: fresh looks at the goal, averaged, that decide whether the robot stands there.
         hidden: seconds at the goal without its landmarks in sight, or recognised, after which it is not
             there, s.
         patience: seconds without getting on before an edge counts as blocked.
@@ -37,6 +38,7 @@ class FollowerSettings:
     look_every: int = 4
     skip: int = 2
     blind: float = 2.0
+    goal_looks: int = 4
     hidden: float = 2.0
     patience: float = 6.0
     parking_patience: float = 30.0

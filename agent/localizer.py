@@ -60,16 +60,7 @@ class Localizer:
         landmarks, seen = recognition.pairs[:, 0], recognition.pairs[:, 1]
         self._tracker.add(landmarks.astype(np.int64), features.raw[seen])
         self._strikes = np.zeros(len(node.landmarks), np.int64)
-        self._filter = LocalizationFilter(
-            description.camera,
-            description.axle,
-            description.wheel_noise,
-            recognition.node_from_robot,
-            landmarks.astype(np.int64),
-            node.points_in_robot[landmarks],
-            node.landmarks.covariances_in_robot(node.camera)[landmarks],
-            settings=replace(self._settings.filter, side_slip=description.side_slip),
-        )
+        self._filter = self._filter_at(recognition.node_from_robot, landmarks.astype(np.int64))
 
     @property
     def pose(self) -> PoseGaussian:
@@ -91,6 +82,10 @@ class Localizer:
         """Whether enough landmarks are tracked and the filter trusts itself."""
         return len(self._tracker.ids) >= self._settings.least and self._filter.healthy
 
+    def restart(self, pose: PoseGaussian) -> None:
+        """Believe a posture that is known better than by what was tracked so far."""
+        self._filter = self._filter_at(pose, self._tracker.ids)
+
     def step(self, observation: Observation) -> None:
         """One tick: predict by the wheels, follow the landmarks, correct."""
         self._filter.predict(observation.odometry)
@@ -106,6 +101,19 @@ class Localizer:
             if bad.any():
                 self._filter.remove(ids[bad])
                 self._tracker.keep(~bad)
+
+    def _filter_at(self, pose: PoseGaussian, landmarks: NDArray[np.int64]) -> LocalizationFilter:
+        node, description = self.node, self._description
+        return LocalizationFilter(
+            description.camera,
+            description.axle,
+            description.wheel_noise,
+            pose,
+            landmarks,
+            node.points_in_robot[landmarks],
+            node.landmarks.covariances_in_robot(node.camera)[landmarks],
+            settings=replace(self._settings.filter, side_slip=description.side_slip),
+        )
 
     def _expected(self) -> Array:
         """(N, 2) px where the tracks should be now, in the tracks' order."""

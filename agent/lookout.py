@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from hybridmap.bearing_recognition import (
     usable_depths,
 )
 from hybridmap.bearings import BearingFix
+from hybridmap.closer import look_closer
 from hybridmap.node import Node
 from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from hybridmap.query import View
@@ -126,6 +127,8 @@ class Lookout:
             if found is None or not self._plausible(found.node_from_robot.mean, one):
                 continue
             if found.inliers > s.more * one.tracked:
+                closer = look_closer(one.node, view, found, s.recognition.pose)
+                found = replace(found, node_from_robot=closer)
                 return one.leg, Localizer(
                     self._description, self._lens, one.node, image, features, found, s.localizer
                 )

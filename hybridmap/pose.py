@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -131,3 +132,20 @@ class PoseGaussian:
     def from_sigmas(mean: Pose2, sigma_xy: float, sigma_heading: float) -> PoseGaussian:
         """Build with independent standard deviations, m and rad."""
         return PoseGaussian(mean, np.diag([sigma_xy**2, sigma_xy**2, sigma_heading**2]))
+
+
+def averaged(poses: Sequence[PoseGaussian]) -> PoseGaussian:
+    """One posture from several estimates of it, each weighted by its information.
+
+    The covariance is the estimates' own on average: what they err by alike does not average out, and how much
+    that is nobody knows.
+
+    Args:
+        poses: at least one, near to each other.
+    """
+    first = poses[0].mean
+    weights = [np.linalg.inv(pose.covariance + 1e-12 * np.eye(3)) for pose in poses]
+    pulls = [w @ (first.inverse() @ pose.mean).vector for w, pose in zip(weights, poses, strict=True)]
+    step = np.linalg.solve(np.sum(weights, axis=0), np.sum(pulls, axis=0))
+    covariance = np.mean([pose.covariance for pose in poses], axis=0)
+    return PoseGaussian(first @ Pose2.from_vector(step), covariance)
