@@ -15,6 +15,7 @@ from agent.surveyor import Traverse
 from agent.tracking import Tracking
 from agent.view import View
 from hybridmap.change import ChangeBody, EdgePut, NodePut
+from hybridmap.grid import settle
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -228,7 +229,9 @@ class Cartographer:
             view.features.pixels[good].astype(np.float32), view.features.codes[good],
             depths[good].astype(np.float32), sigmas[good].astype(np.float32),
         )  # fmt: skip
-        return landmarks, view.tracks[good]
+        # Rounded now, the robot works with the same numbers as everybody who gets the node.
+        landmarks, order = settle(landmarks, camera)
+        return landmarks, view.tracks[good[order]]
 
     def _edge(self, a: Placed, b: Placed, a_from_b: PoseGaussian) -> Edge:
         _, in_a, in_b = np.intersect1d(a.tracks, b.tracks, return_indices=True)

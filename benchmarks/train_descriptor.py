@@ -1,203 +1,192 @@
-"""How much of SIFT survives in 16 bytes, and the making of the table that does it.
+"""The making of the tables that code landmarks (hybridmap/landmarks_v2.npz).
 
-    python -m benchmarks.train_descriptor [--seed N] [--pairs N] [--json]   measure the shipped table
-    python -m benchmarks.train_descriptor --write                           train it again and store it
+    python -m benchmarks.train_descriptor [--json]    train, and compare with the tables that are shipped
+    python -m benchmarks.train_descriptor --write     train, and store
 
-Trained on images that scikit-image ships and that are in the public domain or CC0, and on generated printed
-matter. Measured on images that were not trained on, warped by known homographies, so that a match is right or
-wrong without asking another estimator.
+Trained on images that scikit-image ships and that are in the public domain or CC0, on generated printed
+matter and on views of the simulator's rooms. What comes out on one machine is always the same. How good the
+tables are is measured by `python -m benchmarks.landmarks`, on other images.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import skimage.data
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table as PrintedTable
 
 import hybridmap
+from benchmarks.known_warps import HELD_OUT, TRAINED_ON, Image, load, warp
 from benchmarks.printed_matter import printed_page
-from hybridmap.descriptor import DIMENSIONS, LEVELS, TABLE_NAME, TABLE_VERSION, Table, root_sift, table
-from hybridmap.matching import MatchSettings, match_vectors
+from benchmarks.tracking_scenes import room_drive
+from hybridmap.descriptor import project, quantise, root_sift
+from hybridmap.grid import CELLS, CELLS_PER_E, DEPTH_LEAST, SHARE_LEAST, SHARES_PER_E
+from hybridmap.landmark_tables import (
+    DIMENSIONS,
+    FILE,
+    SYMBOLS,
+    TOTAL_BITS,
+    VERSION,
+    LandmarkTables,
+    landmark_tables,
+)
 from hybridmap.pose import Array
 
-Image = NDArray[np.uint8]
-
-# Public domain or CC0, each says so in its docstring in skimage.data.
-TRAINED_ON = ("astronaut", "brick", "camera", "chelsea", "coffee", "grass", "gravel", "rocket", "clock")
-HELD_OUT = ("coins", "page", "text", "moon", "retina", "hubble_deep_field")
-TRAINING_SEED = 20090628
+SEED = 20090628
 PRINTED_PAGES = 12
 WARPS = 6
+ROOMS = 40
+FEATURES = 700
+
+STEP = 0.035
+"""Finer steps keep hardly more matches, see docs/decisions/landmarks.md."""
+
+SMOOTHING = 0.01
+"""Share of each column's frequencies that is spread widely: other images have other tails."""
+
+DEPTH_MEDIAN, DEPTH_SPREAD = 2.0, 0.8
+"""m, and in its logarithm: rooms, and halls a few times as large."""
+
+SHARE_FLOOR, SHARE_DECAY, UNKNOWN = 0.02, 0.6, 0.02
+"""Depths are seldom known better than to 2 %, e times as badly is 5 times as rare, and some not at all."""
 
 
-@dataclass(frozen=True)
-class Warped:
-    """One image under a known homography, with SIFT of both.
-
-    Attributes:
-        pixels_a: (N, 2) px.
-        sift_a: (N, 128).
-        pixels_b: (M, 2) px.
-        sift_b: (M, 128).
-        b_from_a: (3, 3) homography.
-    """
-
-    pixels_a: Array
-    sift_a: NDArray[np.float32]
-    pixels_b: Array
-    sift_b: NDArray[np.float32]
-    b_from_a: Array
-
-    def right(self, pairs: NDArray[np.int64], tolerance_px: float = 3.0) -> int:
-        """How many pairs agree with the homography."""
-        if len(pairs) == 0:
-            return 0
-        where = cv2.perspectiveTransform(self.pixels_a[pairs[:, 0]][:, None], self.b_from_a)[:, 0]
-        return int((np.linalg.norm(where - self.pixels_b[pairs[:, 1]], axis=1) < tolerance_px).sum())
+def sift_of(image: Image) -> NDArray[np.float32]:
+    """(N, 128) descriptors."""
+    detector = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02)  # type: ignore[attr-defined]
+    found = detector.detectAndCompute(image, None)[1]
+    return np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
 
 
-def load(name: str) -> Image:
-    """One of scikit-image's images, grey, at most 640 px wide."""
-    image: Any = getattr(skimage.data, name)()
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    scale = 640 / max(image.shape)
-    if scale < 1:
-        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(image, dtype=np.uint8)
-
-
-def warp(image: Image, rng: np.random.Generator) -> tuple[Image, Array]:
-    """See the image from elsewhere: turned, nearer or further, oblique, darker, blurred and noisy."""
-    height, width = image.shape
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)
-    angle, scale = rng.normal(0, np.deg2rad(7)), np.exp(rng.uniform(np.log(0.55), np.log(1.5)))
-    turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    centre = np.array([width, height]) / 2
-    moved = (corners - centre) @ turn.T + centre + rng.normal(0, 0.06, (4, 2)) * [width, height] * scale
-    b_from_a = cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32))
-    warped = cv2.warpPerspective(image, b_from_a, (width, height), flags=cv2.INTER_AREA)
-    out = cv2.GaussianBlur(warped, (0, 0), rng.uniform(0.3, 1.2)).astype(np.float64)
-    out = out * rng.uniform(0.6, 1.2) + rng.uniform(-20, 20) + rng.normal(0, rng.uniform(1, 5), out.shape)
-    return np.clip(out, 0, 255).astype(np.uint8), np.asarray(b_from_a, dtype=np.float64)
-
-
-def make_pair(image: Image, rng: np.random.Generator, features: int) -> Warped | None:
-    """SIFT of an image and of the same image warped; None if one shows next to nothing."""
-    detector = cv2.SIFT_create(nfeatures=features, contrastThreshold=0.02)  # type: ignore[attr-defined]
-    other, b_from_a = warp(image, rng)
-    keypoints_a, sift_a = detector.detectAndCompute(image, None)
-    keypoints_b, sift_b = detector.detectAndCompute(other, None)
-    if len(keypoints_a) < 10 or len(keypoints_b) < 10:
-        return None
-    pixels = [np.array([k.pt for k in keypoints]) for keypoints in (keypoints_a, keypoints_b)]
-    return Warped(pixels[0], sift_a, pixels[1], sift_b, b_from_a)
-
-
-def train() -> Table:
-    """Make the table; always the same one."""
-    rng = np.random.default_rng(TRAINING_SEED)
+def training_images() -> list[Image]:
+    """Photographs and pages, and each from elsewhere."""
+    rng = np.random.default_rng(SEED)
     images = [load(name) for name in TRAINED_ON] + [printed_page(rng) for _ in range(PRINTED_PAGES)]
-    samples = []
-    for image in track(images, "training images"):
-        for _ in range(WARPS):
-            pair = make_pair(image, rng, features=700)
-            if pair is not None:
-                samples += [pair.sift_a, pair.sift_b]
-    roots = root_sift(np.concatenate(samples)).astype(np.float64)
+    return [seen for image in images for _ in range(WARPS) for seen in (image, warp(image, rng)[0])]
+
+
+def room_images() -> list[Image]:
+    """Views of simulated rooms."""
+    rng = np.random.default_rng(SEED + 1)
+    return [room_drive(rng, 1).images[0] for _ in track(range(ROOMS), "rooms")]
+
+
+def train() -> LandmarkTables:
+    """Make the tables; always the same ones."""
+    images = np.concatenate([sift_of(image) for image in track(training_images(), "training images")])
+    mean, basis = principal_axes(root_sift(images).astype(np.float64))
+    bare = np.full((DIMENSIONS, SYMBOLS), (1 << TOTAL_BITS) // SYMBOLS)
+    tables = LandmarkTables(mean, basis, STEP, bare, share_frequencies(), cell_frequencies())
+    rooms = np.concatenate([sift_of(image) for image in room_images()])
+    # As many of both kinds: a robot sees rooms, but nobody knows which.
+    codes = [quantise(project(sift, tables), tables) for sift in (images, rooms)]
+    shares = [np.array([np.bincount(c[:, k], minlength=SYMBOLS) for k in range(DIMENSIONS)]) for c in codes]
+    counts = sum(s / s.sum(axis=1, keepdims=True) for s in shares) / 2
+    frequencies = np.array([whole_frequencies(widened(row)) for row in counts])
+    return LandmarkTables(mean, basis, STEP, frequencies, tables.shares, tables.cells)
+
+
+def principal_axes(roots: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and the axes of greatest spread, in half precision as they are stored."""
     mean = roots.mean(axis=0)
     centred = roots - mean
     _, vectors = np.linalg.eigh(centred.T @ centred)
     basis = vectors[:, ::-1][:, :DIMENSIONS]
     basis *= np.sign(basis[np.abs(basis).argmax(axis=0), np.arange(DIMENSIONS)])
-    basis16 = basis.astype(np.float16).astype(np.float32)
-    projected = (centred @ basis16).astype(np.float64)
-    levels = np.stack([lloyd_max(projected[:, k]) for k in track(range(DIMENSIONS), "levels")])
-    return Table(mean.astype(np.float32), basis16, levels.astype(np.float32))
+    return mean.astype(np.float32), basis.astype(np.float16).astype(np.float32)
 
 
-def lloyd_max(values: Array, rounds: int = 60) -> Array:
-    """(16,) ascending levels with the least mean squared rounding error (Lloyd 1982), from quantiles."""
-    values = np.sort(values)
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    levels = np.quantile(values, (np.arange(LEVELS) + 0.5) / LEVELS)
-    for _ in range(rounds):
-        cuts = np.searchsorted(values, 0.5 * (levels[1:] + levels[:-1]))
-        cuts = np.concatenate([[0], cuts, [len(values)]])
-        levels = np.diff(total[cuts]) / np.maximum(np.diff(cuts), 1)
-    return levels
+def widened(shares: Array) -> Array:
+    """A column's shares with a little of a Cauchy distribution of the same middle and width."""
+    symbols = np.arange(SYMBOLS)
+    middle = float(shares @ symbols)
+    width = max(1.0, float(np.sqrt(shares @ (symbols - middle) ** 2)))
+    wide = 1.0 / (1.0 + ((symbols - middle) / width) ** 2)
+    mixed: Array = (1 - SMOOTHING) * shares + SMOOTHING * wide / wide.sum()
+    return mixed
 
 
-def measure(the_table: Table, seed: int, pairs: int, features: int) -> dict[str, Any]:
-    """Right matches with codes as a share of those with full float RootSIFT, same matcher, same input."""
-    rng = np.random.default_rng(seed)
-    images = [load(name) for name in HELD_OUT] + [printed_page(rng) for _ in range(len(HELD_OUT))]
-    settings = MatchSettings()
-    kept, precision_full, precision_code, right_full, right_code = [], [], [], 0, 0
-    for k in track(range(pairs), "held-out pairs"):
-        pair = make_pair(images[k % len(images)], rng, features)
-        if pair is None:
-            continue
-        full = match_vectors(root_sift(pair.sift_a), root_sift(pair.sift_b), settings).pairs
-        codes = [the_table.quantise(the_table.project(s)) for s in (pair.sift_a, pair.sift_b)]
-        code = match_vectors(the_table.restore(codes[0]), the_table.restore(codes[1]), settings).pairs
-        ours, theirs = pair.right(code), pair.right(full)
-        if theirs < 10:
-            continue
-        right_full, right_code = right_full + theirs, right_code + ours
-        kept.append(ours / theirs)
-        precision_full.append(theirs / len(full))
-        precision_code.append(ours / max(len(code), 1))
-    return {
-        "pairs": len(kept),
-        "inliers_kept": right_code / max(right_full, 1),
-        "inliers_kept_worst_tenth": float(np.quantile(kept, 0.1)),
-        "precision_full": float(np.mean(precision_full)),
-        "precision_code": float(np.mean(precision_code)),
-        "bytes_full": 512,
-        "bytes_code": 16,
+def whole_frequencies(shares: Array) -> NDArray[np.int64]:
+    """Whole numbers that sum to 2^12, at least 1 where there is a share at all."""
+    total = 1 << TOTAL_BITS
+    out = np.where(shares > 0, np.maximum(1, np.floor(shares / shares.sum() * total)), 0).astype(np.int64)
+    # What rounding left over goes to, or is taken from, the most frequent: there it weighs least.
+    out[out.argmax()] += total - out.sum()
+    return out
+
+
+def cell_frequencies() -> NDArray[np.int64]:
+    """Depths: log-normal, with a little of anything."""
+    cells = np.arange(SYMBOLS)
+    middle = CELLS_PER_E * np.log(DEPTH_MEDIAN / DEPTH_LEAST)
+    likely = np.exp(-0.5 * ((cells + 0.5 - middle) / (CELLS_PER_E * DEPTH_SPREAD)) ** 2)
+    return whole_frequencies(np.where(cells < CELLS, likely / likely.sum() + 0.0005, 0.0))
+
+
+def share_frequencies() -> NDArray[np.int64]:
+    """Uncertainty: exponential above a floor, steep below it, a little of anything."""
+    steps = (np.arange(1, SYMBOLS) - 1) / SHARES_PER_E + np.log(SHARE_LEAST / SHARE_FLOOR)
+    likely = np.exp(np.where(steps < 0, 4 * steps, -steps / SHARE_DECAY))
+    known = (1 - UNKNOWN) * (likely / likely.sum() + 0.0003)
+    return whole_frequencies(np.concatenate([[UNKNOWN], known]))
+
+
+def bits_of(codes: NDArray[np.uint8], tables: LandmarkTables) -> float:
+    """Bits of a descriptor on average."""
+    frequencies = tables.codes[np.arange(DIMENSIONS), codes]
+    return float((TOTAL_BITS - np.log2(frequencies)).sum(axis=1).mean())
+
+
+def compared(tables: LandmarkTables) -> dict[str, Any]:
+    """What trained tables cost, and how far they are from the shipped ones."""
+    rng = np.random.default_rng(SEED + 2)
+    rooms = np.concatenate([sift_of(room_drive(rng, 1).images[0]) for _ in range(10)])
+    held_out = np.concatenate([sift_of(load(name)) for name in HELD_OUT])
+    trained = np.concatenate([sift_of(load(name)) for name in TRAINED_ON])
+    bits = {
+        f"bits_{name}": bits_of(quantise(project(sift, tables), tables), tables)
+        for name, sift in (("trained_on", trained), ("held_out", held_out), ("other_rooms", rooms))
     }
+    shipped = landmark_tables()
+    away = float(np.abs(tables.basis - shipped.basis).max())
+    return {**bits, "step": tables.step, "basis_off_shipped": away,
+            "frequencies_off_shipped": int(np.abs(tables.codes - shipped.codes).max())}  # fmt: skip
+
+
+def store(tables: LandmarkTables) -> Path:
+    """Write the file that the package ships."""
+    path = Path(hybridmap.__path__[0]) / FILE
+    np.savez_compressed(
+        path, version=np.int64(VERSION), mean=tables.mean, basis=tables.basis.astype(np.float16),
+        step=np.float64(tables.step), codes=tables.codes.astype(np.uint16),
+        shares=tables.shares.astype(np.uint16), cells=tables.cells.astype(np.uint16),
+    )  # fmt: skip
+    landmark_tables.cache_clear()
+    return path
 
 
 def main() -> None:
-    """Measure, or with --write train and store."""
+    """Train, and compare or store."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--pairs", type=int, default=48)
-    parser.add_argument("--features", type=int, default=200, help="features an image")
-    parser.add_argument("--write", action="store_true", help="train the table again and store it")
+    parser.add_argument("--write", action="store_true", help="store the tables")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     console = Console(stderr=arguments.json)
+    tables = train()
     if arguments.write:
-        trained = train()
-        path = Path(hybridmap.__path__[0]) / TABLE_NAME
-        np.savez_compressed(
-            path,
-            version=np.int64(TABLE_VERSION),
-            mean=trained.mean,
-            basis=trained.basis.astype(np.float16),
-            levels=trained.levels,
-        )
-        table.cache_clear()
+        path = store(tables)
         console.print(f"wrote {path.name}, {path.stat().st_size} bytes")
-    figures = measure(table(), arguments.seed, arguments.pairs, arguments.features)
-    printed = PrintedTable("figure", "value")
+    figures = compared(tables)
     for name, value in figures.items():
-        printed.add_row(name, f"{value:.3f}" if isinstance(value, float) else str(value))
-    console.print(printed)
+        console.print(f"{name:24} {value:.4g}")
     if arguments.json:
         print(json.dumps(figures))
 

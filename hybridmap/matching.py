@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.descriptor import decode
+from hybridmap.descriptor import decode, rounding_noise
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Matches:
 
     Attributes:
         pairs: (K, 2) int64, indices in a and in b; no index occurs twice in a column.
-        distances: (K,) float32, between decoded descriptors.
+        distances: (K,) float32, between the descriptors; 0 where rounding could explain all of it.
     """
 
     pairs: NDArray[np.int64]
@@ -55,13 +55,24 @@ def squared_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray
 
 
 def match_vectors(
-    a: NDArray[np.float32], b: NDArray[np.float32], settings: MatchSettings | None = None
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    settings: MatchSettings | None = None,
+    noise: float = 0.0,
 ) -> Matches:
-    """Match descriptors that are already decoded, (N, D) and (M, D)."""
+    """Match descriptors that are already decoded.
+
+    Args:
+        a: (N, D).
+        b: (M, D).
+        settings: when two descriptors are taken for the same.
+        noise: what rounding has added to every squared distance on average; taken off again, so that the
+            ratio is that of the distances before rounding.
+    """
     s = settings or MatchSettings()
     if len(a) == 0 or len(b) == 0:
         return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-    squared = squared_distances(a, b)
+    squared = squared_distances(a, b) - np.float32(noise)
     best_in_b = squared.argmin(axis=1)
     rows = np.arange(len(a))
     best = squared[rows, best_in_b]
@@ -72,7 +83,8 @@ def match_vectors(
     kept = np.flatnonzero(mutual & distinct & (best <= s.most_distance**2))
     kept = kept[np.argsort(best[kept], kind="stable")]
     return Matches(
-        np.stack([kept, best_in_b[kept]], axis=1).astype(np.int64), np.sqrt(best[kept]).astype(np.float32)
+        np.stack([kept, best_in_b[kept]], axis=1).astype(np.int64),
+        np.sqrt(np.maximum(best[kept], 0)).astype(np.float32),
     )
 
 
@@ -90,11 +102,11 @@ def match(
     """Match compact descriptors: mutual nearest neighbours that pass the ratio test both ways.
 
     Args:
-        codes_a: (N, 16) uint8.
-        codes_b: (M, 16) uint8.
+        codes_a: (N, 32) uint8.
+        codes_b: (M, 32) uint8.
         settings: when two descriptors are taken for the same.
 
     Returns:
         (K, 2) int64, indices in a and in b, best first; `match_vectors` gives the distances as well.
     """
-    return match_vectors(decode(codes_a), decode(codes_b), settings).pairs
+    return match_vectors(decode(codes_a), decode(codes_b), settings, rounding_noise()).pairs

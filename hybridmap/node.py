@@ -15,8 +15,8 @@ from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.ranges import Ranges
 
-CODE_BYTES = 16
-"""Bytes of one compact descriptor: 32 dimensions of 4 bits, see hybridmap.descriptor."""
+CODE_BYTES = 32
+"""Length of a compact descriptor in memory, a byte for each coordinate (hybridmap.descriptor)."""
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 """What an agent, server or fleet may be called: it becomes a chunk of a key expression."""
@@ -82,7 +82,7 @@ class Landmarks:
 
     Attributes:
         pixels: (N, 2) float32, undistorted px in the node's image.
-        codes: (N, 16) uint8, compact SIFT descriptors.
+        codes: (N, 32) uint8, compact SIFT descriptors.
         depths: (N,) float32, m along the optical axis from the node's optical centre; NaN where the
             depth is not known (a landmark that only gives a bearing).
         depth_sigmas: (N,) float32, standard deviation of the depth, m; NaN with the depth.

@@ -19,7 +19,7 @@ class View:
 
     Attributes:
         pixels: (N, 2) float32, undistorted px.
-        codes: (N, 16) uint8, compact SIFT descriptors.
+        codes: (N, 32) uint8, compact SIFT descriptors.
         camera: the camera that took it; may be another than the mapping robot's.
     """
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
-from hybridmap.descriptor import DIMENSIONS, table
+from hybridmap.descriptor import quantise
+from hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, TOTAL_BITS, landmark_tables
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.query import View
@@ -85,7 +86,8 @@ class World:
 
 def random_vectors(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """(n, 32) decoded descriptors with the spread of real ones."""
-    sigmas = table().levels.std(axis=1)
+    shares, symbols = landmark_tables().codes / (1 << TOTAL_BITS), np.arange(SYMBOLS)
+    sigmas = np.sqrt(shares @ symbols**2 - (shares @ symbols) ** 2)
     vectors: Array = rng.normal(0, 1, (n, DIMENSIONS)) * (0.66 * sigmas / np.linalg.norm(sigmas))
     return vectors
 
@@ -119,7 +121,7 @@ def take_view(
     clutter = rng.uniform(0, [camera.width, camera.height], (s.clutter, 2))
     vectors = world.vectors[seen] + rng.normal(0, s.code_sigma, (len(seen), DIMENSIONS))
     vectors = np.concatenate([vectors, random_vectors(s.clutter, rng)])
-    codes = table().quantise(vectors.astype(np.float32))
+    codes = quantise(vectors)
     view = View(np.concatenate([pixels, clutter]).astype(np.float32), codes, camera)
     return view, np.concatenate([seen, np.full(s.clutter, -1)])
 

@@ -10,7 +10,8 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.descriptor import DIMENSIONS, decode
+from hybridmap.descriptor import decode
+from hybridmap.landmark_tables import DIMENSIONS
 from hybridmap.node import Node, NodeId
 from hybridmap.query import View
 from merge.candidates import CandidateSettings, overlap

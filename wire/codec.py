@@ -3,7 +3,7 @@
 A change is an envelope (sequence number, stamp) around a *body*. The body alone is what a map file holds. Ids
 of the body's own map are written as a bare number, ids of other maps in full.
 
-Encoding rounds (see wire.landmark_codec); what was decoded encodes to the same bytes again.
+Encoding rounds (see hybridmap.grid); what was decoded encodes to the same bytes again.
 """
 
 from __future__ import annotations
@@ -15,25 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.camera import Camera
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId, check_name
+from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId, check_name
 from hybridmap.ranges import Ranges
-from wire.landmark_codec import (
-    LANDMARK_BYTES,
-    MAX_LANDMARKS,
-    pack_camera,
-    pack_landmarks,
-    pack_posture,
-    unpack_camera,
-    unpack_landmarks,
-    unpack_posture,
-)
+from wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
+from wire.landmarks_v1 import unpack_landmarks_v1
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+from wire.posture_codec import pack_camera, pack_posture, unpack_camera, unpack_posture
 from wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
 
 MAX_RADIUS_MM = 100_000
-MAX_BODY_BYTES = MAX_LANDMARKS * LANDMARK_BYTES + 2048
+MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 MAX_SHARED = MAX_LANDMARKS
 SINGLE = struct.Struct("<f")
@@ -152,7 +146,7 @@ def _node_fields(node: Node) -> dict[str, object]:
         "t": node.stamp_ns,
         "p": pack_posture(node.map_from_robot),
         "c": pack_camera(node.camera),
-        "l": pack_landmarks(node.landmarks, node.camera),
+        "m": pack_landmarks(node.landmarks, node.camera),
     }
     if node.clock:
         fields["z"] = check_name(node.clock)
@@ -176,11 +170,18 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
         stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
         map_from_robot=unpack_posture(reader.binary("p", MAX_BODY_BYTES)),
         camera=camera,
-        landmarks=unpack_landmarks(reader.binary("l", MAX_BODY_BYTES), camera),
+        landmarks=_read_landmarks(reader, camera),
         clock=reader.name("z") if reader.has("z") else "",
         radius=reader.integer("r", 0, MAX_RADIUS_MM) / 1000.0 if reader.has("r") else 0.0,
         ranges=unpack_ranges(reader.binary("g", MAX_RANGE_BYTES)) if reader.has("g") else Ranges(),
     )
+
+
+def _read_landmarks(reader: Reader, camera: Camera) -> Landmarks:
+    # Logs and map files of the first version have "l" instead.
+    if reader.has("l") and not reader.has("m"):
+        return unpack_landmarks_v1(reader.binary("l", MAX_BODY_BYTES), camera)
+    return unpack_landmarks(reader.binary("m", MAX_BODY_BYTES), camera)
 
 
 def _edge_fields(edge: Edge) -> dict[str, object]:

@@ -1,254 +1,198 @@
-"""Landmarks, cameras and postures as packed bytes: where nearly all of a map's size is.
+"""Landmarks as packed bytes: where nearly all of a map's size is. The layout stands in docs/wire.md.
 
-Everything is little-endian. One landmark costs 23 bytes, stored in columns:
-
-    codes    N x 16 bytes   compact descriptors, as they are
-    x        N x uint16     (pixel + margin) * 2^k, see PixelGrid
-    y        N x uint16
-    depth    N x uint16     0: not known; else 1 cm * exp((q - 1) * DEPTH_STEP)
-    sigma    N x uint8      0: with an unknown depth; else 1 mm * exp((q - 1) * SIGMA_STEP)
-
-Errors: pixel half a grid step (1/32 px or less for images up to 2047 px), depth 0.011 % of itself, its sigma
-2.3 % of itself. What was decoded encodes to the same bytes again.
+Whole numbers (hybridmap.grid, hybridmap.descriptor) are packed without loss, each for the bits that its
+frequency is worth. About 17.5 bytes a landmark: 13.3 for the descriptor, 1.7 for depth and sigma, 2.3 for
+the pixel. Where y never falls, the order of the landmarks costs nothing: the high bits of y are written as
+steps up (Elias 1974, Fano 1971). The low ones, and x, are what the lane of a landmark begins with, so they
+cost what they hold.
 """
 
 from __future__ import annotations
 
-import math
 import struct
-from dataclasses import dataclass
-from typing import Any
+import zlib
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.grid import (
+    FINE_BITS,
+    PixelGrid,
+    Rounded,
+    restore_landmarks,
+    round_landmarks,
+)
+from hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION, landmark_tables
 from hybridmap.node import CODE_BYTES, Landmarks
-from hybridmap.pose import Pose2, PoseGaussian
+from wire.lanes import BitReader, Column, Ints, LaneReader, LaneWriter, pack_bits
 
 MAX_LANDMARKS = 2000
-LANDMARK_BYTES = CODE_BYTES + 2 + 2 + 2 + 1
-FEATURE_BYTES = CODE_BYTES + 2 + 2
+HEAD = struct.Struct("<BBHHHHH")
+"""Version, flags, count, least x, reach of x, least y, reach of y."""
 
-MIN_DEPTH, MAX_DEPTH = 0.01, 10_000.0
-DEPTH_STEP = math.log(MAX_DEPTH / MIN_DEPTH) / 65534
-MIN_SIGMA, MAX_SIGMA = 0.001, 100.0
-SIGMA_STEP = math.log(MAX_SIGMA / MIN_SIGMA) / 254
+CHECK_BYTES = 4
+ASCENDING, WITH_DEPTHS = 1, 2
+"""Flags: whether y never falls; whether there are depths."""
 
-CAMERA = struct.Struct("<HH6d")
-POSTURE = struct.Struct("<9f")
-UPPER = np.triu_indices(3)
-
-MAX_POSITION = 1e6
-"""No robot drives farther from its start than this, m."""
-
-
-@dataclass(frozen=True, slots=True)
-class PixelGrid:
-    """The finest grid of steps 2^-k px on which a camera's pixels fit into 16 bits.
-
-    It reaches over the image's border by half the image on each side: removing lens distortion moves pixels
-    outwards.
-
-    Attributes:
-        shift: k; a step is 2^-k px.
-        margin_x: half the image's width, px.
-        margin_y: half the image's height, px.
-    """
-
-    shift: int
-    margin_x: int
-    margin_y: int
-
-    @staticmethod
-    def of(camera: Camera) -> PixelGrid:
-        """The grid for a camera's images."""
-        reach = 2 * max(camera.width, camera.height)
-        return PixelGrid((65535 // reach).bit_length() - 1, camera.width // 2, camera.height // 2)
-
-    def quantise(self, pixels: NDArray[Any]) -> bytes:
-        """The columns x and y of (N, 2) px.
-
-        Raises:
-            InvalidValue: a pixel is not finite or farther from the image than half its size.
-        """
-        from_margin = np.asarray(pixels, np.float64) + np.array([self.margin_x, self.margin_y])
-        grid = np.rint(from_margin * 2.0**self.shift)
-        # Written so that NaN fails.
-        if not ((grid >= 0) & (grid <= 65535)).all():
-            raise InvalidValue("landmarks: a pixel is not finite or far outside the image")
-        columns: bytes = grid.astype("<u2").T.tobytes()
-        return columns
-
-    def restore(self, columns: bytes) -> NDArray[np.float32]:
-        """(N, 2) px of the columns x and y."""
-        grid = np.frombuffer(columns, "<u2").reshape(2, -1).T
-        # Exact in float32: 16 bits scaled by a power of two, less a small integer.
-        return (grid * 2.0**-self.shift - (self.margin_x, self.margin_y)).astype(np.float32)
+MAX_LANDMARKS_BYTES = MAX_LANDMARKS * ((CODE_BYTES + 3) * TOTAL_BITS + 32) // 8 + HEAD.size + CHECK_BYTES
+"""Nothing costs more than this, however unlikely its symbols."""
 
 
 def pack_landmarks(landmarks: Landmarks, camera: Camera) -> bytes:
-    """Encode landmarks. Depths outside 1 cm .. 10 km become unknown, sigmas are clipped to 1 mm .. 100 m.
+    """Encode landmarks, in their order. They are rounded, see hybridmap.grid.
 
     Raises:
-        InvalidValue: too many, a pixel off the image, a depth that is not positive, or one without sigma.
+        InvalidValue: too many, a code that is none, a pixel off the image, or a depth that is not positive or
+            without sigma.
     """
-    _check_count(len(landmarks))
-    depths = landmarks.depths.astype(np.float64)
-    if (depths <= 0).any():
-        raise InvalidValue("landmarks: a depth is not positive")
-    known = (depths >= MIN_DEPTH) & (depths <= MAX_DEPTH)
-    sigmas = landmarks.depth_sigmas.astype(np.float64)[known]
-    if not (np.isfinite(sigmas) & (sigmas >= 0)).all():
-        raise InvalidValue("landmarks: a depth has no finite sigma")
-    depth = np.zeros(len(landmarks), "<u2")
-    depth[known] = 1 + np.rint(np.log(depths[known] / MIN_DEPTH) / DEPTH_STEP)
-    sigma = np.zeros(len(landmarks), np.uint8)
-    sigma[known] = 1 + np.rint(np.log(np.clip(sigmas, MIN_SIGMA, MAX_SIGMA) / MIN_SIGMA) / SIGMA_STEP)
-    pixels = PixelGrid.of(camera).quantise(landmarks.pixels)
-    return _pack_codes(landmarks.codes) + pixels + depth.tobytes() + sigma.tobytes()
+    return _pack(round_landmarks(landmarks, camera), landmarks.codes, with_depths=True)
 
 
 def unpack_landmarks(data: bytes, camera: Camera) -> Landmarks:
     """Decode landmarks.
 
     Raises:
-        InvalidMessage: a length that no number of landmarks has, or a sigma that does not go with its depth.
+        InvalidMessage: damaged, of another version, or views' features.
     """
-    n, rest = divmod(len(data), LANDMARK_BYTES)
-    if rest or n > MAX_LANDMARKS:
-        raise InvalidMessage(f"landmarks: {len(data)} bytes are no 0..{MAX_LANDMARKS} landmarks")
-    codes, pixels, depth, sigma = _split(data, 16 * n, 4 * n, 2 * n, n)
-    depth_steps = np.frombuffer(depth, "<u2").astype(np.float64)
-    sigma_steps = np.frombuffer(sigma, np.uint8).astype(np.float64)
-    known = depth_steps > 0
-    if (known != (sigma_steps > 0)).any():
-        raise InvalidMessage("landmarks: depth and sigma must both be known or both not")
-    depths = np.where(known, MIN_DEPTH * np.exp((depth_steps - 1) * DEPTH_STEP), np.nan)
-    sigmas = np.where(known, MIN_SIGMA * np.exp((sigma_steps - 1) * SIGMA_STEP), np.nan)
-    return Landmarks(
-        PixelGrid.of(camera).restore(pixels),
-        _codes(codes),
-        depths.astype(np.float32),
-        sigmas.astype(np.float32),
-    )
+    rounded, codes = _unpack(data, with_depths=True)
+    return restore_landmarks(rounded, codes, camera)
 
 
 def pack_features(pixels: NDArray[np.float32], codes: NDArray[np.uint8], camera: Camera) -> bytes:
-    """Encode features without depth: the columns codes, x and y.
+    """Encode features without depth, in their order.
 
     Raises:
         InvalidValue: too many, shapes that do not belong together, or a pixel off the image.
     """
-    _check_count(len(pixels))
-    if (
-        pixels.shape != (len(pixels), 2)
-        or codes.shape != (len(pixels), CODE_BYTES)
-        or codes.dtype != np.uint8
-    ):
+    if pixels.shape != (len(pixels), 2) or codes.shape != (len(pixels), CODE_BYTES):
         raise InvalidValue(f"features: shapes {pixels.shape} and {codes.shape} do not belong together")
-    return codes.tobytes() + PixelGrid.of(camera).quantise(pixels)
+    nothing = np.zeros(len(pixels), np.int64)
+    x, y = PixelGrid.of(camera).round(pixels)
+    return _pack(Rounded(x, y, nothing, nothing), codes, with_depths=False)
 
 
 def unpack_features(data: bytes, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Decode features into (N, 2) px and (N, 16) codes.
+    """Decode features into (N, 2) px and (N, 32) codes.
 
     Raises:
-        InvalidMessage: a length that no number of features has.
+        InvalidMessage: damaged, of another version, or landmarks.
     """
-    n, rest = divmod(len(data), FEATURE_BYTES)
-    if rest or n > MAX_LANDMARKS:
-        raise InvalidMessage(f"features: {len(data)} bytes are no 0..{MAX_LANDMARKS} features")
-    codes, pixels = _split(data, 16 * n, 4 * n)
-    return PixelGrid.of(camera).restore(pixels), _codes(codes)
+    rounded, codes = _unpack(data, with_depths=False)
+    return PixelGrid.of(camera).restore(rounded.x, rounded.y), codes
 
 
-def pack_camera(camera: Camera) -> bytes:
-    """Encode a camera, exactly: width, height as uint16, then six float64 in the order of its fields."""
-    return CAMERA.pack(
-        camera.width,
-        camera.height,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.mount_height,
-        camera.mount_forward,
-    )
+@cache
+def _code_columns() -> tuple[Column, ...]:
+    return tuple(Column(frequencies) for frequencies in landmark_tables().codes)
 
 
-def unpack_camera(data: bytes) -> Camera:
-    """Decode a camera.
-
-    Raises:
-        InvalidMessage: wrong length, or numbers that no camera has.
-    """
-    if len(data) != CAMERA.size:
-        raise InvalidMessage(f"camera: {len(data)} bytes instead of {CAMERA.size}")
-    numbers = CAMERA.unpack(data)
-    if not all(abs(n) <= MAX_POSITION for n in numbers):
-        raise InvalidMessage("camera: a number is out of range")
-    try:
-        return Camera(*numbers)
-    except InvalidValue as error:
-        raise InvalidMessage(str(error)) from None
+@cache
+def _depth_columns() -> tuple[Column, Column]:
+    return Column(landmark_tables().shares), Column(landmark_tables().cells)
 
 
-def pack_posture(posture: PoseGaussian) -> bytes:
-    """Encode a posture: mean x, y, heading, then the covariance's upper triangle by rows, nine float32.
-
-    Raises:
-        InvalidValue: a number is out of the range that `unpack_posture` accepts.
-    """
-    try:
-        data = POSTURE.pack(*posture.mean.vector, *posture.covariance[UPPER])
-        unpack_posture(data)
-    except (OverflowError, InvalidMessage) as error:
-        raise InvalidValue(f"posture: {error}") from None
-    return data
-
-
-def unpack_posture(data: bytes) -> PoseGaussian:
-    """Decode a posture.
-
-    Raises:
-        InvalidMessage: wrong length, a number not finite or out of range, or no covariance.
-    """
-    if len(data) != POSTURE.size:
-        raise InvalidMessage(f"posture: {len(data)} bytes instead of {POSTURE.size}")
-    numbers = np.array(POSTURE.unpack(data))
-    # Written so that NaN fails.
-    if not ((np.abs(numbers[:3]) <= MAX_POSITION).all() and (np.abs(numbers[3:]) <= MAX_POSITION**2).all()):
-        raise InvalidMessage("posture: a number is not finite or out of range")
-    covariance = np.zeros((3, 3))
-    covariance[UPPER] = numbers[3:]
-    covariance = covariance + np.triu(covariance, 1).T
-    try:
-        return PoseGaussian(Pose2.from_vector(numbers[:3]), covariance)
-    except InvalidValue as error:
-        raise InvalidMessage(str(error)) from None
+def _pack(rounded: Rounded, codes: NDArray[np.uint8], with_depths: bool) -> bytes:
+    count = len(codes)
+    if count > MAX_LANDMARKS:
+        raise InvalidValue(f"{count} landmarks, at most {MAX_LANDMARKS} are allowed")
+    if codes.dtype != np.uint8 or (codes >= SYMBOLS).any():
+        raise InvalidValue(f"descriptors must be uint8 below {SYMBOLS}, not {codes.dtype}")
+    least_x, least_y = (int(of.min()) if count else 0 for of in (rounded.x, rounded.y))
+    x, y = rounded.x - least_x, rounded.y - least_y
+    reach_x, reach_y = int(x.max(initial=0)), int(y.max(initial=0))
+    ascending = bool((np.diff(y) >= 0).all())
+    low = _low_bits(count, reach_y) if ascending else reach_y.bit_length()
+    row = _row_of(y >> low, reach_y >> low) if ascending else np.zeros(0, np.int64)
+    size = _lane_size(reach_x, low)
+    lanes = LaneWriter((x << low | y & ((1 << low) - 1)) + (1 << size), size)
+    if with_depths:
+        _push_depths(lanes, rounded)
+    for k in reversed(range(CODE_BYTES)):
+        lanes.push(codes[:, k].astype(np.int64), _code_columns()[k])
+    flags = ASCENDING * ascending + WITH_DEPTHS * with_depths
+    head = HEAD.pack(VERSION, flags, count, least_x, reach_x, least_y, reach_y)
+    rows = row, np.ones_like(row)
+    numbers, widths = (np.concatenate(pair) for pair in zip(rows, lanes.finish(), strict=True))
+    data = head + pack_bits(numbers, widths)
+    return data + zlib.crc32(data).to_bytes(CHECK_BYTES, "little")
 
 
-def _check_count(n: int) -> None:
-    if n > MAX_LANDMARKS:
-        raise InvalidValue(f"{n} landmarks, at most {MAX_LANDMARKS} are allowed")
+def _unpack(data: bytes, with_depths: bool) -> tuple[Rounded, NDArray[np.uint8]]:
+    if len(data) < HEAD.size + CHECK_BYTES:
+        raise InvalidMessage(f"landmarks: {len(data)} bytes are too few")
+    version, flags, count, least_x, reach_x, least_y, reach_y = HEAD.unpack_from(data)
+    if version != VERSION:
+        raise InvalidMessage(f"landmarks: version {version}, this program reads {VERSION}")
+    body, check = data[:-CHECK_BYTES], data[-CHECK_BYTES:]
+    if zlib.crc32(body).to_bytes(CHECK_BYTES, "little") != check:
+        raise InvalidMessage("landmarks: damaged, the checksum is wrong")
+    if flags & ~(ASCENDING | WITH_DEPTHS) or bool(flags & WITH_DEPTHS) != with_depths:
+        raise InvalidMessage(f"landmarks: flags {flags} do not go with them")
+    if count > MAX_LANDMARKS:
+        raise InvalidMessage(f"{count} landmarks, at most {MAX_LANDMARKS} are allowed")
+    bits = BitReader(body[HEAD.size :])
+    ascending = bool(flags & ASCENDING)
+    low = _low_bits(count, reach_y) if ascending else reach_y.bit_length()
+    high = _read_row(bits, count, reach_y >> low) if ascending else np.zeros(count, np.int64)
+    size = _lane_size(reach_x, low)
+    lanes = LaneReader(bits, count, size)
+    codes = np.empty((CODE_BYTES, count), np.uint8)
+    for k, column in enumerate(_code_columns()):
+        codes[k] = lanes.pop(column)
+    share, depth = _pop_depths(lanes) if with_depths else (np.zeros(count, np.int64),) * 2
+    bits.end()
+    seeds = lanes.states - (1 << size)
+    x, y = least_x + (seeds >> low), least_y + (high << low | seeds & ((1 << low) - 1))
+    if x.max(initial=0) > min(least_x + reach_x, 65535) or y.max(initial=0) > min(least_y + reach_y, 65535):
+        raise InvalidMessage("landmarks: a pixel is out of range")
+    return Rounded(x, y, share, depth), np.ascontiguousarray(codes.T)
 
 
-def _pack_codes(codes: NDArray[np.uint8]) -> bytes:
-    if codes.dtype != np.uint8:
-        raise InvalidValue(f"descriptors must be uint8, not {codes.dtype}")
-    return codes.tobytes()
+def _push_depths(lanes: LaneWriter, rounded: Rounded) -> None:
+    shares, cells = _depth_columns()
+    known = np.flatnonzero(rounded.share)
+    fine = FINE_BITS[rounded.share[known]]
+    depth = rounded.depth[known]
+    lanes.push_plain(depth & ((1 << fine) - 1), fine, known)
+    lanes.push(depth >> fine, cells, known)
+    lanes.push(rounded.share, shares)
 
 
-def _codes(data: bytes) -> NDArray[np.uint8]:
-    # A copy, so that the array can be written to and does not hold the whole message.
-    return np.frombuffer(data, np.uint8).reshape(-1, CODE_BYTES).copy()
+def _pop_depths(lanes: LaneReader) -> tuple[Ints, Ints]:
+    shares, cells = _depth_columns()
+    share = lanes.pop(shares)
+    known = np.flatnonzero(share)
+    fine = FINE_BITS[share[known]]
+    depth = np.zeros(len(share), np.int64)
+    cell = lanes.pop(cells, known)
+    depth[known] = (cell << fine) | lanes.pop_plain(fine, known)
+    return share, depth
 
 
-def _split(data: bytes, *lengths: int) -> list[bytes]:
-    parts, begin = [], 0
-    for length in lengths:
-        parts.append(data[begin : begin + length])
-        begin += length
-    return parts
+def _low_bits(count: int, reach: int) -> int:
+    """How many bits of each ascending number are written plainly: so that few are left to count in ones."""
+    return max(0, ((reach + 1) // max(count, 1)).bit_length() - 1)
+
+
+def _lane_size(reach_x: int, low: int) -> int:
+    """Bits of a lane: of what it begins with, x and the low bits of y."""
+    return max(TOTAL_BITS, (((reach_x + 1) << low) - 1).bit_length())
+
+
+def _row_of(high: Ints, steps: int) -> Ints:
+    """Elias and Fano's code of the high parts: a one for a number, a zero for a step up."""
+    row = np.zeros(len(high) + steps if len(high) else 0, np.int64)
+    row[high + np.arange(len(high))] = 1
+    return row
+
+
+def _read_row(bits: BitReader, count: int, steps: int) -> Ints:
+    row = bits.read(np.ones(count + steps if count else 0, np.int64))
+    ones = np.flatnonzero(row)
+    if len(ones) != count:
+        raise InvalidMessage(f"landmarks: {len(ones)} rows for {count} landmarks")
+    high: Ints = ones - np.arange(count)
+    return high

@@ -25,8 +25,8 @@ from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import NodeId
 from hybridmap.pose import PoseGaussian
 from wire.codec import MAX_BODY_BYTES, decode_body, encode_body
-from wire.landmark_codec import POSTURE, pack_posture, unpack_posture
 from wire.packing import MAX_NUMBER, Reader, pack
+from wire.posture_codec import POSTURE, pack_posture, unpack_posture
 
 MAGIC = b"MAPWEAVE"
 VERSION = 1

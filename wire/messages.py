@@ -13,20 +13,12 @@ from hybridmap.node import MapId, NodeId, check_name
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
 from wire.codec import EDGE_KINDS, KINDS_OF_EDGE, MAX_BODY_BYTES, decode_body, encode_body
-from wire.landmark_codec import (
-    FEATURE_BYTES,
-    MAX_LANDMARKS,
-    MAX_POSITION,
-    pack_camera,
-    pack_features,
-    pack_posture,
-    unpack_camera,
-    unpack_features,
-    unpack_posture,
-)
+from wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_features, unpack_features
+from wire.landmarks_v1 import unpack_features_v1
 from wire.packing import MAX_NUMBER, Reader, pack
+from wire.posture_codec import MAX_POSITION, pack_camera, pack_posture, unpack_camera, unpack_posture
 
-MAX_VIEW_BYTES = MAX_LANDMARKS * FEATURE_BYTES + 256
+MAX_VIEW_BYTES = MAX_LANDMARKS_BYTES + 256
 MAX_CANDIDATES = 64
 MAX_LEGS = 1024
 MAX_REASON = 1024
@@ -79,14 +71,18 @@ class KnownRequest:
 
 def encode_view(view: View) -> bytes:
     """Encode a view; raises InvalidValue if it would not decode."""
-    return pack({"c": pack_camera(view.camera), "f": pack_features(view.pixels, view.codes, view.camera)})
+    return pack({"c": pack_camera(view.camera), "m": pack_features(view.pixels, view.codes, view.camera)})
 
 
 def decode_view(data: bytes) -> View:
     """Decode a view; raises InvalidMessage."""
     reader = Reader(data, "view", MAX_VIEW_BYTES)
     camera = unpack_camera(reader.binary("c", MAX_VIEW_BYTES))
-    pixels, codes = unpack_features(reader.binary("f", MAX_VIEW_BYTES), camera)
+    # Robots of the first version send "f" instead.
+    if reader.has("f") and not reader.has("m"):
+        pixels, codes = unpack_features_v1(reader.binary("f", MAX_VIEW_BYTES), camera)
+    else:
+        pixels, codes = unpack_features(reader.binary("m", MAX_VIEW_BYTES), camera)
     return View(pixels, codes, camera)
 
 

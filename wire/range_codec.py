@@ -2,7 +2,9 @@
 
 reach     uint16    mm, from the robot's middle
 bearings  K int16   1e-4 rad, within half a turn
-distances K uint8   255: nothing in reach; else that share of 254 of the reach
+distances K uint8   255: nothing in reach; else that share of 254 of the reach, 254 a hair less than all of it
+
+What was decoded encodes to the same bytes again.
 """
 
 from __future__ import annotations
@@ -16,6 +18,11 @@ from hybridmap.ranges import MOST, Ranges
 
 MAX_RANGE_BYTES = 2 + 3 * MOST
 BEARING_STEP = 1e-4
+MOST_STEPS = 31415
+"""Bearings of half a turn to either side are the same; one step more would come back as the other."""
+
+JUST_SEEN = 1.0 - 1e-5
+"""What is seen at the very end of the reach is seen, and must not come back as nothing."""
 
 
 def pack_ranges(ranges: Ranges) -> bytes:
@@ -26,7 +33,7 @@ def pack_ranges(ranges: Ranges) -> bytes:
     steps = np.where(share >= 1.0 - 1e-6, 255, np.minimum(np.rint(share * 254), 254))
     return (
         np.uint16(reach_mm).tobytes()
-        + np.rint(bearings / BEARING_STEP).astype("<i2").tobytes()
+        + np.clip(np.rint(bearings / BEARING_STEP), -MOST_STEPS, MOST_STEPS).astype("<i2").tobytes()
         + steps.astype(np.uint8).tobytes()
     )
 
@@ -43,7 +50,8 @@ def unpack_ranges(data: bytes) -> Ranges:
     reach = int(np.frombuffer(data, "<u2", 1)[0]) / 1000.0
     bearings = np.frombuffer(data, "<i2", count, 2).astype(np.float64) * BEARING_STEP
     steps = np.frombuffer(data, np.uint8, count, 2 + 2 * count).astype(np.float64)
+    shares = np.where(steps == 255, 1.0, np.minimum(steps / 254, JUST_SEEN))
     try:
-        return Ranges(bearings, np.where(steps == 255, reach, steps / 254 * reach), reach)
+        return Ranges(bearings, shares * reach, reach)
     except InvalidValue as error:
         raise InvalidMessage(str(error)) from None

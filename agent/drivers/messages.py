@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.errors import InvalidMessage, InvalidValue
-from wire.landmark_codec import pack_camera, unpack_camera
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+from wire.posture_codec import pack_camera, unpack_camera
 
 ENDED = "the simulation has ended"
 """Refusal: there will be no more observations, and that is no failure."""

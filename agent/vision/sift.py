@@ -51,7 +51,7 @@ class Features:
     Attributes:
         raw: (N, 2) px as in the real image.
         pixels: (N, 2) px in the ideal image.
-        codes: (N, 16) uint8 compact descriptors.
+        codes: (N, 32) uint8 compact descriptors.
         responses: (N,) SIFT's response.
     """
 

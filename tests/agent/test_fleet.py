@@ -52,7 +52,7 @@ MAP = MapId("r0", 1)
 HERE, THERE = NodeId("r0", 1, 3), NodeId("r1", 1, 9)
 VIEW = View(
     np.array([[10.0, 20.0], [30.0, 40.0]], np.float32),
-    np.arange(32, dtype=np.uint8).reshape(2, 16),
+    np.arange(64, dtype=np.uint8).reshape(2, 32),
     Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3),
 )
 

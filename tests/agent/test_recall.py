@@ -77,7 +77,7 @@ def test_a_room_that_was_never_mapped_is_not_recognised(own_map):
 def test_nothing_to_recognise(world, own_map):
     rng = np.random.default_rng(0)
     view, _ = take_view(world, Pose2(2.5, 2.0), rng)
-    empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 16), np.uint8), CAMERA)
+    empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), CAMERA)
     assert recall(HybridMap(), view, rng) is None
     assert recall(own_map, empty, rng) is None
     (first, *_) = own_map.nodes.values()

@@ -56,7 +56,7 @@ def test_landmark_covariances_against_sampling() -> None:
     pixel, depth, depth_sigma, pixel_sigma = np.array([70.0, 200.0]), 3.0, 0.05, 0.8
     landmarks = Landmarks(
         pixel[None].astype(np.float32),
-        np.zeros((1, 16), np.uint8),
+        np.zeros((1, 32), np.uint8),
         np.array([depth], np.float32),
         np.array([depth_sigma], np.float32),
     )

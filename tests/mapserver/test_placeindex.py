@@ -125,7 +125,7 @@ def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[N
 def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pose2]]) -> None:
     world, nodes, tour = building
     view, _ = take_view(world, tour[0], np.random.default_rng(6))
-    empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 16), np.uint8), CAMERA)
+    empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), CAMERA)
     assert PlaceIndex().query(view) == [] and filled(nodes[:1]).query(empty) == []
     bare = Node(NodeId("a", 1, 99), 0, nodes[0].map_from_robot, CAMERA, Landmarks.empty())
     index = filled([bare])

@@ -29,7 +29,7 @@ HERE = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 
 def node_put(number: int, landmarks: int = 0, map_id: MapId = MAP) -> NodePut:
     seen = Landmarks(
-        np.zeros((landmarks, 2), np.float32), np.zeros((landmarks, 16), np.uint8),
+        np.zeros((landmarks, 2), np.float32), np.zeros((landmarks, 32), np.uint8),
         np.full(landmarks, np.nan, np.float32), np.full(landmarks, np.nan, np.float32),
     )  # fmt: skip
     return NodePut(Node(NodeId(*map_id, number), 0, HERE, CAMERA, seen))

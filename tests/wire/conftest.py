@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 from hybridmap.camera import Camera
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from hybridmap.descriptor import quantise
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
+from hybridmap.synthetic import random_vectors
 
 # Examples run on machines that are busy with other things.
 settings.register_profile("mapweave", deadline=None)
@@ -53,10 +55,10 @@ def landmarks(draw: st.DrawFn, camera: Camera, most: int = 40) -> Landmarks:
     n = draw(st.integers(0, most))
     depths = np.exp(random.uniform(math.log(0.011), math.log(9.9e3), n))
     depths[random.random(n) < draw(st.floats(0, 1))] = np.nan
-    sigmas = np.exp(random.uniform(math.log(0.0011), math.log(99.0), n))
+    sigmas = depths * np.exp(random.uniform(math.log(0.002), math.log(4.5), n))
     sigmas[np.isnan(depths)] = np.nan
     pixels = random.uniform(-0.45, 1.45, (n, 2)) * [camera.width, camera.height]
-    codes = random.integers(0, 256, (n, 16)).astype(np.uint8)
+    codes = random.integers(0, 64, (n, 32)).astype(np.uint8)
     return Landmarks(pixels.astype(np.float32), codes, depths.astype(np.float32), sigmas.astype(np.float32))
 
 
@@ -124,7 +126,7 @@ def sample_node(count: int = 150, number: int = 17, map_id: MapId = MAP, seed: i
     depths = random.uniform(0.3, 8.0, count).astype(np.float32)
     depths[::5] = np.nan
     pixels = (random.uniform(0, 1, (count, 2)) * [319, 239]).astype(np.float32)
-    codes = random.integers(0, 256, (count, 16)).astype(np.uint8)
+    codes = quantise(random_vectors(count, random))
     posture = PoseGaussian.from_sigmas(Pose2(1.2345, -2.0, 0.3), 0.02, 0.01)
     stamp_ns = 1_700_000_000_000_000_000
     return Node(

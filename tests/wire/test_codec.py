@@ -23,13 +23,6 @@ from wire.codec import decode_body, decode_change, element_of, encode_body, enco
 data = st.data()
 
 
-def test_a_node_of_150_landmarks_keeps_its_byte_budget(some: SimpleNamespace) -> None:
-    longest = MapId("r" * 32, 2**41)
-    for map_id, most in ((some.map, 3650), (longest, 3700)):
-        change = Change(map_id, 100_000, 2**62, NodePut(some.node(map_id=map_id)))
-        assert len(encode_change(change)) <= most
-
-
 def test_an_edge_of_60_shared_landmarks_is_small(some: SimpleNamespace) -> None:
     assert len(encode_change(Change(some.map, 1000, 2**62, EdgePut(some.edge())))) < 250
 
@@ -58,11 +51,14 @@ def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject) ->
     assert np.array_equal(old.codes, new.codes)
     assert new.codes.flags.writeable
     if len(old):
-        assert np.abs(old.pixels.astype(float) - new.pixels).max() <= 1 / 32 + 1e-9
+        assert np.abs(old.pixels.astype(float) - new.pixels).max() <= 1 / 16 + 1e-9
     assert np.array_equal(old.has_depth, new.has_depth)
     known = old.has_depth
-    np.testing.assert_allclose(new.depths[known], old.depths[known], rtol=1.2e-4)
-    np.testing.assert_allclose(new.depth_sigmas[known], old.depth_sigmas[known], rtol=0.023)
+    np.testing.assert_allclose(
+        new.depth_sigmas[known] / new.depths[known], old.depth_sigmas[known] / old.depths[known], rtol=0.065
+    )
+    most = np.maximum(old.depth_sigmas[known] / old.depths[known], 0.002) / 5.6
+    assert (np.abs(np.log(new.depths[known].astype(float) / old.depths[known])) <= most).all()
     assert np.isnan(new.depth_sigmas[~known]).all()
 
 
@@ -109,25 +105,6 @@ def test_a_second_decoder_reads_a_node(some: SimpleNamespace) -> None:
     assert (x, y, heading) == pytest.approx((1.2345, -2.0, 0.3))
     assert (xx, yy, hh) == pytest.approx((4e-4, 4e-4, 1e-4))
     assert (xy, xh, yh) == (0.0, 0.0, 0.0)
-    packed = fields["l"]
-    assert len(packed) == 150 * 23
-    for n in range(150):
-        code = packed[16 * n : 16 * n + 16]
-        (u,) = struct.unpack_from("<H", packed, 150 * 16 + 2 * n)
-        (v,) = struct.unpack_from("<H", packed, 150 * 18 + 2 * n)
-        (depth,) = struct.unpack_from("<H", packed, 150 * 20 + 2 * n)
-        (sigma,) = struct.unpack_from("<B", packed, 150 * 22 + n)
-        assert code == node.landmarks.codes[n].tobytes()
-        # 65535 // (2 * 320) = 102: steps of 1/64 px from half an image left of and above the image.
-        assert u / 64 - 160 == pytest.approx(node.landmarks.pixels[n, 0], abs=1 / 128)
-        assert v / 64 - 120 == pytest.approx(node.landmarks.pixels[n, 1], abs=1 / 128)
-        if math.isnan(node.landmarks.depths[n]):
-            assert (depth, sigma) == (0, 0)
-        else:
-            assert 0.01 * 1e6 ** ((depth - 1) / 65534) == pytest.approx(node.landmarks.depths[n], rel=1.2e-4)
-            assert 0.001 * 1e5 ** ((sigma - 1) / 254) == pytest.approx(
-                node.landmarks.depth_sigmas[n], rel=0.023
-            )
 
 
 def test_a_second_decoder_reads_an_edge(some: SimpleNamespace) -> None:
@@ -155,22 +132,23 @@ def test_what_is_not_there_costs_nothing_and_comes_back_empty(some: SimpleNamesp
     assert body.edge.evidence == {}
 
 
-@pytest.mark.parametrize("far", [0.009, 1.1e4, math.inf])
+@pytest.mark.parametrize("far", [0.009, 1.3e4, math.inf])
 def test_depths_beyond_use_become_unknown(some: SimpleNamespace, far: float) -> None:
     back = through(some, depth=far, sigma=1.0)
     assert np.isnan(back.depths).all()
     assert np.isnan(back.depth_sigmas).all()
 
 
-@pytest.mark.parametrize(("sigma", "clipped"), [(0.0, 0.001), (1e-9, 0.001), (1e4, 100.0)])
-def test_sigmas_are_clipped(some: SimpleNamespace, sigma: float, clipped: float) -> None:
-    assert through(some, depth=2.0, sigma=sigma).depth_sigmas[0] == pytest.approx(clipped, rel=1e-6)
+@pytest.mark.parametrize(("sigma", "share"), [(0.0, 0.002), (1e-9, 0.002), (1e4, 0.002 * math.exp(62 / 8))])
+def test_sigmas_are_clipped(some: SimpleNamespace, sigma: float, share: float) -> None:
+    back = through(some, depth=2.0, sigma=sigma)
+    assert back.depth_sigmas[0] / back.depths[0] == pytest.approx(share, rel=1e-6)
 
 
 def through(some: SimpleNamespace, depth: float, sigma: float) -> Landmarks:
     """One landmark, there and back."""
     one = Landmarks(
-        np.full((1, 2), 100, np.float32), np.zeros((1, 16), np.uint8),
+        np.full((1, 2), 100, np.float32), np.zeros((1, 32), np.uint8),
         np.array([depth], np.float32), np.array([sigma], np.float32),
     )  # fmt: skip
     body = decode_body(encode_body(NodePut(replaced(some.node(), landmarks=one))))
@@ -187,7 +165,7 @@ def replaced(node: Node, **new: Any) -> Node:
 
 def bad_landmarks(count: int = 1, pixel: float = 10.0, depth: float = 1.0, sigma: float = 0.1) -> Landmarks:
     return Landmarks(
-        np.full((count, 2), pixel, np.float32), np.zeros((count, 16), np.uint8),
+        np.full((count, 2), pixel, np.float32), np.zeros((count, 32), np.uint8),
         np.full(count, depth, np.float32), np.full(count, sigma, np.float32),
     )  # fmt: skip
 
@@ -270,10 +248,10 @@ FORGERIES: list[tuple[str, dict[str, Any], str]] = [
     ("node", {"c": struct.pack("<HH6d", 8, 240, 1, 1, 1, 1, 1, 1)}, "image size"),
     ("node", {"c": struct.pack("<HH6d", 320, 240, -1, 1, 1, 1, 1, 1)}, "focal"),
     ("node", {"c": struct.pack("<HH6d", 320, 240, math.nan, 1, 1, 1, 1, 1)}, "out of range"),
-    ("node", {"l": b"\0" * 22}, "22 bytes are no"),
-    ("node", {"l": b"\0" * 23 * 2001}, "46023 bytes"),
-    ("node", {"l": b"\0" * 20 + b"\1\0" + b"\0"}, "depth and sigma"),
-    ("node", {"l": "text"}, "l must be at most"),
+    ("node", {"m": b"\0" * 15}, "15 bytes are too few"),
+    ("node", {"m": b"\3" + b"\0" * 20}, "version 3, this program reads 2"),
+    ("node", {"m": b"\2" + b"\0" * 20}, "checksum"),
+    ("node", {"m": "text"}, "m must be at most"),
     ("edge", {"a": -1}, "a must be"),
     ("edge", {"a": 17}, "to itself"),
     ("edge", {"a": ["robot-0", 3, 17]}, "to itself"),
@@ -302,7 +280,7 @@ def test_forgeries_are_refused_with_a_reason(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["v", "k", "i", "t", "p", "c", "l"])
+@pytest.mark.parametrize("name", ["v", "k", "i", "t", "p", "c", "m"])
 def test_what_is_missing_is_named(some: SimpleNamespace, name: str) -> None:
     fields = msgpack.unpackb(encode_body(NodePut(some.node(3))))
     del fields[name]
@@ -323,7 +301,7 @@ def test_whatever_a_camera_sees_fits(some: SimpleNamespace, data: st.DataObject)
     camera: Camera = data.draw(some.cameras)
     far = np.array([[-0.5, -0.5], [1.5, 1.5], [1.5, -0.5]]) * [camera.width, camera.height]
     corners = Landmarks(
-        np.trunc(far).astype(np.float32), np.zeros((3, 16), np.uint8),
+        np.trunc(far).astype(np.float32), np.zeros((3, 32), np.uint8),
         np.full(3, np.nan, np.float32), np.full(3, np.nan, np.float32),
     )  # fmt: skip
     body = decode_body(encode_body(NodePut(replaced(some.node(), camera=camera, landmarks=corners))))

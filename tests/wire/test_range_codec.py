@@ -46,3 +46,14 @@ def test_a_robot_without_sensors_says_nothing():
 def test_what_does_not_belong_together_is_refused(bearings, distances, reach):
     with pytest.raises(InvalidValue):
         Ranges(np.array(bearings), np.array(distances), reach)
+
+
+@given(st.integers(1, 60_000), st.lists(st.tuples(st.floats(-10, 10), st.floats(0, 1)), max_size=20))
+def test_what_was_decoded_encodes_to_the_same_bytes(reach_mm, sensors):
+    """Things at the very end of the reach and sensors that look straight back once did not."""
+    reach = reach_mm / 1000
+    bearings, shares = np.array([*sensors, (np.pi, 0.999), (-np.pi, 1.0), (3.14159, 0.9999)]).T
+    packed = pack_ranges(Ranges(bearings, shares * reach, reach))
+    back = unpack_ranges(packed)
+    assert pack_ranges(back) == packed
+    assert ((back.distances < reach) == (shares * reach < reach * (1 - 1e-6))).all()

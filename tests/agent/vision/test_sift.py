@@ -24,7 +24,7 @@ def test_features_are_spread_and_each_has_a_place_of_its_own(pictures, name):
     assert 20 <= len(features) <= settings.most
     assert len({(round(x), round(y)) for x, y in features.raw}) == len(features)
     assert (np.diff(features.responses) <= 0).all(), "strongest first"
-    assert features.codes.shape == (len(features), 16)
+    assert features.codes.shape == (len(features), 32)
     assert CAMERA.contains(features.raw, settings.border_px - 1).all()
     cells = np.floor(features.raw * settings.cells / [320, 240]).astype(int)
     _, counts = np.unique(cells, axis=0, return_counts=True)

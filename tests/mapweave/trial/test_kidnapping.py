@@ -38,7 +38,7 @@ def a_map(where: dict[str, list[tuple[float, float]]], landmarks: int = LEAST_LA
         for k, (x, y) in enumerate(places)
     }
     seen = Landmarks(
-        np.zeros((landmarks, 2), np.float32), np.zeros((landmarks, 16), np.uint8),
+        np.zeros((landmarks, 2), np.float32), np.zeros((landmarks, 32), np.uint8),
         np.ones(landmarks, np.float32), np.ones(landmarks, np.float32),
     )  # fmt: skip
     here = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)

@@ -1,0 +1,300 @@
+"""Landmarks on the wire: a second decoder written from docs/wire.md, sizes, damage, and the first version."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import msgpack
+import numpy as np
+import pytest
+import skimage.data
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap.camera import Camera
+from hybridmap.change import Change, NodePut
+from hybridmap.descriptor import encode
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.grid import settle
+from hybridmap.landmark_tables import landmark_tables
+from hybridmap.node import Landmarks
+from hybridmap.recognition import Recognition, examine_nodes
+from wire.codec import decode_body, encode_body, encode_change
+from wire.landmark_codec import (
+    MAX_LANDMARKS,
+    MAX_LANDMARKS_BYTES,
+    pack_features,
+    pack_landmarks,
+    unpack_features,
+    unpack_landmarks,
+)
+from wire.mapfile import read_map_file
+
+data = st.data()
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)
+
+
+class PlainDecoder:
+    """Reads landmarks bit by bit with Python's numbers alone, from the page on the wire."""
+
+    def __init__(self, packed: bytes) -> None:
+        head = struct.unpack_from("<BBHHHHH", packed)
+        self.version, self.flags, self.count, self.least_x, self.reach_x, self.least_y, self.reach_y = head
+        (check,) = struct.unpack("<I", packed[-4:])
+        assert zlib.crc32(packed[:-4]) == check
+        self.text = "".join(f"{byte:08b}" for byte in packed[12:-4])
+        self.at = 0
+
+    def take(self, count: int) -> int:
+        self.at += count
+        return int(self.text[self.at - count : self.at] or "0", 2)
+
+    def rows(self) -> tuple[list[int], int]:
+        if not self.flags & 1:
+            return [0] * self.count, self.reach_y.bit_length()
+        low = 0
+        while 2 << low <= (self.reach_y + 1) // self.count:
+            low += 1
+        high, step = [], 0
+        for _ in range(self.count + (self.reach_y >> low)):
+            if self.take(1):
+                high.append(step)
+            else:
+                step += 1
+        return high, low
+
+    def pop(self, lane: int, frequencies: list[int]) -> int:
+        slot, symbol = self.states[lane] % 4096, 0
+        while slot >= frequencies[symbol]:
+            slot -= frequencies[symbol]
+            symbol += 1
+        self.states[lane] = frequencies[symbol] * (self.states[lane] // 4096) + slot
+        self.missing.append(lane)
+        return symbol
+
+    def refill(self) -> None:
+        for lane in self.missing:
+            while self.states[lane] < 1 << self.size:
+                self.states[lane] = 2 * self.states[lane] + self.take(1)
+        self.missing = []
+
+    def read(self) -> list[tuple[float, float, list[int], float, float]]:
+        """(x, y, code, depth, sigma) of each landmark for a camera of 320 x 240."""
+        tables, everyone = landmark_tables(), range(self.count)
+        high, low = self.rows()
+        self.size = max(12, (((self.reach_x + 1) << low) - 1).bit_length())
+        self.states = [(1 << self.size) + self.take(self.size) for _ in everyone]
+        self.missing: list[int] = []
+        codes: list[list[int]] = [[] for _ in everyone]
+        for k in range(32):
+            for lane in everyone:
+                codes[lane].append(self.pop(lane, tables.codes[k].tolist()))
+            self.refill()
+        depths, sigmas = [math.nan] * self.count, [math.nan] * self.count
+        if self.flags & 2:
+            shares = [self.pop(lane, tables.shares.tolist()) for lane in everyone]
+            self.refill()
+            known = [lane for lane in everyone if shares[lane]]
+            cells = {lane: self.pop(lane, tables.cells.tolist()) for lane in known}
+            self.refill()
+            for lane in known:
+                share = 0.002 * math.exp((shares[lane] - 1) / 8)
+                fine = max(0, math.ceil(math.log2(0.75 / share)))
+                step = self.pop(lane, [1 << (12 - fine)] * (1 << fine))
+                q = cells[lane] * 2**fine + step + 0.5
+                depths[lane] = 0.01 * math.exp(q / 4 / 2**fine)
+                sigmas[lane] = depths[lane] * share
+            self.refill()
+        seeds = [state - (1 << self.size) for state in self.states]
+        assert set(self.text[self.at :]) <= {"0"}
+        assert len(self.text) - self.at < 8
+        x = [self.least_x + (seed >> low) for seed in seeds]
+        y = [self.least_y + (h << low) + seed % (1 << low) for h, seed in zip(high, seeds, strict=True)]
+        return [
+            (x[n] / 8 - 160, y[n] / 8 - 120, codes[n], depths[n], sigmas[n]) for n in everyone
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, 2, 40, 150])
+@pytest.mark.parametrize("by_rows", [True, False])
+def test_a_second_decoder_reads_landmarks(some: SimpleNamespace, count: int, by_rows: bool) -> None:
+    one: Landmarks = some.node(count).landmarks
+    if by_rows:
+        one, _ = settle(one, CAMERA)
+    plain = PlainDecoder(pack_landmarks(one, CAMERA))
+    assert (plain.version, plain.count) == (2, count)
+    assert plain.flags == 2 + (by_rows or count == 1 or (one.pixels[1, 1] >= one.pixels[0, 1] and count == 2))
+    back = unpack_landmarks(pack_landmarks(one, CAMERA), CAMERA)
+    for n, (x, y, code, depth, sigma) in enumerate(plain.read()):
+        assert code == one.codes[n].tolist()
+        assert (x, y) == tuple(back.pixels[n])
+        assert (x, y) == pytest.approx(one.pixels[n], abs=1 / 16)
+        assert depth == pytest.approx(back.depths[n], rel=1e-6, nan_ok=True)
+        assert sigma == pytest.approx(back.depth_sigmas[n], rel=1e-6, nan_ok=True)
+
+
+def test_a_second_decoder_reads_features(some: SimpleNamespace) -> None:
+    one: Landmarks = some.node(30).landmarks
+    plain = PlainDecoder(pack_features(one.pixels, one.codes, CAMERA))
+    assert plain.flags == 0
+    pixels, codes = unpack_features(pack_features(one.pixels, one.codes, CAMERA), CAMERA)
+    for n, (x, y, code, depth, _) in enumerate(plain.read()):
+        assert (x, y, code) == (*pixels[n], codes[n].tolist())
+        assert math.isnan(depth)
+
+
+@given(data)
+def test_landmarks_come_back_in_their_order(some: SimpleNamespace, data: st.DataObject) -> None:
+    camera = data.draw(some.cameras)
+    one: Landmarks = data.draw(some.landmarks(camera))
+    if data.draw(st.booleans()):
+        one, _ = settle(one, camera)
+    packed = pack_landmarks(one, camera)
+    back = unpack_landmarks(packed, camera)
+    assert np.array_equal(back.codes, one.codes)
+    assert back.codes.flags.writeable
+    assert np.abs(back.pixels - one.pixels).max(initial=0) <= 1 / 16
+    assert pack_landmarks(back, camera) == packed
+    pixels, codes = unpack_features(pack_features(one.pixels, one.codes, camera), camera)
+    assert np.array_equal(pixels, back.pixels)
+    assert np.array_equal(codes, one.codes)
+
+
+@given(data)
+def test_settled_landmarks_come_back_to_the_last_bit(some: SimpleNamespace, data: st.DataObject) -> None:
+    """What the robot that made a node works with is what everybody else gets."""
+    camera = data.draw(some.cameras)
+    one, _ = settle(data.draw(some.landmarks(camera)), camera)
+    back = unpack_landmarks(pack_landmarks(one, camera), camera)
+    for name in ("pixels", "codes", "depths", "depth_sigmas"):
+        assert getattr(back, name).tobytes() == getattr(one, name).tobytes()
+
+
+@pytest.mark.parametrize("photograph", ["coins", "page", "retina", "stereo_motorcycle"])
+def test_150_landmarks_of_a_photograph_fit_the_byte_budget(some: SimpleNamespace, photograph: str) -> None:
+    """Real descriptors of images that no table was trained on; 80 bytes of 3000 are left to the transport."""
+    image = getattr(skimage.data, photograph)()
+    image = image[0] if isinstance(image, tuple) else image
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    grey = cv2.resize(grey, (640, 480), interpolation=cv2.INTER_AREA)
+    # OpenCV may give a few more, where a place has several orientations.
+    keypoints, sift = cv2.SIFT_create(nfeatures=150, contrastThreshold=0.01).detectAndCompute(grey, None)
+    assert len(sift) >= 150
+    random = np.random.default_rng(0)
+    depths = np.exp(random.normal(math.log(2.0), 0.6, 150)).astype(np.float32)
+    sigmas = (depths * random.uniform(0.02, 0.1, 150)).astype(np.float32)
+    pixels = np.array([k.pt for k in keypoints[:150]], np.float32)
+    camera = Camera(640, 480, 554.0, 554.0, 319.5, 239.5, 0.25, 0.05)
+    landmarks, _ = settle(Landmarks(pixels, encode(sift[:150]), depths, sigmas), camera)
+    node = replace(some.node(1), camera=camera, landmarks=landmarks)
+    change = Change(node.id.map, 100_000, node.stamp_ns, NodePut(node))
+    assert len(encode_change(change)) <= 2920
+
+
+def test_order_by_rows_saves_its_rank(some: SimpleNamespace) -> None:
+    """log2(150!) is 873 bits; the row of ones and zeros costs a little of that."""
+    one: Landmarks = some.node(150).landmarks
+    settled, _ = settle(one, CAMERA)
+    saved = len(pack_landmarks(one, CAMERA)) - len(pack_landmarks(settled, CAMERA))
+    assert 80 < saved < 110
+
+
+def test_the_least_likely_is_not_longer_than_is_allowed() -> None:
+    """Every symbol the rarest of its column, pixels as far apart as they can be."""
+    tables, random = landmark_tables(), np.random.default_rng(0)
+    large = Camera(16384, 16384, 1e4, 1e4, 8e3, 8e3, 0.3)
+    pixels = random.uniform(-0.4, 1.4, (MAX_LANDMARKS, 2)) * 16384
+    codes = np.tile(tables.codes.argmin(axis=1), (MAX_LANDMARKS, 1)).astype(np.uint8)
+    depths = np.full(MAX_LANDMARKS, 9e3, np.float32)
+    worst = Landmarks(pixels.astype(np.float32), codes, depths, np.zeros_like(depths))
+    packed = pack_landmarks(worst, large)
+    assert 0.9 * MAX_LANDMARKS_BYTES < len(packed) <= MAX_LANDMARKS_BYTES
+    assert np.array_equal(unpack_landmarks(packed, large).codes, codes)
+
+
+@settings(max_examples=200)
+@given(data)
+def test_damage_is_noticed(some: SimpleNamespace, data: st.DataObject) -> None:
+    good = pack_landmarks(some.node(20).landmarks, CAMERA)
+    bad = bytearray(good)
+    bad[data.draw(st.integers(0, len(good) - 1))] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(InvalidMessage, match="landmarks: ") as error:
+        unpack_landmarks(bytes(bad), CAMERA)
+    assert "\n" not in str(error.value)
+
+
+@settings(max_examples=300)
+@given(data)
+def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data: st.DataObject) -> None:
+    """Whatever decodes is finite, within the image's surroundings, and encodes to what decodes alike."""
+    bad = bytearray(pack_landmarks(some.node(20).landmarks, CAMERA)[:-4])
+    for _ in range(data.draw(st.integers(1, 3))):
+        reach = data.draw(st.sampled_from([12, len(bad)]))
+        bad[data.draw(st.integers(0, reach - 1))] ^= data.draw(st.integers(1, 255))
+    if data.draw(st.booleans()):
+        bad = bad[: data.draw(st.integers(0, len(bad)))]
+    forged = bytes(bad) + zlib.crc32(bad).to_bytes(4, "little")
+    try:
+        one = unpack_landmarks(forged, CAMERA)
+    except InvalidMessage:
+        return
+    assert np.isfinite(one.pixels).all()
+    assert (one.depths[one.has_depth] > 0).all()
+    packed = pack_landmarks(one, CAMERA)
+    again = unpack_landmarks(packed, CAMERA)
+    assert again.pixels.tobytes() == one.pixels.tobytes()
+    assert pack_landmarks(again, CAMERA) == packed
+
+
+def test_landmarks_are_no_features_and_features_no_landmarks(some: SimpleNamespace) -> None:
+    one: Landmarks = some.node(5).landmarks
+    with pytest.raises(InvalidMessage, match="flags"):
+        unpack_features(pack_landmarks(one, CAMERA), CAMERA)
+    with pytest.raises(InvalidMessage, match="flags"):
+        unpack_landmarks(pack_features(one.pixels, one.codes, CAMERA), CAMERA)
+
+
+def test_codes_that_are_none_are_refused(some: SimpleNamespace) -> None:
+    one: Landmarks = some.node(5).landmarks
+    wrong = one.codes.copy()
+    wrong[2, 3] = 64
+    for codes in (wrong, one.codes.astype(np.int64)):
+        with pytest.raises(InvalidValue, match="uint8 below 64"):
+            pack_landmarks(Landmarks(one.pixels, codes, one.depths, one.depth_sigmas), CAMERA)
+
+
+def test_a_map_file_of_the_first_version_opens() -> None:
+    """Two nodes as the first version wrote them, which it recognised as one place, 31 landmarks agreeing."""
+    changes = read_map_file(Path(__file__).parent / "first_version.mapweave").changes
+    one, two = (change.node for change in changes if isinstance(change, NodePut))
+    assert (len(one.landmarks), len(two.landmarks)) == (65, 88)
+    assert one.landmarks.pixels[0] == pytest.approx([204.03125, 63.140625], abs=0)
+    assert two.landmarks.pixels.sum(axis=0) == pytest.approx([14129.281, 6078.2188], rel=1e-6)
+    assert one.landmarks.depths.sum() == pytest.approx(189.45918)
+    found = examine_nodes(one, two, None, np.random.default_rng(0))
+    assert isinstance(found, Recognition)
+    assert found.inliers >= 28
+    assert found.node_from_robot.mean.vector == pytest.approx([-0.153, 0.258, 0.094], abs=0.02)
+    again = encode_body(NodePut(one))
+    assert encode_body(decode_body(again)) == again
+
+
+@pytest.mark.parametrize(
+    ("old", "reason"),
+    [
+        (b"\0" * 22, "22 bytes are no 0..2000 of the first version"),
+        (b"\0" * 23 * 2001, "46023 bytes are no"),
+        (b"\0" * 20 + b"\1\0" + b"\0", "depth and sigma"),
+    ],
+)
+def test_what_is_wrong_with_old_landmarks_is_said(some: SimpleNamespace, old: bytes, reason: str) -> None:
+    fields = msgpack.unpackb(encode_body(NodePut(some.node(3))))
+    del fields["m"]
+    with pytest.raises(InvalidMessage, match=reason):
+        decode_body(msgpack.packb({**fields, "l": old}))

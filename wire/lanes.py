@@ -1,0 +1,176 @@
+"""Many symbols at once, each for the bits that its frequency is worth: asymmetric numeral systems in lanes.
+
+Each lane is a state in [2^m, 2^(m+1)) to which symbols are pushed and from which they come back last in,
+first out (Duda, arXiv:1311.2540, the variant with ranges; side by side after Giesen, arXiv:1402.3392). A
+symbol of frequency f of 2^12 costs 12 - log2(f) bits. What does not fit into the state any more goes to the
+stream bit by bit; so a lane costs its m bits at the end and hardly half a bit more, and its first state may
+hold m bits of something else. All lanes move together: a column is a few operations on arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import InvalidMessage
+from hybridmap.landmark_tables import TOTAL_BITS
+
+TOTAL = 1 << TOTAL_BITS
+Ints = NDArray[np.int64]
+Lanes = Ints | slice
+EVERY = slice(None)
+
+
+def log2(numbers: Ints) -> Ints:
+    """Whole part of the binary logarithm of numbers from 1."""
+    return np.frexp(numbers)[1].astype(np.int64) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """Frequencies of one column's symbols.
+
+    Attributes:
+        frequencies: (S,) int64, with sum 2^12.
+    """
+
+    frequencies: Ints
+
+    @cached_property
+    def starts(self) -> Ints:
+        """(S,) sum of the frequencies before each symbol."""
+        return np.cumsum(self.frequencies) - self.frequencies
+
+    @cached_property
+    def symbols(self) -> Ints:
+        """(4096,) symbol of each slot."""
+        return np.repeat(np.arange(len(self.frequencies)), self.frequencies)
+
+    @cached_property
+    def widths(self) -> Ints:
+        """(4096,) frequency of each slot's symbol."""
+        return self.frequencies[self.symbols]
+
+    @cached_property
+    def places(self) -> Ints:
+        """(4096,) number of each slot among those of its symbol."""
+        return np.arange(TOTAL) - self.starts[self.symbols]
+
+
+@dataclass(eq=False)
+class LaneWriter:
+    """Lanes into which symbols go. What is pushed last is read first.
+
+    Attributes:
+        states: (N,) int64 in [2^m, 2^(m+1)).
+        size: m, 12 to 32.
+    """
+
+    states: Ints
+    size: int
+    _bits: list[tuple[Ints, Ints]] = field(default_factory=list)
+
+    def push(self, symbols: Ints, column: Column, lanes: Lanes = EVERY) -> None:
+        """One symbol of a column for each lane; none may be of frequency 0."""
+        self._push(lanes, column.frequencies[symbols], column.starts[symbols])
+
+    def push_plain(self, numbers: Ints, widths: Ints, lanes: Lanes = EVERY) -> None:
+        """A number of 0 to 12 bits for each lane, all alike likely."""
+        left = TOTAL_BITS - widths
+        self._push(lanes, 1 << left, numbers << left)
+
+    def _push(self, lanes: Lanes, frequencies: Ints, starts: Ints) -> None:
+        states = self.states[lanes]
+        out = TOTAL_BITS - log2(frequencies)
+        out -= (states >> out) < (frequencies << (self.size - TOTAL_BITS))
+        self._bits.append((states & ((1 << out) - 1), out))
+        whole, rest = np.divmod(states >> out, frequencies)
+        self.states[lanes] = (whole << TOTAL_BITS) + starts + rest
+
+    def finish(self) -> tuple[Ints, Ints]:
+        """Numbers and their widths in bits in the order of reading: last states, then the rest."""
+        widths = np.full(len(self.states), self.size)
+        parts = [(self.states - (1 << self.size), widths), *reversed(self._bits)]
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+class LaneReader:
+    """Lanes from which symbols come."""
+
+    def __init__(self, bits: BitReader, count: int, size: int) -> None:
+        """Read the last states of so many lanes of m bits."""
+        self._bits, self._size = bits, size
+        self.states = bits.read(np.full(count, size, np.int64)) + (1 << size)
+
+    def pop(self, column: Column, lanes: Lanes = EVERY) -> Ints:
+        """One symbol of each lane."""
+        states = self.states[lanes]
+        slots = states & (TOTAL - 1)
+        self._refill(lanes, column.widths[slots] * (states >> TOTAL_BITS) + column.places[slots])
+        symbols: Ints = column.symbols[slots]
+        return symbols
+
+    def pop_plain(self, widths: Ints, lanes: Lanes = EVERY) -> Ints:
+        """A number of 0 to 12 bits of each lane."""
+        states, left = self.states[lanes], TOTAL_BITS - widths
+        slots = states & (TOTAL - 1)
+        numbers = slots >> left
+        self._refill(lanes, ((states >> TOTAL_BITS) << left) + slots - (numbers << left))
+        return numbers
+
+    def _refill(self, lanes: Lanes, states: Ints) -> None:
+        missing = self._size - log2(states)
+        self.states[lanes] = (states << missing) | self._bits.read(missing)
+
+
+class BitReader:
+    """Numbers of so many bits each, first bit first."""
+
+    def __init__(self, data: bytes) -> None:
+        """Take the bytes."""
+        padded = np.frombuffer(data + bytes(5), np.uint8).astype(np.int64)
+        # 40 bits from each byte on.
+        self._windows = np.zeros(len(data) + 1, np.int64)
+        for k in range(5):
+            self._windows |= padded[k : len(data) + 1 + k] << 8 * (4 - k)
+        self._length = 8 * len(data)
+        self._at = 0
+
+    def read(self, widths: Ints) -> Ints:
+        """Numbers of 0 to 32 bits.
+
+        Raises:
+            InvalidMessage: there are not that many.
+        """
+        ends = np.cumsum(widths) + self._at
+        if len(ends) and ends[-1] > self._length:
+            raise InvalidMessage("landmarks: cut off")
+        begins = ends - widths
+        numbers: Ints = self._windows[begins >> 3] >> (40 - widths - (begins & 7)) & ((1 << widths) - 1)
+        if len(ends):
+            self._at = int(ends[-1])
+        return numbers
+
+    def end(self) -> None:
+        """Nothing but the filling of the last byte may be left.
+
+        Raises:
+            InvalidMessage: there is more, or it is not zero.
+        """
+        left = self._length - self._at
+        if left >= 8 or self.read(np.array([left])).any():
+            raise InvalidMessage("landmarks: more than there should be")
+
+
+def pack_bits(numbers: Ints, widths: Ints) -> bytes:
+    """Numbers of so many bits each, first bit first, filled with zeros to whole bytes."""
+    ends = np.cumsum(widths)
+    total = int(ends[-1]) if len(ends) else 0
+    # For each bit: how many of its number follow it.
+    following = np.repeat(ends, widths) - 1 - np.arange(total)
+    bits: NDArray[Any] = np.repeat(numbers, widths) >> following & 1
+    return np.packbits(bits.astype(np.uint8)).tobytes()
