@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from agent.detour import Detour
 from agent.fix import Fix
 from agent.follower import Follower, Progress
 from agent.follower_settings import FollowerSettings
+from agent.headway import Headway
 from agent.lookout import Expected, Lookout, LookoutSettings
 from agent.mapper import Mapper
-from agent.observation import Observation, Odometry, RobotDescription
+from agent.node_servo import NodeServo
+from agent.observation import Command, Observation, Odometry, RobotDescription
+from agent.servo.step import ServoStep
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.camera import Camera
@@ -117,3 +122,35 @@ def test_nodes_are_found_where_they_are_expected_only(walls, node):
     found = lookout.find(image, [Expected(7, node, elsewhere), Expected(3, node, elsewhere, doubt=2.0)])
     assert found is not None
     assert found[0] == 3
+
+
+def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypatch):
+    """It once stood before an obstacle for as long as anybody had patience, and the drive around had none."""
+    standing = ServoStep(Command(), "driving", None, "standing still to think the way over", 9)
+
+    def stand(servo: NodeServo, leg: int, *_: object) -> ServoStep:
+        servo.leg = leg
+        return standing
+
+    monkeypatch.setattr(NodeServo, "command", stand)
+    follower = follower_at_the_goal(node)
+    follower.fix.localizer.pose = PoseGaussian.from_sigmas(Pose2(-1.0, 0.0, 0.0), 0.002, 0.001)
+    dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
+    commands = [follower.step(Observation(k * 10**8, Odometry(0.0, 0.0), dark)) for k in range(140)]
+    moved = [command.forward > 0.0 for command in commands]
+    stood = round(FollowerSettings().stalled_parking / ROBOT.tick)
+    assert not any(moved[: stood - 1])
+    assert all(moved[stood + 2 : stood + 30])
+    assert follower.progress is Progress.DRIVING
+
+
+@given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=60))
+def test_headway_counts_since_the_robot_came_nearer(distances):
+    headway, best, since = Headway(), np.inf, 0
+    for distance in distances:
+        headway.take(distance, 0.1)
+        since += 1
+        if distance < best - headway.step:
+            best, since = distance, 0
+        assert headway.stood == pytest.approx(0.1 * since)
+        assert headway.best == best
