@@ -168,13 +168,13 @@ class FleetLink:
         except InvalidValue as unspeakable:
             return Answer(question.number, None, str(unspeakable))
         replies = self._bus.ask(key, payload, self._timeout)
-        error = NO_ANSWER if not replies else ""
+        error, retry_after = NO_ANSWER if not replies else "", 0.0
         for reply in replies:
             if reply.error:
-                error = reply.error
+                error, retry_after = reply.error, reply.retry_after or retry_after
                 continue
             try:
                 return Answer(question.number, decode_answer(question, reply.payload))
             except MapweaveError as refused:
                 error = str(refused)
-        return Answer(question.number, None, error)
+        return Answer(question.number, None, error, retry_after)

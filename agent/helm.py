@@ -64,13 +64,23 @@ class Helm:
     # Behaviours
 
     def ask(self, question: Question) -> Generator[Command, None, Answer]:
-        """Ask the fleet's map, and stand until the answer comes or is overdue."""
+        """Ask the fleet's map, and stand until the answer comes or is overdue.
+
+        A server that is busy says when it will not be, and is asked again then.
+        """
         self._questions.append(question)
+        answer, again = Answer(question.number, None, NO_ANSWER), math.inf
         for _ in range(self._patience):
             yield Command()
             if question.number in self._answers:
-                return self._answers.pop(question.number)
-        return Answer(question.number, None, NO_ANSWER)
+                answer = self._answers.pop(question.number)
+                if answer.content is not None or not answer.retry_after:
+                    return answer
+                again = self.now + answer.retry_after
+            if self.now >= again:
+                self._questions.append(question)
+                again = math.inf
+        return answer
 
     def stand(self, seconds: float) -> Behaviour:
         """Stand still."""

@@ -85,8 +85,16 @@ Question = WhereAmI | WhichWay | WhatIsKnown
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What came back. `content` is None when nobody answered; `error` says what is known of the reason."""
+    """What came back.
+
+    Attributes:
+        number: of the question.
+        content: None when nobody answered.
+        error: what is known of the reason then.
+        retry_after: seconds after which a server that was only busy may answer; else 0.
+    """
 
     number: int
     content: RelocalizeAnswer | RouteAnswer | KnownAnswer | None
     error: str = ""
+    retry_after: float = 0.0

@@ -175,7 +175,7 @@ class Search:
             return Answer(0, None, NO_ANSWER)
         answer = yield from self._helm.ask(WhereAmI(self._helm.number(), view))
         if answer.content is None:
-            self._silent_until = self._helm.now + self._settings.silence
+            self._silent_until = self._helm.now + (answer.retry_after or self._settings.silence)
         return answer
 
     def _contradicts(self, told: RelocalizeAnswer | None, own: tuple[Node, Recognition]) -> bool:

@@ -27,3 +27,16 @@ class DeviceError(MapweaveError):
 
 class NotConnected(MapweaveError):
     """No router, or nobody answers."""
+
+
+class Busy(MapweaveError):
+    """More is asked than can be answered at present; the same question may be asked again later.
+
+    Attributes:
+        retry_after: s.
+    """
+
+    def __init__(self, retry_after: float) -> None:
+        """Say when."""
+        super().__init__(f"busy, retry after {retry_after:.1f} s")
+        self.retry_after = retry_after

@@ -33,22 +33,29 @@ class Request(Protocol):
         """Answer. A second answer is ignored."""
         ...
 
-    def refuse(self, reason: str) -> None:
-        """Answer with an error that the asker can log."""
+    def refuse(self, reason: str, retry_after: float = 0.0) -> None:
+        """Answer with an error that the asker can log.
+
+        Args:
+            reason: in words.
+            retry_after: seconds after which the same question may be answered; 0: to ask again does not help.
+        """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One answer to a question. Exactly one of the two is set.
+    """One answer to a question. Exactly one of payload and error is set.
 
     Attributes:
         payload: the answer.
         error: why there is none.
+        retry_after: seconds after which a server that was only busy may answer; else 0.
     """
 
     payload: bytes = b""
     error: str = ""
+    retry_after: float = 0.0
 
 
 class Closing(Protocol):
@@ -76,7 +83,7 @@ class Bus(Protocol):
         ...
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
-        """Answer questions. A handler that raises MapweaveError refuses with its text."""
+        """Answer questions. A handler that raises MapweaveError refuses with its text; Busy, also with its time."""
         ...
 
     def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:

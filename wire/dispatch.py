@@ -13,13 +13,15 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from hybridmap.errors import MapweaveError
+from hybridmap.errors import Busy, MapweaveError
 from wire.bus import Request, Sample
 
 log = logging.getLogger(__name__)
 
 DEFAULT_LIMIT = 16384
 """Tasks that may wait: half a minute of a hundred robots at five messages a second."""
+FULL_PAUSE = 1.0
+"""After what time a question that found the queue full may be asked again, s."""
 
 
 class Dispatcher:
@@ -70,6 +72,8 @@ class Dispatcher:
                 return
             try:
                 handler(request)
+            except Busy as error:
+                request.refuse(str(error), error.retry_after)
             except MapweaveError as error:
                 request.refuse(str(error))
             except Exception as error:
@@ -80,7 +84,8 @@ class Dispatcher:
             self.refused += 1
             if self.refused & (self.refused - 1) == 0:
                 log.warning("slow handlers: %d questions refused so far", self.refused)
-            request.refuse("too busy, ask again later")
+            busy = Busy(FULL_PAUSE)
+            request.refuse(str(busy), busy.retry_after)
 
     def presence(
         self, handler: Callable[[str, bool], None], key: str, alive: bool, wanted: Callable[[], bool]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from wire.bus import Reply, Request, Sample
+from wire.refusal import decode_refusal, encode_refusal
 
 if TYPE_CHECKING:
     from wire.memory import MemoryBus
@@ -105,9 +106,9 @@ class MemoryRequest:
         """Answer; a second answer is ignored."""
         self._finish(Reply(payload=bytes(payload)))
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         """Answer with an error; a second answer is ignored."""
-        self._finish(Reply(error=reason or "refused"))
+        self._finish(decode_refusal(encode_refusal(reason, retry_after)))
 
     def abandon(self) -> None:
         """Nobody will answer: the server has closed."""

@@ -94,6 +94,6 @@ class _MeteredRequest:
         self._count(payload)
         self._request.reply(payload)
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         self._count(reason)
-        self._request.refuse(reason)
+        self._request.refuse(reason, retry_after)

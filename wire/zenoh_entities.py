@@ -14,11 +14,9 @@ from hybridmap.errors import NotConnected
 from wire.bus import Reply, Request, Sample
 from wire.dispatch import Dispatcher
 from wire.keyexpr import is_key
+from wire.refusal import decode_refusal, encode_refusal
 
 log = logging.getLogger(__name__)
-
-REFUSED = b"refused: "
-"""Marks an error reply that a handler made; all others are Zenoh's own, like its "Timeout"."""
 
 
 @dataclass
@@ -172,9 +170,9 @@ class ZenohRequest:
         """Answer; a second answer is ignored."""
         self._finish(lambda: self._query.reply(self._key, payload))
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         """Answer with an error; a second answer is ignored."""
-        self._finish(lambda: self._query.reply_err(REFUSED + (reason or "refused").encode()))
+        self._finish(lambda: self._query.reply_err(encode_refusal(reason, retry_after)))
 
     def abandon(self) -> None:
         """Nobody will answer: the bus closes."""
@@ -198,8 +196,5 @@ def read_reply(reply: zenoh.Reply) -> Reply | None:
     """What a server answered; None for what Zenoh says by itself."""
     if reply.ok is not None:
         return Reply(payload=reply.ok.payload.to_bytes())
-    payload = reply.err.payload.to_bytes() if reply.err is not None else b""
-    if not payload.startswith(REFUSED):
-        # Zenoh's own "Timeout": somebody has not answered, which the list shows by its length.
-        return None
-    return Reply(error=payload[len(REFUSED) :].decode(errors="replace"))
+    # Zenoh's own "Timeout" is none: somebody has not answered, which the list shows by its length.
+    return decode_refusal(reply.err.payload.to_bytes() if reply.err is not None else b"")

@@ -26,7 +26,7 @@ class Question:
     def reply(self, payload: bytes) -> None:
         self.answers.append(payload)
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         self.refusals.append(reason)
 
 

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import pytest
 
-from hybridmap.errors import InvalidValue, MapweaveError, NotConnected
+from hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected
 from wire.bus import Bus, Reply, Request, Sample
 from wire.bus_settings import BusSettings
 from wire.memory import MemoryBus, MemoryHub
@@ -245,6 +245,22 @@ def test_handlers_that_raise(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> 
         settle(asker, "expected")
         assert asker.ask("expected", b"", 3.0) == [Reply(error="the reason in words")]
         assert asker.ask("unexpected", b"", 3.0) == [Reply(error="internal error: ZeroDivisionError")]
+
+
+def test_a_busy_server_says_when_to_ask_again(fleet: Fleet) -> None:
+    asker, server = fleet.join(), fleet.join()
+
+    def raises(request: Request) -> None:
+        raise Busy(0.84)
+
+    server.serve("raises", raises)
+    server.serve("refuses", lambda request: request.refuse("busy, retry after 0.8 s", 0.84))
+    for key in ("raises", "refuses"):
+        settle(asker, key)
+        (reply,) = asker.ask(key, b"", 3.0)
+        assert reply.error == "busy, retry after 0.8 s"
+        assert reply.retry_after == pytest.approx(0.84)
+        assert not reply.payload
 
 
 def test_a_subscriber_that_raises_is_logged_and_goes_on(

@@ -131,12 +131,13 @@ class _Question:
 
     def __init__(self) -> None:
         self.refusal = ""
+        self.retry_after = 0.0
 
     def reply(self, payload: bytes) -> None:
         raise AssertionError("nobody replies here")
 
-    def refuse(self, reason: str) -> None:
-        self.refusal = reason
+    def refuse(self, reason: str, retry_after: float = 0.0) -> None:
+        self.refusal, self.retry_after = reason, retry_after
 
 
 def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
@@ -158,7 +159,7 @@ def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
         question = _Question()
         dispatcher.question(lambda _: None, question, lambda: True)
     dispatcher.presence(lambda key, alive: seen.append(f"{key} {alive}"), "token", True, lambda: True)
-    assert question.refusal == "too busy, ask again later"
+    assert (question.refusal, question.retry_after) == ("busy, retry after 1.0 s", 1.0)
     assert (dispatcher.lost, dispatcher.refused) == (3, 1)
     assert [record.levelname for record in caplog.records] == ["WARNING"] * 3, (
         "at 1 and 2 lost, and 1 refused"

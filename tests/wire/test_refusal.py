@@ -1,0 +1,44 @@
+"""Refusals as bytes: every word and number comes back, and whatever comes is read without harm."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wire.bus import Reply
+from wire.refusal import LONGEST_PAUSE, MARK, decode_refusal, encode_refusal
+
+
+@given(
+    st.text(min_size=1).filter(lambda t: "\0" not in t and t.isprintable()), st.floats(0, 2 * LONGEST_PAUSE)
+)
+def test_refusals_come_back(reason: str, retry_after: float) -> None:
+    reply = decode_refusal(encode_refusal(reason, retry_after))
+    assert reply is not None
+    assert reply.error == reason
+    assert reply.retry_after == pytest.approx(min(retry_after, LONGEST_PAUSE), rel=1e-6, abs=1e-37)
+
+
+def test_as_bytes() -> None:
+    """As docs/wire.md has it; the first is also what programs of before send."""
+    assert encode_refusal("no such node") == b"refused: no such node"
+    assert encode_refusal("busy", 0.5) == b"refused: busy\0\x00\x00\x00\x3f"
+    assert encode_refusal("") == b"refused: refused"
+
+
+@given(st.binary(max_size=40))
+def test_whatever_comes_is_a_refusal_or_none(data: bytes) -> None:
+    assert decode_refusal(data) is None or data.startswith(MARK)
+    reply = decode_refusal(MARK + data)
+    assert isinstance(reply, Reply)
+    assert reply.error
+    assert 0.0 <= reply.retry_after <= LONGEST_PAUSE
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -1.0, 1e9, 0.0])
+def test_a_pause_that_cannot_be_is_none(number: float) -> None:
+    reply = decode_refusal(MARK + b"busy\0" + struct.pack("<f", number))
+    assert reply == Reply(error="busy", retry_after=0.0)

@@ -1,0 +1,35 @@
+"""What goes back instead of an answer, as bytes: why, and when it is worth asking again."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+from wire.bus import Reply
+
+MARK = b"refused: "
+"""Begins a refusal that a handler made; all other errors are Zenoh's own, like its "Timeout"."""
+LONGEST_PAUSE = 3600.0
+"""Longest time after which somebody may be told to ask again, s."""
+_END = b"\0"
+
+
+def encode_refusal(reason: str, retry_after: float = 0.0) -> bytes:
+    """Encode a refusal.
+
+    Args:
+        reason: in words.
+        retry_after: seconds after which the same question may be answered; 0: to ask again does not help.
+    """
+    words = MARK + (reason or "refused").replace("\0", " ").encode(errors="replace")
+    return words + _END + struct.pack("<f", min(retry_after, LONGEST_PAUSE)) if retry_after > 0.0 else words
+
+
+def decode_refusal(data: bytes) -> Reply | None:
+    """What a server refused; None for what is no server's word."""
+    if not data.startswith(MARK):
+        return None
+    words, _, pause = data[len(MARK) :].partition(_END)
+    (seconds,) = struct.unpack("<f", pause) if len(pause) == 4 else (0.0,)
+    usable = math.isfinite(seconds) and 0.0 < seconds <= LONGEST_PAUSE
+    return Reply(error=words.decode(errors="replace") or "refused", retry_after=seconds if usable else 0.0)
