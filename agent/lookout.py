@@ -142,7 +142,7 @@ class Lookout:
         found = recognise_bearings(one.node, view, self._rng, s.bearings)
         if found is None or found.inliers <= s.more * one.tracked:
             return None
-        if not self._in_line(found.fixes[0], one):
+        if not any(self._in_line(fix, one) for fix in found.fixes):
             return None
         if one.held is not None:
             one.held.renew(features, found)

@@ -46,16 +46,16 @@ class Task:
     points: Array
 
 
-def draw_task(rng: np.random.Generator) -> Task:
-    """Twelve landmarks 1.5-5 m ahead of the goal and in its view, and a start behind the goal.
+def draw_task(rng: np.random.Generator, count: int = 12) -> Task:
+    """Landmarks 1.5-5 m ahead of the goal and in its view, and a start behind the goal.
 
     The start is 0.3-2.5 m off in the half-plane behind the goal (up to 10 cm ahead), its heading within 45
     degrees of the goal's, and sees at least six landmarks.
     """
     while True:
-        depth = rng.uniform(1.5, 5.0, 12)
-        bearing = rng.uniform(-SEMI_APERTURE, SEMI_APERTURE, 12)
-        height = CAMERA.mount_height + rng.uniform(-0.25, 0.25, 12)
+        depth = rng.uniform(1.5, 5.0, count)
+        bearing = rng.uniform(-SEMI_APERTURE, SEMI_APERTURE, count)
+        height = CAMERA.mount_height + rng.uniform(-0.25, 0.25, count)
         points = np.column_stack([depth, depth * np.tan(bearing), height])
         distance, direction = rng.uniform(0.3, 2.5), rng.uniform(-math.pi, math.pi)
         start = Pose2(
@@ -101,9 +101,16 @@ class Unicycle:
 class PoseFilter:
     """Estimates the robot's posture in goal from noisy wheels and noisy pixels of the known landmarks."""
 
-    def __init__(self, task: Task, rng: np.random.Generator) -> None:
-        """Begin with a rough guess, as after a relocalization; the first images mend it."""
+    def __init__(self, task: Task, rng: np.random.Generator, believed: Array | None = None) -> None:
+        """Begin with a rough guess, as after a relocalization; the first images mend it.
+
+        Args:
+            task: what is true.
+            rng: of the noise.
+            believed: (N, 3) m, landmarks as the map has them; exactly those of the task without.
+        """
         self._points, self._rng = task.points, rng
+        self._believed = task.points if believed is None else believed
         self._state = task.start.vector + rng.normal(0.0, [0.05, 0.05, 0.05])
         self._covariance = np.diag([0.05, 0.05, 0.05]) ** 2
         for _ in range(3):
@@ -136,7 +143,7 @@ class PoseFilter:
         prior, information = self._state, np.linalg.inv(self._covariance)
         state = prior
         for _ in range(3):
-            q = Pose2.from_vector(state).inverse().apply(self._points[seen])
+            q = Pose2.from_vector(state).inverse().apply(self._believed[seen])
             c, s = math.cos(state[2]), math.sin(state[2])
             # d q_x and d q_y by (x, y, heading), each (n, 3); q = R^T (p - t).
             one = np.ones(len(q))

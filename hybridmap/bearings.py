@@ -48,6 +48,7 @@ class BearingSettings:
         most_direction_sigma: a direction known no better than this is not known, rad.
         rounds: of Gauss-Newton.
         finalists: samples that are refined.
+        worse: as wrong matches a sample may have more than the best, as a share of all, to be refined.
         apart: two answers are different if their headings differ by more than this, rad.
         apart_direction: or their directions by more than this, rad.
     """
@@ -61,6 +62,7 @@ class BearingSettings:
     most_direction_sigma: float = 0.5
     rounds: int = 8
     finalists: int = 6
+    worse: float = 0.3
     apart: float = 0.1
     apart_direction: float = 0.4
 
@@ -136,9 +138,11 @@ def relate_all(
     A few landmarks near the camera's own height often leave two or three, which the next view tells apart.
     """
     s = settings or BearingSettings()
-    a, b = rays(pixels_a, camera_a), rays(pixels_b, camera_b)
-    if a.ndim != 2 or a.shape[1] != 2 or a.shape != b.shape or not np.isfinite([a, b]).all():
+    seen_a, seen_b = np.asarray(pixels_a, np.float64), np.asarray(pixels_b, np.float64)
+    fine = seen_a.shape == seen_b.shape == (len(seen_a), 2)
+    if not fine or not np.isfinite([seen_a, seen_b]).all():
         raise InvalidValue("bearings: pixels of two views must both be (N, 2), as many, and finite")
+    a, b = rays(seen_a, camera_a), rays(seen_b, camera_b)
     sigmas = s.pixel_sigma / np.array([camera_a.fx, camera_b.fx])
     if len(a) < max(s.least_inliers, 2):
         return []
@@ -194,7 +198,11 @@ def _best_samples(
     chosen[:, 1] = (chosen[:, 0] + 1 + chosen[:, 1] % (len(a) - 1)) % len(a)
     tried = two_point_solutions(a[chosen], b[chosen])
     kept: list[Array] = []
-    for k in np.argsort(_costs(a, b, tried, sigmas, s), kind="stable").tolist():
+    costs = _costs(a, b, tried, sigmas, s)
+    worst = float(costs.min()) + s.worse * s.gate * len(a)
+    for k in np.argsort(costs, kind="stable").tolist():
+        if costs[k] > worst:
+            break
         off = [np.abs(np.remainder(tried[k] - other + math.pi, 2.0 * math.pi) - math.pi) for other in kept]
         if all((o > (s.apart, s.apart_direction)).any() for o in off):
             kept.append(tried[k])

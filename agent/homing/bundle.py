@@ -13,6 +13,9 @@ from agent.homing.rays import Rays
 from agent.homing.sight import BEHIND, Sight, see
 from hybridmap.pose import Array, Pose2, PoseGaussian, wrap_angle
 
+USUAL_MISS = 3.0
+"""Half squared misses of a landmark, for each image of it, that chance hardly exceeds: 1 is expected."""
+
 
 @dataclass(frozen=True, eq=False)
 class Link:
@@ -46,7 +49,7 @@ class Normal:
         v: (N, 3, 3) of the landmarks.
         gradient: (3K,) of the postures.
         gradients: (N, 3) of the landmarks.
-        cost: half the squared misses, Huber's loss beyond the gate.
+        cost: half the squared misses, less than that where they are large.
         last_misses: (N,) sigma by which the last image misses; NaN where it shows nothing.
     """
 
@@ -99,18 +102,18 @@ class Bundle:
     huber: float
 
     def cost(self, frames: Keyframes, rays: Rays) -> float:
-        """Of an estimate: half the squared misses, Huber's loss beyond the gate."""
-        believed = 0.5 * float(((rays.off / rays.sigmas) ** 2).sum())
-        return self._loss(see(frames, rays, self.noise)) + believed + self._told(frames)
+        """Of an estimate: half the squared misses, less than that where they are large."""
+        losses, _, _ = self._judge(see(frames, rays, self.noise), rays)
+        return float(losses.sum()) + self._told(frames)
 
     def linearised(self, frames: Keyframes, rays: Rays) -> Normal:
         """Normal equations at an estimate."""
         sight = see(frames, rays, self.noise)
         by_posture, by_ray = sight.slopes(frames, rays, self.noise)
         k, n = len(frames.postures), len(rays.values)
-        weights = self._weights(sight)[..., None, None]
-        misses = sight.misses[..., None]
-        information = 1.0 / rays.sigmas**2
+        losses, trust, weights = self._judge(sight, rays)
+        weights, misses = weights[..., None, None], sight.misses[..., None]
+        information = trust[:, None] / rays.sigmas**2
 
         # (K, N, 2, 3) and (K, N, 2, 1) to one block a landmark: (N, 2K, ...).
         own, weighed, missed = (
@@ -128,7 +131,7 @@ class Bundle:
         for j in range(k):
             u[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] = blocks[j]
         gradient = (pulled * misses).sum(axis=(1, 2)).reshape(-1)
-        cost = self._loss(sight) + 0.5 * float((information * rays.off**2).sum())
+        cost = float(losses.sum())
         for link in self._links(frames):
             at = slice(link.column, link.column + link.jacobian.shape[1])
             pull = link.jacobian.T @ link.information
@@ -138,16 +141,22 @@ class Bundle:
         last = np.where(sight.shown[-1], np.linalg.norm(sight.misses[-1], axis=-1), np.nan)
         return Normal(u, w, v, gradient, gradients, cost, last)
 
-    def _weights(self, sight: Sight) -> Array:
-        """(K, N) Huber's, 0 where nothing is seen."""
-        length = np.linalg.norm(sight.misses, axis=-1)
-        weights: Array = np.where(sight.ahead, np.minimum(1.0, self.huber / np.maximum(length, 1e-9)), 0.0)
-        return weights
+    def _judge(self, sight: Sight, rays: Rays) -> tuple[Array, Array, Array]:
+        """How bad each landmark is (N,), how far it is believed (N,), and each of its sightings (K, N).
 
-    def _loss(self, sight: Sight) -> float:
+        One slipped pixel counts less by Huber's loss. A landmark that was matched wrongly is wrong in all
+        images alike: beyond what chance makes of its misses altogether, they count by their logarithm.
+        """
         length = np.linalg.norm(sight.misses, axis=-1)
-        losses = np.where(length <= self.huber, 0.5 * length**2, self.huber * (length - 0.5 * self.huber))
-        return float(losses.sum()) + BEHIND * float((sight.shown & ~sight.ahead).sum())
+        single = np.where(length <= self.huber, 0.5 * length**2, self.huber * (length - 0.5 * self.huber))
+        behind = BEHIND * (sight.shown & ~sight.ahead)
+        whole = (single + behind).sum(axis=0) + 0.5 * ((rays.off / rays.sigmas) ** 2).sum(axis=1)
+        usual = USUAL_MISS * (sight.shown.sum(axis=0) + 2.0)
+        excess = np.maximum(whole / usual, 1.0)
+        losses = np.where(excess > 1.0, usual * (1.0 + np.log(excess)), whole)
+        trust = 1.0 / excess
+        weights = np.where(sight.ahead, np.minimum(1.0, self.huber / np.maximum(length, 1e-9)), 0.0)
+        return losses, trust, weights * trust
 
     def _told(self, frames: Keyframes) -> float:
         """What prior and wheels cost."""

@@ -21,7 +21,7 @@ from hybridmap.pose import Array, Pose2, PoseGaussian
 NEAREST = 0.02
 """Depths, as a share of that at the place, below which a landmark is not believed to be ahead."""
 
-USUAL = 0.3
+USUAL = 0.1
 """Inverse depth before anything is seen, as a share of its standard deviation."""
 
 

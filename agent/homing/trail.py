@@ -50,7 +50,7 @@ class TrailSettings:
     recent: int = 4
     apart: float = 0.05
     apart_turn: float = 0.15
-    nearness: float = 1.0
+    nearness: float = 2.0
     rounds: int = 3
     first_rounds: int = 25
 

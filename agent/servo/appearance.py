@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.observation import Command, RobotDescription
+from agent.servo.follow import clip
 from agent.servo.laws import saturate
 from agent.servo.settings import ServoSettings
 from agent.servo.step import ServoStep
 from agent.servo.supervisor import Servo
-from hybridmap.pose import Array, PoseGaussian
+from hybridmap.pose import Array, Pose2, PoseGaussian
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +35,8 @@ class AppearanceSettings:
         least_seen: landmarks without which nothing is driven.
         lost_ticks: so many images in a row may show fewer before it is said.
         exact: an arrival known no better than this is told as such, m.
+        patience: s without getting nearer or surer after which a goal that is nearer than twice what is
+            known of it counts as reached: there is nothing more to see.
     """
 
     servo: ServoSettings = field(default_factory=lambda: ServoSettings(field_margin=0.08))
@@ -42,6 +45,7 @@ class AppearanceSettings:
     least_seen: int = 4
     lost_ticks: int = 10
     exact: float = 0.01
+    patience: float = 10.0
 
 
 class AppearanceServo:
@@ -53,6 +57,7 @@ class AppearanceServo:
         self._description = description
         self._servo = Servo(description, self.settings.servo)
         self._lost = 0
+        self._best, self._waited = math.inf, 0.0
 
     @property
     def switches(self) -> int:
@@ -62,6 +67,7 @@ class AppearanceServo:
     def start(self, goal_from_robot: PoseGaussian, points_in_goal: Array) -> bool:
         """Take a new goal; see Servo.start."""
         self._lost = 0
+        self._best, self._waited = math.inf, 0.0
         return self._servo.start(goal_from_robot.mean, points_in_goal)
 
     def command(
@@ -84,8 +90,11 @@ class AppearanceServo:
         if self._lost > s.lost_ticks:
             words = f"fewer than {s.least_seen} of the place's landmarks are in view"
             return ServoStep(Command(), "stuck", None, words, 0)
-        step = self._servo.command(pose, points_in_goal, visible, obstacles)
         left, sigma = math.hypot(pose.x, pose.y), self.spread(goal_from_robot)
+        self._wait(left + sigma)
+        if self._waited > s.patience and left < 2.0 * sigma and sigma > s.exact:
+            return self._face(pose, sigma)
+        step = self._servo.command(pose, points_in_goal, visible, obstacles)
         if step.state == "arrived":
             return self._arrived(step, sigma)
         if sigma > s.unsure * max(left, 0.05) and step.command.forward != 0.0:
@@ -103,6 +112,20 @@ class AppearanceServo:
     def spread(goal_from_robot: PoseGaussian) -> float:
         """Largest standard deviation of the position, m."""
         return math.sqrt(max(float(np.linalg.eigvalsh(goal_from_robot.covariance[:2, :2])[-1]), 0.0))
+
+    def _wait(self, off: float) -> None:
+        """Count for how long the goal has come no nearer, or been known no better: `off` m in all."""
+        if off < 0.9 * self._best:
+            self._best, self._waited = off, 0.0
+        self._waited += self._description.tick
+
+    def _face(self, pose: Pose2, sigma: float) -> ServoStep:
+        """Where bearings tell no position any more they still tell the heading."""
+        s = self.settings.servo
+        if abs(pose.heading) > s.heading_tolerance:
+            turn = clip(-s.turn_gain * pose.heading, self._description.max_turn)
+            return ServoStep(Command(0.0, turn), "turning", None, "turning to the goal's heading", 0)
+        return self._arrived(ServoStep(Command(), "arrived", None, "at the goal", 0), sigma)
 
     def _arrived(self, step: ServoStep, sigma: float) -> ServoStep:
         if sigma <= self.settings.exact:
