@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.ruling import Rulings
 from mapserver.placeindex import PlaceIndex
 from merge.candidates import CandidateSettings, Pair, choose_pairs
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap
 from merge.merging import MergeSettings, merge_maps
+from merge.undoing import undo
 from merge.verification import VerificationSettings, verify
 
 
@@ -68,6 +70,7 @@ class Merger:
         self._settings = settings or MergerSettings()
         self._overlaps: dict[Pair, float] = {}
         self._verdicts: dict[Pair, Link | RefusedLink] = {}
+        self._rulings = Rulings()
         self._merged = MergedMap.empty()
         self._dirty = False
 
@@ -99,19 +102,28 @@ class Merger:
             case EdgePut() | EdgeRetired():
                 pass
 
+    def rule(self, rulings: Rulings) -> None:
+        """Heed these rulings of people from now on, and no others."""
+        self._rulings = rulings
+        self._dirty = True
+
     def merged(self) -> MergedMap:
         """The merged map of all that has come; made anew only if something has changed."""
         if self._dirty:
             chosen = choose_pairs(self._overlaps, self._edges(), self._settings.candidates)
             self._verify(chosen)
             verdicts = [self._verdicts[pair] for pair in chosen]
-            self._merged = merge_maps(
+            undone = undo(
                 # Copies: a merged map stays as it was when later changes come.
                 {map_id: HybridMap(one.contents()) for map_id, one in self.maps.items()},
                 [verdict for verdict in verdicts if isinstance(verdict, Link)],
-                [verdict for verdict in verdicts if isinstance(verdict, RefusedLink)],
-                self._settings.merging,
+                self._rulings,
             )
+            refused = [verdict for verdict in verdicts if isinstance(verdict, RefusedLink)]
+            merged = merge_maps(
+                undone.maps, undone.links, [*refused, *undone.refused], self._settings.merging
+            )
+            self._merged = undone.completed(merged)
             self.counters.merges += 1
             self._dirty = False
         return self._merged

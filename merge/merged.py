@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from hybridmap.change import EdgePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.ruling import Rulings
 from merge.links import Link, RefusedLink
 from merge.posegraph import PoseGraph
 
@@ -38,6 +39,7 @@ class MergedMap:
         components: nodes that belong together, largest first.
         postures: of all nodes.
         graphs: the solved graph of each component, for covariances between nodes.
+        rulings: of people on what shall not be linked; the refused say which of them had anything to undo.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -46,6 +48,7 @@ class MergedMap:
     components: tuple[frozenset[NodeId], ...]
     postures: Mapping[NodeId, Placement]
     graphs: tuple[PoseGraph, ...] = ()
+    rulings: Rulings = field(default_factory=Rulings)
 
     @staticmethod
     def empty() -> MergedMap:

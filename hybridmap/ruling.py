@@ -1,0 +1,88 @@
+"""Rulings: what a person has decided of links, against or again with what the robots saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from hybridmap.errors import InvalidValue
+from hybridmap.node import MapId, NodeId
+
+Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
+"""Two nodes, or two maps; the smaller first."""
+
+MOST_WORDS = 300
+"""Characters of a reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ruling:
+    """That two nodes, or two maps, shall not be linked, or that they may be again.
+
+    Attributes:
+        ends: what it is about. Of two maps it holds for every link between them, also for those to come.
+        apart: whether they shall not be linked; False takes back what was ruled before.
+        who: has decided.
+        stamp_ns: when, wall time since 1970.
+        because: why, in that one's words; may be empty.
+    """
+
+    ends: Ends
+    apart: bool
+    who: str
+    stamp_ns: int
+    because: str = ""
+
+    def __post_init__(self) -> None:
+        """Put the ends in order.
+
+        Raises:
+            InvalidValue: no two different nodes or maps, or words that are no single printable line.
+        """
+        first, second = sorted(self.ends)
+        if len(first) != len(second) or first == second:
+            raise InvalidValue("a ruling needs two different nodes or two different maps")
+        for words in (self.who, self.because):
+            if len(words) > MOST_WORDS or not words.isprintable():
+                raise InvalidValue(
+                    f"who and why must be one printable line, at most {MOST_WORDS} characters"
+                )
+        object.__setattr__(self, "ends", (first, second))
+
+
+class Rulings:
+    """All rulings in the order in which they were made; of those about the same ends the last holds."""
+
+    def __init__(self, made: Iterable[Ruling] = ()) -> None:
+        """Take them over; the same one twice counts once."""
+        self.made = tuple(dict.fromkeys(made))
+        self._last = {ruling.ends: ruling for ruling in self.made}
+
+    def __add__(self, other: Rulings) -> Rulings:
+        """Both, by the time when they were made."""
+        return Rulings(sorted({*self.made, *other.made}, key=lambda r: (r.stamp_ns, r.ends, r.apart)))
+
+    @property
+    def in_force(self) -> tuple[Ruling, ...]:
+        """Those that keep something apart, in the order of their ends."""
+        return tuple(self._last[ends] for ends in sorted(self._last) if self._last[ends].apart)
+
+    def against(self, a: NodeId, b: NodeId) -> Ruling | None:
+        """The ruling by which two nodes shall not be linked; None if there is none in force."""
+        for ends in (_ordered(a, b), _ordered(a.map, b.map)):
+            found = self._last.get(ends)
+            if found is not None and found.apart:
+                return found
+        return None
+
+    def about(self, first: NodeId | MapId, second: NodeId | MapId) -> tuple[Ruling, ...]:
+        """Every ruling that was ever made of these two, or of the maps of these two nodes."""
+        ends = [_ordered(first, second)]
+        if isinstance(first, NodeId) and isinstance(second, NodeId):
+            ends.append(_ordered(first.map, second.map))
+        return tuple(ruling for ruling in self.made if ruling.ends in ends)
+
+
+def _ordered(a: NodeId | MapId, b: NodeId | MapId) -> Ends:
+    first, second = sorted((a, b))
+    return first, second  # type: ignore[return-value]

@@ -1,0 +1,90 @@
+"""Undoing: links that a person has ruled out take no part in the merge, and say who, when and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+from hybridmap.change import EdgePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
+from hybridmap.ruling import Ruling, Rulings
+from merge.claims import CLAIMS
+from merge.links import Link, RefusedLink, refuse, refuse_edge
+from merge.merged import MergedMap
+
+NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Undone:
+    """What is left to merge.
+
+    Attributes:
+        maps: without the claims that are ruled out; maps with none of these are the very same objects.
+        links: without those that are ruled out.
+        refused: what was taken away, with reasons.
+        whole: the maps as they came.
+        rulings: of people, in force or not.
+    """
+
+    maps: Mapping[MapId, HybridMap]
+    links: tuple[Link, ...]
+    refused: tuple[RefusedLink, ...]
+    whole: Mapping[MapId, HybridMap]
+    rulings: Rulings
+
+    def completed(self, merged: MergedMap) -> MergedMap:
+        """The merge of what was left, holding the maps as they came, so that a ruling can be taken back.
+
+        Args:
+            merged: the merge of `maps`, `links` and `refused`.
+        """
+        return replace(merged, maps=dict(sorted(self.whole.items())), rulings=self.rulings)
+
+
+def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Rulings) -> Undone:
+    """Take away what is ruled out: links, and what a robot itself claims to have recognised.
+
+    How a robot drove and turned while it mapped is measured and stands.
+
+    Args:
+        maps: by id; they are not changed.
+        links: verified.
+        rulings: of people.
+    """
+    kept: list[Link] = []
+    refused: list[RefusedLink] = []
+    for link in links:
+        ruling = rulings.against(*link.pair)
+        if ruling is None:
+            kept.append(link)
+        else:
+            refused.append(refuse(link, reason_of(ruling)))
+    if not rulings.in_force:
+        return Undone(maps, tuple(kept), (), maps, rulings)
+    left = dict(maps)
+    for map_id, one in maps.items():
+        out = [
+            (edge, ruling)
+            for edge in one.edges.values()
+            if edge.kind in CLAIMS and (ruling := rulings.against(edge.a, edge.b)) is not None
+        ]
+        if out:
+            gone = {edge.id for edge, _ in out}
+            refused += [refuse_edge(edge, reason_of(ruling)) for edge, ruling in out]
+            left[map_id] = HybridMap(
+                body for body in one.contents() if not (isinstance(body, EdgePut) and body.edge.id in gone)
+            )
+    return Undone(left, tuple(kept), tuple(refused), maps, rulings)
+
+
+def reason_of(ruling: Ruling) -> str:
+    """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
+    when = datetime.fromtimestamp(ruling.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    what = (
+        "" if len(ruling.ends[0]) == 3 else f" with all links between {ruling.ends[0]} and {ruling.ends[1]}"
+    )
+    why = f': "{ruling.because}"' if ruling.because else ""
+    return f"undone{what} by {ruling.who or 'somebody'} on {when}{why}"

@@ -1,0 +1,52 @@
+"""Rulings: the last one counts, the whole record stays."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridmap.errors import InvalidValue
+from hybridmap.node import MapId, NodeId
+from hybridmap.ruling import Ruling, Rulings
+
+A, B = NodeId("a", 1, 3), NodeId("b", 1, 5)
+
+
+def test_the_ends_are_put_in_order():
+    assert Ruling((B, A), True, "x", 0).ends == (A, B)
+    assert Ruling((B.map, A.map), True, "x", 0).ends == (A.map, B.map)
+
+
+@pytest.mark.parametrize(
+    ("ends", "who", "why"),
+    [((A, A), "x", ""), ((A, B.map), "x", ""), ((A, B), "x\ny", ""), ((A, B), "x", "w" * 301)],
+)
+def test_what_is_no_ruling_is_refused(ends, who, why):
+    with pytest.raises(InvalidValue):
+        Ruling(ends, True, who, 0, why)
+
+
+def test_a_ruling_on_maps_holds_for_all_their_nodes():
+    rulings = Rulings([Ruling((A.map, B.map), True, "anna", 1)])
+    assert rulings.against(A, B) is rulings.against(NodeId("b", 1, 99), NodeId("a", 1, 98)) is rulings.made[0]
+    assert rulings.against(A, NodeId("b", 2, 5)) is None
+    assert rulings.about(B, A) == rulings.about(MapId("b", 1), MapId("a", 1)) == rulings.made
+
+
+ends = st.sampled_from([(A, B), (A, NodeId("b", 1, 7)), (A.map, B.map)])
+
+
+@given(st.lists(st.tuples(ends, st.booleans()), max_size=8), st.integers(0, 8))
+def test_the_last_one_counts_however_the_record_is_put_together(made, cut):
+    """Against a replay into a plain dictionary; and two halves joined are the whole."""
+    rulings = [Ruling(e, apart, "x", k) for k, (e, apart) in enumerate(made)]
+    last = {}
+    for ruling in rulings:
+        last[ruling.ends] = ruling
+    whole = Rulings(rulings)
+    assert set(whole.in_force) == {r for r in last.values() if r.apart}
+    assert (Rulings(rulings[cut:]) + Rulings(rulings[:cut])).made == whole.made
+    assert (whole.against(B, A) is not None) == any(
+        r.apart for r in last.values() if r.ends in ((A, B), (A.map, B.map))
+    )
