@@ -177,11 +177,14 @@ class Cartographer:
         if self._last is not None:
             self._last.node_from_anchor = self._last.node_from_anchor @ moved
 
-    def drove(self, traverse: Traverse) -> list[ChangeBody]:
-        """Write down that the robot got from one node to another; returns the change, already applied."""
-        change = EdgePut(driven_edge(self.map, traverse, self._number))
-        self.map.apply(change)
-        return [change]
+    def drove(self, traverse: Traverse | None, refined: Node | None) -> list[ChangeBody]:
+        """Write down what a drive has measured; returns the changes, already applied."""
+        changes: list[ChangeBody] = [] if refined is None else [NodePut(refined)]
+        if traverse is not None:
+            changes.append(EdgePut(driven_edge(self.map, traverse, self._number)))
+        for change in changes:
+            self.map.apply(change)
+        return changes
 
     def _number(self) -> NodeId:
         number = NodeId(self._map_id.agent, self._map_id.epoch, self._next_number)

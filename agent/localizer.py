@@ -60,6 +60,8 @@ class Localizer:
         landmarks, seen = recognition.pairs[:, 0], recognition.pairs[:, 1]
         self._tracker.add(landmarks.astype(np.int64), features.raw[seen])
         self._strikes = np.zeros(len(node.landmarks), np.int64)
+        self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
+        self._teaches = True
         self._filter = self._filter_at(recognition.node_from_robot, landmarks.astype(np.int64))
 
     @property
@@ -83,8 +85,30 @@ class Localizer:
         return len(self._tracker.ids) >= self._settings.least and self._filter.healthy
 
     def restart(self, pose: PoseGaussian) -> None:
-        """Believe a posture that is known better than by what was tracked so far."""
+        """Believe a posture that is known better than by what was tracked so far.
+
+        By the same landmarks: so from then on they learn nothing from where the robot is.
+        """
+        self._note(np.ones(len(self._filter.ids), np.bool_))
+        self._teaches = False
         self._filter = self._filter_at(pose, self._tracker.ids)
+
+    def depths(self) -> tuple[Array, Array]:
+        """What the filter knows of the depths of all landmarks that were followed until they left the view.
+
+        Returns:
+            (N,) m, and standard deviations (N,) m by which they may be kept one by one, see NodeState.depths;
+            in the order of the node's landmarks, NaN for those that were not followed, or given up.
+        """
+        self._note(np.ones(len(self._filter.ids), np.bool_))
+        return self._depths.copy(), self._depth_sigmas.copy()
+
+    def _note(self, which: NDArray[np.bool_]) -> None:
+        """Keep the depths of some of the filter's landmarks."""
+        ids = self._filter.ids[which]
+        if self._teaches and self._filter.healthy:
+            depths, sigmas = self._filter.state.depths()
+            self._depths[ids], self._depth_sigmas[ids] = depths[which], sigmas[which]
 
     def step(self, observation: Observation) -> None:
         """One tick: predict by the wheels, follow the landmarks, correct."""
@@ -92,7 +116,10 @@ class Localizer:
         if observation.image is None:
             return
         self._tracker.track(observation.image, self._expected())
-        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, self._tracker.ids)])
+        gone = ~np.isin(self._filter.ids, self._tracker.ids)
+        if gone.any():
+            self._note(gone)
+            self._filter.remove(self._filter.ids[gone])
         ids = self._tracker.ids
         if len(ids):
             report = self._filter.update(ids, self._tracker.pixels)
@@ -100,6 +127,7 @@ class Localizer:
             bad = self._strikes[ids] >= self._settings.strikes
             if bad.any():
                 self._filter.remove(ids[bad])
+                self._depths[ids[bad]] = self._depth_sigmas[ids[bad]] = np.nan
                 self._tracker.keep(~bad)
 
     def _filter_at(self, pose: PoseGaussian, landmarks: NDArray[np.int64]) -> LocalizationFilter:

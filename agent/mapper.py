@@ -152,9 +152,9 @@ class Mapper:
         """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
         return self._tracking.converged_share
 
-    def drove(self, traverse: Traverse | None) -> list[ChangeBody]:
+    def drove(self, traverse: Traverse | None, refined: Node | None) -> list[ChangeBody]:
         """Take in what was measured on a drive while nothing was mapped; see Cartographer."""
-        return [] if traverse is None else self._cartographer.drove(traverse)
+        return self._cartographer.drove(traverse, refined)
 
     # One tick, and what ends an episode
 

@@ -18,13 +18,14 @@ from agent.helm import Behaviour, Helm
 from agent.mission import Answer, Question, WhichWay
 from agent.observation import Command, Observation, RobotDescription
 from agent.own_route import own_route
+from agent.refinement import Refinement, RefinementSettings
 from agent.search import Search, SearchSettings
 from agent.surveyor import Surveyor, SurveyorSettings, Traverse
 from agent.tally import Tally
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import NodeId
+from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import RouteAnswer, RouteLeg
 
@@ -42,6 +43,7 @@ class NavigatorSettings:
         detour: between nodes.
         blocks: how long it remembers where it could not get through.
         surveyor: what it measures on its way.
+        refinement: what it learns of landmarks.
         answer_patience: ticks that an answer may take before the question counts as lost.
         pause: seconds that it waits before what is in its way, and before it asks again for a route.
         trusted: after a block it still knows where it is if it has driven less than this blindly, m.
@@ -55,6 +57,7 @@ class NavigatorSettings:
     detour: DetourSettings = field(default_factory=DetourSettings)
     blocks: BlockSettings = field(default_factory=BlockSettings)
     surveyor: SurveyorSettings = field(default_factory=SurveyorSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
     answer_patience: int = 100
     pause: float = 2.0
     trusted: float = 1.0
@@ -83,6 +86,7 @@ class Navigator:
         legs: nodes on the first route that was given.
         tally: what the drive was made of so far.
         traverse: from one node to another, if the last step has ended one.
+        refined: a node of the own map as it is known better after the last step, if it is.
     """
 
     def __init__(
@@ -103,6 +107,7 @@ class Navigator:
         self.legs = 0
         self.tally = Tally()
         self.traverse: Traverse | None = None
+        self.refined: Node | None = None
         self._description = description
         self._lens = lens
         self._sift = sift
@@ -114,6 +119,7 @@ class Navigator:
         self._search = Search(description, lens, sift, own_map, self._helm, s.search, self._rng)
         self._blocks = Blocks(s.blocks)
         self._surveyor = Surveyor(description, s.surveyor)
+        self._refinement = Refinement(own_map, s.refinement)
         self._believed: Pose2 | None = None
         self._vain_looks = 0
         self._goal_hidden = False
@@ -132,7 +138,9 @@ class Navigator:
         if self.fix is not None and not self._following:
             self.fix.follow(observation, self._description)
         command = next(self._behaviour)
-        self.traverse = self._surveyor.see(None if self._searching else self.fix, observation)
+        known = None if self._searching else self.fix
+        self.traverse = self._surveyor.see(known, observation)
+        self.refined = self._refinement.see(None if self.arrived else known)
         if self._searching:
             self.detail = self._search.detail
         return command, self._helm.questions()

@@ -196,7 +196,7 @@ class Pipeline:
                 command, changes, questions = self._map(observation, answers)
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers)
-                changes = self._mapper.drove(self._navigator.traverse)
+                changes = self._mapper.drove(self._navigator.traverse, self._navigator.refined)
         safe, warning = guard(command, observation.proximity, self._description)
         if observation.bumped and safe.forward * self._direction > 0:
             safe, warning = Command(0.0, safe.turn), "stopped: the bumper is pressed"

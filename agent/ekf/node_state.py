@@ -56,6 +56,24 @@ class NodeState:
         blocks = self.covariance[3:, 3:].reshape(n, 3, n, 3)[index, :, index, :]
         return points, by_ray @ blocks @ np.swapaxes(by_ray, 1, 2)
 
+    def depths(self) -> tuple[Array, Array]:
+        """Depths of the landmarks at the node, and standard deviations by which they may be kept one by one.
+
+        What images teach of the depths is common to many of them. Kept without their correlations they would
+        be believed to err independently, and the next drive would learn too much from them. Independent
+        errors that are together no smaller than the joint ones have the standard deviations
+        sigma_i sqrt(sum_j |rho_ij|): their covariance less the joint one is diagonally dominant.
+
+        Returns:
+            (n,) m along the optical axis, infinite where w <= 0; (n,) m.
+        """
+        w, joint = self.rays[:, 2], self.covariance[5::3, 5::3]
+        ahead = w > 0.0
+        depths = np.where(ahead, 1.0 / np.where(ahead, w, 1.0), np.inf)
+        sigmas = np.sqrt(np.maximum(np.diag(joint), 1e-300))
+        common = np.abs(joint / np.outer(sigmas, sigmas)).sum(axis=1)
+        return depths, np.where(ahead, depths**2, np.inf) * sigmas * np.sqrt(common)
+
     def stepped(self, step: Array) -> tuple[Array, Array]:
         """Posture and rays after a step (3 + 3n,) of the state; the slopes b stay."""
         rays = self.rays.copy()
