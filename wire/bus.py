@@ -83,7 +83,7 @@ class Bus(Protocol):
         ...
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
-        """Answer questions. A handler that raises MapweaveError refuses with its text; Busy, also with its time."""
+        """Answer questions. A handler that raises MapweaveError refuses with its text, and Busy its time."""
         ...
 
     def ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:

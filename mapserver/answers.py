@@ -1,0 +1,34 @@
+"""What questions are answered from between two merges: one merged map, and who reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mapserver.known import Known
+from mapserver.merger import Merger
+from mapserver.relocalization import Relocalizer
+from mapserver.routes import Router
+from merge.merged import MergedMap
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """Never changed, only replaced: whoever answers keeps what it began with, whatever is merged meanwhile.
+
+    Attributes:
+        merged: the map.
+        relocalizer: says where a view was taken.
+        router: says how to get somewhere.
+        known: says what others have mapped.
+    """
+
+    merged: MergedMap
+    relocalizer: Relocalizer
+    router: Router
+    known: Known
+
+    @classmethod
+    def of(cls, merger: Merger, merged: MergedMap) -> Answers:
+        """Answers from a merged map; nodes that are newer are recognised, but lie nowhere yet."""
+        relocalizer = Relocalizer(merger.index, merger.node, merged)
+        return cls(merged, relocalizer, Router(merged), Known(merged))

@@ -1,0 +1,123 @@
+"""Workers for questions that take long. Whoever would wait too long is told at once when to come again."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+from hybridmap.errors import Busy
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class DeskSettings:
+    """How questions are shared out.
+
+    Attributes:
+        workers: threads; 0: whoever asks does the work itself, one after the other and without a limit.
+        longest_wait: a question that would wait longer for a worker is refused, s.
+        first_guess: how long a question takes, before any was answered, s.
+        smoothing: weight of the newest question in the mean time that one takes.
+        longest_pause: nobody is sent away for longer, s.
+    """
+
+    workers: int = min(os.cpu_count() or 1, 4)
+    longest_wait: float = 0.5
+    first_guess: float = 0.03
+    smoothing: float = 0.1
+    longest_pause: float = 10.0
+
+
+class Desk:
+    """A pool of workers with a queue that is never longer than can be worked off in time.
+
+    Those who are refused get appointments one after the other, so that a crowd does not come back as a crowd.
+    """
+
+    def __init__(
+        self, settings: DeskSettings | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Start the workers.
+
+        Args:
+            settings: how many, and what is too long.
+            clock: tells the time, s.
+        """
+        self._settings = settings or DeskSettings()
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._open = 0
+        self._answered = 0
+        self._refused = 0
+        self._seconds = self._settings.first_guess
+        self._appointment = -float("inf")
+        workers = self._settings.workers
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="desk") if workers else None
+
+    def submit(self, work: Callable[[], _T]) -> Future[_T]:
+        """Have something done.
+
+        Returns:
+            Its result, or what it raised, some time later.
+
+        Raises:
+            Busy: it would wait too long; nothing was done.
+        """
+        if self._pool is None:
+            done: Future[_T] = Future()
+            try:
+                done.set_result(self._timed(work))
+            except Exception as error:  # noqa: BLE001 - goes to whoever asks for the result, as a worker's does
+                done.set_exception(error)
+            return done
+        with self._lock:
+            wait = self._wait()
+            if wait > self._settings.longest_wait:
+                self._refused += 1
+                raise Busy(self._next_appointment(wait))
+            self._open += 1
+        return self._pool.submit(self._timed, work)
+
+    def counters(self) -> dict[str, int | float]:
+        """Questions answered and refused so far, those open now, and how long one takes, ms."""
+        with self._lock:
+            return {
+                "answered": self._answered,
+                "busy": self._refused,
+                "open": self._open,
+                "answer_ms": round(1e3 * self._seconds, 1),
+            }
+
+    def close(self) -> None:
+        """Finish what was taken on. Twice is no error."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def _wait(self) -> float:
+        """How long a question that comes now would wait for a worker, s."""
+        workers = self._settings.workers
+        return max(self._open - workers + 1, 0) * self._seconds / workers
+
+    def _next_appointment(self, wait: float) -> float:
+        """In how many seconds somebody may come again: when the queue is half empty, behind all others."""
+        s, now = self._settings, self._clock()
+        first = now + wait - 0.5 * s.longest_wait
+        self._appointment = max(self._appointment, first) + self._seconds / s.workers
+        self._appointment = min(self._appointment, now + s.longest_pause)
+        return self._appointment - now
+
+    def _timed(self, work: Callable[[], _T]) -> _T:
+        began = self._clock()
+        try:
+            return work()
+        finally:
+            with self._lock:
+                self._open -= self._pool is not None
+                self._answered += 1
+                self._seconds += self._settings.smoothing * (self._clock() - began - self._seconds)

@@ -1,0 +1,122 @@
+"""Robots' questions over the bus. Where a view was taken is for the desk to find out; the rest is quick."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from hybridmap.errors import Busy, MapweaveError
+from mapserver.answers import Answers
+from mapserver.blockages import Blockages
+from mapserver.desk import Desk
+from wire.bus import Bus, Closing, Request
+from wire.keys import Keys
+from wire.log_messages import Scalar, encode_record
+from wire.mapfile import MapFile, pack_map_file
+from wire.messages import (
+    decode_known_request,
+    decode_route_request,
+    decode_view,
+    encode_known_answer,
+    encode_relocalize_answer,
+    encode_route_answer,
+)
+
+log = logging.getLogger(__name__)
+
+Handler = Callable[[bytes], bytes]
+
+
+class Services:
+    """Declared on a bus until closed."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        name: str,
+        answers: Callable[[], Answers],
+        desk: Desk,
+        blockages: Blockages,
+        status: Callable[[], dict[str, Scalar]],
+    ) -> None:
+        """Begin to answer.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            name: of the server in the fleet.
+            answers: the newest ones. May wait for them.
+            desk: for questions that take long.
+            blockages: takes note of where robots did not get through.
+            status: of the server.
+        """
+        self._answers = answers
+        self._desk = desk
+        self._blockages = blockages
+        self._status = status
+        self._turn = threading.Lock()
+        self._closing: list[Closing] = [
+            bus.serve(keys.relocalize(name), self._relocalize_later),
+            bus.serve(keys.route(name), guarded(self._route)),
+            bus.serve(keys.known(name), guarded(self._known)),
+            bus.serve(keys.server_map(name), guarded(self._map)),
+            bus.serve(keys.server_status(name), guarded(self._tell_status)),
+            bus.announce(keys.server_alive(name)),
+        ]
+
+    def close(self) -> None:
+        """Stop answering."""
+        for closing in self._closing:
+            closing.close()
+
+    def _relocalize_later(self, request: Request) -> None:
+        self._desk.submit(lambda: guarded(self._relocalize)(request))
+
+    def _relocalize(self, payload: bytes) -> bytes:
+        view = decode_view(payload)
+        return encode_relocalize_answer(self._answers().relocalizer.answer(view))
+
+    def _route(self, payload: bytes) -> bytes:
+        request = decode_route_request(payload)
+        answers = self._answers()
+        with self._turn:
+            self._blockages.report(request.blocked, time.monotonic())
+            wary = self._blockages.known(time.monotonic())
+        answer = answers.router.route(
+            request.start, request.goal, request.blocked, wary, request.start_from_robot
+        )
+        return encode_route_answer(answer)
+
+    def _known(self, payload: bytes) -> bytes:
+        request = decode_known_request(payload)
+        answer = self._answers().known.answer(request.map, (request.x, request.y), request.reach)
+        return encode_known_answer(answer)
+
+    def _map(self, payload: bytes) -> bytes:
+        merged = self._answers().merged
+        changes = tuple(merged.union().contents())
+        return pack_map_file(MapFile("merged", merged.summary(), changes, dict(merged.postures)))
+
+    def _tell_status(self, payload: bytes) -> bytes:
+        self._answers()
+        return encode_record(self._status())
+
+
+def guarded(answer: Handler) -> Callable[[Request], None]:
+    """Answer, or refuse with the reason: an asker must never wait for its time to run out."""
+
+    def handle(request: Request) -> None:
+        try:
+            request.reply(answer(request.payload))
+        except Busy as error:
+            request.refuse(str(error), error.retry_after)
+        except MapweaveError as error:
+            request.refuse(str(error))
+        except Exception as error:  # a defect here must not leave a robot waiting
+            log.exception("no answer to %s", request.key)
+            request.refuse(f"the server failed: {error}")
+
+    return handle

@@ -1,0 +1,97 @@
+"""Keeps the answers up to date: a thread of its own takes changes in and makes the merged map anew."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+
+from hybridmap.change import Change
+from hybridmap.errors import MapweaveError
+from mapserver.answers import Answers
+from mapserver.merger import Merger
+from mapserver.shared_index import SharedPlaceIndex
+from merge.merged import MergedMap
+
+log = logging.getLogger(__name__)
+
+
+class Upkeep:
+    """Merges beside the questions. Only its thread touches the merger; done answers replace those before."""
+
+    def __init__(self, share: float, by_itself: bool = True) -> None:
+        """Begin with nothing.
+
+        Args:
+            share: at most this share of the time is spent making the merged map anew.
+            by_itself: merge whenever there is something new; else only when somebody waits for it.
+        """
+        self._share = share
+        self._by_itself = by_itself
+        self._merger = Merger(SharedPlaceIndex())
+        self._changes: queue.SimpleQueue[Change | threading.Event | None] = queue.SimpleQueue()
+        self._answers = Answers.of(self._merger, MergedMap.empty())
+        self._dirty = False
+        self._thread = threading.Thread(target=self._work, name="merge", daemon=True)
+
+    @property
+    def answers(self) -> Answers:
+        """From the newest merged map."""
+        return self._answers
+
+    @property
+    def settled(self) -> bool:
+        """Whether everything that has come is merged."""
+        return not self._dirty and self._changes.empty()
+
+    def start(self) -> None:
+        """Begin to merge."""
+        self._thread.start()
+
+    def take(self, change: Change) -> None:
+        """Take note of a change, in the order of its log. Returns at once."""
+        self._changes.put(change)
+
+    def settle(self, timeout: float) -> bool:
+        """Wait until everything that came before this call is merged; False if the time is over first."""
+        merged = threading.Event()
+        self._changes.put(merged)
+        return merged.wait(timeout)
+
+    def close(self) -> None:
+        """Stop after what has come."""
+        self._changes.put(None)
+        self._thread.join(30.0)
+
+    def _work(self) -> None:
+        rest_until = 0.0
+        while True:
+            pause = max(rest_until - time.monotonic(), 0.0)
+            try:
+                waits = self._dirty and self._by_itself
+                change = self._changes.get(timeout=pause + 0.02 if waits else None)
+            except queue.Empty:
+                began = time.monotonic()
+                self._merge()
+                spent = time.monotonic() - began
+                rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
+                continue
+            if change is None:
+                return
+            if isinstance(change, threading.Event):
+                if self._dirty:
+                    self._merge()
+                change.set()
+                continue
+            try:
+                self._merger.on_change(change)
+            except MapweaveError as error:
+                log.warning("change %s of %s is not merged: %s", change.sequence, change.map, error)
+            self._dirty = True
+            if time.monotonic() > rest_until + 2.0:
+                rest_until = time.monotonic()
+
+    def _merge(self) -> None:
+        self._dirty = False
+        self._answers = Answers.of(self._merger, self._merger.merged())

@@ -1,0 +1,65 @@
+"""A small fleet's store, and views of the same rooms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.query import View
+from hybridmap.synthetic import World, room, take_map, take_view
+from mapserver.entry import Entry
+from mapserver.store import Store
+from wire.codec import encode_change
+
+ROBOT = MapId("r0", 1)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedRoom:
+    """A room that one robot has mapped, as its map server's store holds it.
+
+    Attributes:
+        path: of the store.
+        world: the room.
+        truth: where each node was made.
+    """
+
+    path: Path
+    world: World
+    truth: dict[NodeId, Pose2]
+
+    def view(self, node: NodeId, seed: int = 5) -> View:
+        """What is seen a little beside a node."""
+        posture = self.truth[node] @ Pose2(0.1, 0.05, 0.05)
+        return take_view(self.world, posture, np.random.default_rng(seed))[0]
+
+
+@pytest.fixture(scope="session")
+def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], MappedRoom]:
+    """Makes a store anew at each call."""
+    rng = np.random.default_rng(4)
+    world = room(0, 0, 5, 4, 600, rng)
+    stops = [Pose2(2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for k in range(7)]
+    nodes, edges = take_map(world, ROBOT, stops, rng)
+    truth = {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
+    bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+    entries = [
+        Entry.read(ROBOT, k + 1, encode_change(Change(ROBOT, k + 1, 0, body)))
+        for k, body in enumerate(bodies)
+    ]
+
+    def make() -> MappedRoom:
+        path = tmp_path_factory.mktemp("store") / "s0.sqlite"
+        store = Store(path)
+        store.apply(ROBOT, 7, entries, len(entries))
+        store.close()
+        return MappedRoom(path, world, truth)
+
+    return make

@@ -1,0 +1,209 @@
+"""Questions beside each other: one that takes long, and a long merge, hold up nobody."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, View
+from hybridmap.synthetic import take_node
+from mapserver.desk import DeskSettings
+from mapserver.merger import Merger
+from mapserver.relocalization import Relocalizer
+from mapserver.server import MapServer, ServerSettings
+from mapserver.shared_index import SharedPlaceIndex
+from wire.bus import Reply
+from wire.keys import Keys
+from wire.log_messages import decode_record
+from wire.memory import MemoryBus, MemoryHub
+from wire.messages import (
+    KnownRequest,
+    RouteRequest,
+    decode_relocalize_answer,
+    decode_route_answer,
+    encode_known_request,
+    encode_route_request,
+    encode_view,
+)
+
+KEYS = Keys("fleet")
+
+
+class Served:
+    """A map server with a mapped room, and somebody who asks."""
+
+    def __init__(self, room, lockstep: bool = False) -> None:
+        self.room = room
+        hub = MemoryHub()
+        self.bus, self.asker = MemoryBus(hub), MemoryBus(hub)
+        desk = DeskSettings(workers=2, longest_wait=0.2, first_guess=0.1)
+        settings = ServerSettings(lockstep=lockstep, desk=desk)
+        self.server = MapServer(self.bus, KEYS, room.path, "s0", settings)
+        self.nodes = sorted(room.truth)
+
+    def __enter__(self) -> Served:
+        self.server.__enter__()
+        assert self.server.settle(20)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.server.__exit__(None, None, None)
+        self.asker.close()
+        self.bus.close()
+
+    def where(self, node: NodeId | None = None, seed: int = 5) -> Reply:
+        view = self.room.view(node or self.nodes[2], seed)
+        (reply,) = self.asker.ask(KEYS.relocalize("s0"), encode_view(view), 20.0)
+        return reply
+
+    def quick_ones(self) -> None:
+        """Everything but where a view was taken, with its answer looked at."""
+        request = encode_route_request(RouteRequest(self.nodes[0], self.nodes[-1]))
+        (route,) = self.asker.ask(KEYS.route("s0"), request, 5.0)
+        assert decode_route_answer(route.payload).legs
+        (known,) = self.asker.ask(
+            KEYS.known("s0"), encode_known_request(KnownRequest(self.nodes[0].map, 0, 0, 9)), 5.0
+        )
+        assert not known.error
+        (status,) = self.asker.ask(KEYS.server_status("s0"), b"", 5.0)
+        assert decode_record(status.payload)["nodes"] == len(self.nodes)
+
+
+@pytest.fixture
+def served(mapped_room) -> Iterator[Served]:
+    with Served(mapped_room()) as served:
+        yield served
+
+
+class Gate:
+    """Holds up calls of a method until it is opened."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> None:
+        self.open = threading.Event()
+        self.entered = threading.Semaphore(0)
+        real = getattr(owner, name)
+
+        def held(*arguments: object) -> object:
+            self.entered.release()
+            assert self.open.wait(20)
+            return real(*arguments)
+
+        monkeypatch.setattr(owner, name, held)
+
+
+def test_slow_questions_hold_up_nobody_and_what_is_too_much_is_refused(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = Gate(monkeypatch, Relocalizer, "answer")
+    with ThreadPoolExecutor(12) as askers:
+        waiting = [askers.submit(served.where) for _ in range(12)]
+        for _ in range(2):
+            assert gate.entered.acquire(timeout=10)
+        served.quick_ones()
+        # Two are worked on, and four more fit into 0.2 s at 0.1 s each for two workers.
+        while served.server.status()["busy"] != 6:
+            time.sleep(0.01)
+        gate.open.set()
+        replies = [future.result(20) for future in waiting]
+    refused = [reply for reply in replies if reply.error]
+    assert len(refused) == 6
+    for reply in refused:
+        assert reply.error == f"busy, retry after {reply.retry_after:.1f} s"
+        assert 0.0 < reply.retry_after < 1.0
+    for reply in replies:
+        if not reply.error:
+            assert decode_relocalize_answer(reply.payload).certainty is Certainty.FOUND
+    assert served.server.status()["answered"] == 6
+
+
+def test_a_long_merge_holds_up_no_question(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = Gate(monkeypatch, Merger, "merged")
+    served.server._upkeep._dirty = True
+    settling = threading.Thread(target=served.server.settle, args=(20.0,))
+    settling.start()
+    assert gate.entered.acquire(timeout=10)
+    assert decode_relocalize_answer(served.where().payload).certainty is Certainty.FOUND
+    served.quick_ones()
+    assert settling.is_alive()
+    gate.open.set()
+    settling.join(20)
+
+
+def test_every_node_is_found_by_many_at_once(served: Served) -> None:
+    """The same questions one after the other and all at once have the same answers."""
+    questions = [(node, seed) for node in served.nodes for seed in (1, 2)]
+    alone = [served.where(*question).payload for question in questions]
+    with ThreadPoolExecutor(2) as askers:
+        together = [reply.payload for reply in askers.map(lambda q: served.where(*q), questions)]
+    assert together == alone
+    for (node, _), payload in zip(questions, alone, strict=True):
+        answer = decode_relocalize_answer(payload)
+        assert answer.certainty is Certainty.FOUND
+        best = answer.candidates[0]
+        true = served.room.truth[best.node].inverse() @ served.room.truth[node]
+        # The view is taken 0.11 m beside the node.
+        assert true.distance(best.node_from_robot.mean) < 0.25
+
+
+def test_in_lockstep_questions_are_answered_one_after_the_other(mapped_room) -> None:
+    with Served(mapped_room(), lockstep=True) as served, ThreadPoolExecutor(20) as askers:
+        replies = [future.result(20) for future in [askers.submit(served.where) for _ in range(20)]]
+    assert {reply.error for reply in replies} == {""}
+    assert len({reply.payload for reply in replies}) == 1
+
+
+def test_what_is_wrong_is_said_and_costs_no_worker(
+    served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (reply,) = served.asker.ask(KEYS.relocalize("s0"), b"garbage", 5.0)
+    assert reply.error.startswith("view:")
+    assert reply.retry_after == 0.0
+
+    def broken(self: Relocalizer, view: View) -> RelocalizeAnswer:
+        raise ZeroDivisionError("a defect")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Relocalizer, "answer", broken)
+        for _ in range(5):
+            assert served.where().error == "the server failed: a defect"
+    assert "no answer to" in caplog.text
+    assert not served.where().error
+
+
+def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
+    """Against the same index that nobody else touches."""
+    room = mapped_room()
+    rng = np.random.default_rng(9)
+    posture = room.truth[min(room.truth)]
+    template = take_node(room.world, NodeId("x", 1, 0), posture, PoseGaussian(Pose2(), np.zeros((3, 3))), rng)
+    index = SharedPlaceIndex()
+    stop = threading.Event()
+    view = room.view(min(room.truth))
+
+    def search() -> None:
+        while not stop.is_set():
+            assert all(score > 0 for _, score in index.query(view, 5))
+
+    with ThreadPoolExecutor(3) as pool:
+        searches = [pool.submit(search) for _ in range(3)]
+        for number in range(120):
+            index.add(replace(template, id=NodeId("x", 1, number)))
+            if number % 3 == 2:
+                index.remove(NodeId("x", 1, number - 1))
+        stop.set()
+        for one in searches:
+            one.result(20)
+    alone = SharedPlaceIndex()
+    for number in range(120):
+        if number % 3 != 1:
+            alone.add(replace(template, id=NodeId("x", 1, number)))
+    assert len(index) == 80
+    assert {n for n, _ in index.query(view, 80)} == {n for n, _ in alone.query(view, 80)}
