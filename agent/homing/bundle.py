@@ -2,41 +2,72 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agent.homing.keyframes import Keyframes
 from agent.homing.rays import Rays
 from agent.homing.sight import BEHIND, Sight, see
-from hybridmap.pose import Array, Pose2, PoseGaussian, wrap_angle
+from hybridmap.pose import Array, PoseGaussian
 
 USUAL_MISS = 3.0
 """Half squared misses of a landmark, for each image of it, that chance hardly exceeds: 1 is expected."""
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
-    """What the prior says of the first posture, or the wheels of two that follow each other.
+class Chain:
+    """What the prior says of the first posture, and the wheels of each and the one before it.
 
     Attributes:
-        residual: (3,) m, m, rad.
-        jacobian: (3, 3 or 6) by the posture or both.
-        information: (3, 3) inverse covariance of the residual.
-        column: of the first posture's x in the state.
+        residuals: (K, 3) m, m, rad; of the prior first.
+        by_before: (K, 3, 3) by the posture before; 0 for the prior.
+        by_after: (K, 3, 3) by the posture itself.
+        information: (K, 3, 3) inverse covariances of the residuals.
     """
 
-    residual: Array
-    jacobian: Array
+    residuals: Array
+    by_before: Array
+    by_after: Array
     information: Array
-    column: int
+
+    @staticmethod
+    def of(frames: Keyframes, prior: PoseGaussian) -> Chain:
+        """Between the postures of a way; a step's covariance is in the axes at its end."""
+        means = np.array([prior.mean.vector, *(step.mean.vector for step in frames.steps)])
+        covariances = np.array([prior.covariance, *(step.covariance for step in frames.steps)])
+        before = np.vstack([np.zeros(3), frames.postures[:-1]])
+        back = _turns(-before[:, 2])
+        ways = (back @ (frames.postures - before)[:, :, None])[:, :, 0]
+        residuals = ways - means
+        residuals[:, 2] = np.remainder(residuals[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+        by_before = -back
+        by_before[:, 0, 2], by_before[:, 1, 2] = ways[:, 1], -ways[:, 0]
+        by_before[0] = 0.0
+        end = _turns(means[:, 2])
+        spread = end @ covariances @ end.transpose(0, 2, 1) + 1e-12 * np.eye(3)
+        return Chain(residuals, by_before, back, np.asarray(np.linalg.inv(spread), np.float64))
 
     @property
     def cost(self) -> float:
-        """Half its squared miss."""
-        return 0.5 * float(self.residual @ self.information @ self.residual)
+        """Half the squared misses."""
+        return 0.5 * float((self.residuals * self._pulls).sum())
+
+    @property
+    def _pulls(self) -> Array:
+        return (self.information @ self.residuals[:, :, None])[:, :, 0]
+
+    def add_to(self, u: Array, gradient: Array) -> None:
+        """Add normal equations to (3K, 3K) and (3K,) of the postures."""
+        pulls = self._pulls
+        for j, (before, after, information) in enumerate(
+            zip(self.by_before, self.by_after, self.information, strict=True)
+        ):
+            first = max(3 * j - 3, 0)
+            at = slice(first, 3 * j + 3)
+            jacobian = np.hstack([before, after]) if j else after
+            u[at, at] += jacobian.T @ information @ jacobian
+            gradient[at] += jacobian.T @ pulls[j]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +135,7 @@ class Bundle:
     def cost(self, frames: Keyframes, rays: Rays) -> float:
         """Of an estimate: half the squared misses, less than that where they are large."""
         losses, _, _ = self._judge(see(frames, rays, self.noise), rays)
-        return float(losses.sum()) + self._told(frames)
+        return float(losses.sum()) + Chain.of(frames, self.prior).cost
 
     def linearised(self, frames: Keyframes, rays: Rays) -> Normal:
         """Normal equations at an estimate."""
@@ -131,13 +162,9 @@ class Bundle:
         for j in range(k):
             u[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] = blocks[j]
         gradient = (pulled * misses).sum(axis=(1, 2)).reshape(-1)
-        cost = float(losses.sum())
-        for link in self._links(frames):
-            at = slice(link.column, link.column + link.jacobian.shape[1])
-            pull = link.jacobian.T @ link.information
-            u[at, at] += pull @ link.jacobian
-            gradient[at] += pull @ link.residual
-            cost += link.cost
+        chain = Chain.of(frames, self.prior)
+        chain.add_to(u, gradient)
+        cost = float(losses.sum()) + chain.cost
         last = np.where(sight.shown[-1], np.linalg.norm(sight.misses[-1], axis=-1), np.nan)
         return Normal(u, w, v, gradient, gradients, cost, last)
 
@@ -158,35 +185,12 @@ class Bundle:
         weights = np.where(sight.ahead, np.minimum(1.0, self.huber / np.maximum(length, 1e-9)), 0.0)
         return losses, trust, weights * trust
 
-    def _told(self, frames: Keyframes) -> float:
-        """What prior and wheels cost."""
-        return sum(link.cost for link in self._links(frames))
 
-    def _links(self, frames: Keyframes) -> Iterator[Link]:
-        """The prior, and the ways between postures."""
-        off = frames.postures[0] - self.prior.mean.vector
-        off[2] = wrap_angle(float(off[2]))
-        turn = np.eye(3)
-        turn[:2, :2] = self.prior.mean.rotation.T
-        yield Link(turn @ off, turn, _inverse(self.prior.covariance), 0)
-        for j, step in enumerate(frames.steps):
-            yield _between(frames.postures[j], frames.postures[j + 1], step, 3 * j)
-
-
-def _between(before: Array, after: Array, step: PoseGaussian, column: int) -> Link:
-    """What the wheels measured from one posture to the next; their covariance is in the axes at the end."""
-    back = Pose2.from_vector(before).rotation.T
-    way = back @ (after - before)[:2]
-    residual = np.append(way, after[2] - before[2]) - step.mean.vector
-    residual[2] = wrap_angle(float(residual[2]))
-    jacobian = np.zeros((3, 6))
-    jacobian[:2, :2], jacobian[:2, 3:5] = -back, back
-    jacobian[:2, 2] = way[1], -way[0]
-    jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
-    end = np.eye(3)
-    end[:2, :2] = step.mean.rotation
-    return Link(residual, jacobian, _inverse(end @ step.covariance @ end.T), column)
-
-
-def _inverse(covariance: NDArray[np.float64]) -> Array:
-    return np.asarray(np.linalg.inv(covariance + 1e-12 * np.eye(3)), np.float64)
+def _turns(angles: Array) -> Array:
+    """(K, 3, 3) rotations of planar postures by (K,) rad."""
+    turns = np.zeros((len(angles), 3, 3))
+    turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)
+    turns[:, 1, 0] = np.sin(angles)
+    turns[:, 0, 1] = -turns[:, 1, 0]
+    turns[:, 2, 2] = 1.0
+    return turns
