@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,19 @@ def add_to(commands: Any) -> None:
         "server",
         help="run the map server and the router",
         description="Keep every robot's map, merge them, tell lost robots where they are and give routes. "
-        "The Zenoh router that robots connect to runs inside.",
+        "The Zenoh router that robots connect to runs inside. With --http it also tells people where a "
+        "photograph was taken: POST /relocalize, GET /status, and a page for phones at /.",
     )
     parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
     parser.add_argument("--data", type=Path, default=Path("out/server"), help="folder for the store")
     parser.add_argument(
         "--lockstep", action="store_true", help="answer only what is merged already: repeatable simulation"
     )
+    parser.add_argument(
+        "--http", metavar="[HOST:]PORT",
+        help="answer people over HTTP as well, on this machine alone unless HOST says otherwise, "
+        "for example 8080 or 0.0.0.0:8080 (default: off)",
+    )  # fmt: skip
     add_network(parser, listens=True)
     parser.set_defaults(run=run)
 
@@ -30,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
     from hybridmap.node import check_name
     from mapserver.server import MapServer, ServerSettings
+    from mapserver.web import Web, parse_address
     from wire.bus_settings import BusSettings
     from wire.keys import Keys
     from wire.zenoh_bus import ZenohBus
@@ -37,13 +45,19 @@ def run(arguments: argparse.Namespace) -> int:
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
+    address = parse_address(arguments.http) if arguments.http is not None else None
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
         how = ServerSettings(lockstep=arguments.lockstep)
-        with MapServer(bus, keys, arguments.data / f"{name}.sqlite", name, how) as server:
+        with ExitStack() as stack:
+            server = MapServer(bus, keys, arguments.data / f"{name}.sqlite", name, how)
+            stack.enter_context(server)
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
+            if address is not None:
+                stack.enter_context(Web(address, server.locate, server.status))
+                print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
             said = ""
             while not stop.wait(1.0):
                 now = server.summary()

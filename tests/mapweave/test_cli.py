@@ -300,6 +300,14 @@ def test_a_port_that_is_taken(capfd, port, tmp_path):
     assert f"cannot listen at tcp/127.0.0.1:{port}: the port is taken" in said
 
 
+def test_a_port_for_people_that_is_taken(capfd, port, nobody, tmp_path):
+    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "a", "--http", port)
+    assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in said
+    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "b", "--http", "here")
+    assert "write a port, or HOST:PORT" in said
+    assert not (tmp_path / "b").exists()
+
+
 def test_an_address_of_another_machine(capfd, tmp_path):
     said = complaint(capfd, "server", "--listen", "tcp/192.0.2.1:7447", "--data", tmp_path)
     assert "cannot listen at tcp/192.0.2.1:7447" in said
