@@ -142,7 +142,9 @@ class Lookout:
         found = recognise_bearings(one.node, view, self._rng, s.bearings)
         if found is None or found.inliers <= s.more * one.tracked:
             return None
-        if not any(self._in_line(fix, one) for fix in found.fixes):
+        # One wall can be explained from two sides: which is the right one shows on the way.
+        likely = [fix for fix in found.fixes if fix.directed == found.fixes[0].directed]
+        if not any(self._in_line(fix, one) for fix in likely):
             return None
         if one.held is not None:
             one.held.renew(features, found)
