@@ -83,8 +83,7 @@ def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Ruling
 def reason_of(ruling: Ruling) -> str:
     """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
     when = datetime.fromtimestamp(ruling.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    what = (
-        "" if len(ruling.ends[0]) == 3 else f" with all links between {ruling.ends[0]} and {ruling.ends[1]}"
-    )
+    first, second = ruling.ends
+    what = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
     why = f': "{ruling.because}"' if ruling.because else ""
     return f"undone{what} by {ruling.who or 'somebody'} on {when}{why}"

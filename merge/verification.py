@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hybridmap.node import Node
-from hybridmap.recognition import Recognition, RecognitionSettings, examine_nodes
+from hybridmap.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
 from merge.links import Link, RefusedLink
 
 
@@ -46,8 +46,7 @@ def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Li
     s = settings or VerificationSettings()
     if b.id < a.id:
         a, b = b, a
-    rng = np.random.default_rng(zlib.crc32(f"{a.id} {b.id}".encode()))
-    verdict = examine_nodes(a, b, s.recognition, rng)
+    verdict = examine(a, b, s)
     if isinstance(verdict, Recognition):
         sigma_xy, sigma_heading = verdict.evidence["sigma_xy"], verdict.evidence["sigma_heading"]
         if sigma_xy > s.most_sigma_xy or sigma_heading > s.most_sigma_heading:
@@ -56,3 +55,16 @@ def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Li
             return RefusedLink(a.id, b.id, reason)
         return Link(a.id, b.id, verdict.node_from_robot, verdict.pairs, verdict.evidence)
     return RefusedLink(a.id, b.id, verdict.reason)
+
+
+def examine(a: Node, b: Node, settings: VerificationSettings | None = None) -> Recognition | Refusal:
+    """What `verify` goes by: the same draws, the same numbers.
+
+    Args:
+        a: the node with the smaller id.
+        b: the other one.
+        settings: when they are linked.
+    """
+    s = settings or VerificationSettings()
+    rng = np.random.default_rng(zlib.crc32(f"{a.id} {b.id}".encode()))
+    return examine_nodes(a, b, s.recognition, rng)

@@ -1,0 +1,146 @@
+"""Why two nodes, or two maps, are linked or are not: plain values with every number behind the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.node import MapId, Node, NodeId
+from hybridmap.pose import Array, PoseGaussian
+from hybridmap.ruling import Ruling
+
+
+class Standing(StrEnum):
+    """What has become of two nodes."""
+
+    LINKED = "linked"
+    REFUSED = "refused"
+    """Compared, and not linked."""
+    UNDONE = "undone"
+    """A person has ruled so."""
+    UNCOMPARED = "not compared"
+    """Other pairs look more alike; the numbers come from a comparison that was made for the explanation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """Another link between the same two pieces of map.
+
+    Attributes:
+        a: its end in the piece of the explained pair's a.
+        b: its other end.
+        distance2: how far the loop through both links is from closing, chi-square with 3 degrees of freedom.
+        agrees: whether that is within the gate of the merge.
+        kept: whether the merge keeps it.
+    """
+
+    a: NodeId
+    b: NodeId
+    distance2: float
+    agrees: bool
+    kept: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """How far a link is from where the merged map has put its nodes.
+
+    Attributes:
+        merged_a_from_b: where b stands in a by everything that is joined.
+        off: (3,) m, m, rad: from the link's b to the merged one, in the link's b.
+        strain2: `off` in the link's own uncertainty, chi-square with 3 degrees of freedom.
+        alone: whether nothing but this link says how the two stand to each other.
+    """
+
+    merged_a_from_b: PoseGaussian
+    off: Array
+    strain2: float
+    alone: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PairExplanation:
+    """Why two nodes are linked, or are not.
+
+    Attributes:
+        a: the smaller id.
+        b: the greater id.
+        standing: what has become of them.
+        reason: in words.
+        matches: (M, 2) int64, landmarks of a and of b that look alike, each the other's best.
+        shared: (K, 2) int64, of these, those that agree on one posture.
+        residuals_px: (K,) px, how far these are from where the posture predicts them (NaN: behind the image).
+        a_from_b: the posture that the landmarks give; None if they agree on none.
+        evidence: numbers of hybridmap.recognition, empty without a posture.
+        probability: that the link is right, see merge.credence; None without a posture.
+        misfit: against the merged map; None if nothing joins the two.
+        witnesses: other links between the same two pieces of map.
+        claims: what the robots themselves say of the two by their edges, one sentence each.
+        rulings: what people have ruled about these two or their maps, in order.
+    """
+
+    a: Node
+    b: Node
+    standing: Standing
+    reason: str
+    matches: NDArray[np.int64]
+    shared: NDArray[np.int64]
+    residuals_px: Array
+    a_from_b: PoseGaussian | None = None
+    evidence: dict[str, float] = field(default_factory=dict)
+    probability: float | None = None
+    misfit: Misfit | None = None
+    witnesses: tuple[Witness, ...] = ()
+    claims: tuple[str, ...] = ()
+    rulings: tuple[Ruling, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class NearMiss:
+    """Two nodes of two maps that came near to being linked.
+
+    Attributes:
+        a: node of the first map.
+        b: node of the second.
+        matches: landmarks that look alike.
+        inliers: of these, those that agree on the best posture.
+        lacks: what it lacks, in words.
+    """
+
+    a: NodeId
+    b: NodeId
+    matches: int
+    inliers: int
+    lacks: str
+
+
+@dataclass(frozen=True, slots=True)
+class MapsExplanation:
+    """Why two maps are one, or are not.
+
+    Attributes:
+        first: the smaller id.
+        second: the greater id.
+        joined: whether any node of one is in one component with any of the other.
+        reason: in words.
+        links: between the two.
+        landmarks: behind these.
+        refused: links that were found and refused.
+        unverified: pairs that looked alike and showed no common posture.
+        nearest: pairs that came nearest to a link, best first; of links that were refused, then of others.
+        rulings: what people have ruled about the two maps, in order.
+    """
+
+    first: MapId
+    second: MapId
+    joined: bool
+    reason: str
+    links: int
+    landmarks: int
+    refused: int
+    unverified: int
+    nearest: tuple[NearMiss, ...] = ()
+    rulings: tuple[Ruling, ...] = ()
