@@ -10,14 +10,45 @@ tried.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.ekf import kernels
+from agent.ekf.report import Health
 from hybridmap.pose import Array
 
 Mask = NDArray[np.bool_]
+
+
+class Judgement(NamedTuple):
+    """What to make of the landmarks of an image.
+
+    Attributes:
+        innovations: (m, 2) slopes, measured minus expected.
+        believed: (m,) which of them to correct by.
+        whitening: (2k, 2k) what whitens the innovations of these k (agent.ekf.algebra.whiten).
+        health: what they tell of the filter.
+        reason: what is wrong, in words; empty if nothing is.
+    """
+
+    innovations: Array
+    believed: Mask
+    whitening: Array
+    health: Health = Health.GOOD
+    reason: str = ""
+
+    @property
+    def agreeing(self) -> int:
+        """How many are believed."""
+        return len(self.whitening) // 2
+
+    @staticmethod
+    def of_none(innovations: Array, health: Health, reason: str) -> Judgement:
+        """None of them is believed."""
+        return Judgement(innovations, np.zeros(len(innovations), np.bool_), np.zeros((0, 0)), health, reason)
+
 
 MEDIAN = 2.0 * math.log(2.0)
 """Of a chi-square with two degrees of freedom."""
@@ -68,7 +99,7 @@ def one_point_consensus(innovations: Array, covariance: Array, gate: float) -> M
     distance = _quadratic(left_covariance, left)
     agrees = distance <= gate
     score = agrees.sum(axis=0) - np.minimum(distance, gate).mean(axis=0) / (2.0 * gate)
-    return np.asarray(agrees[:, int(np.argmax(np.where(plausible, score, -1.0)))], np.bool_)
+    return np.ascontiguousarray(agrees[:, int(np.argmax(np.where(plausible, score, -1.0)))])
 
 
 def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
@@ -83,28 +114,31 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
         gate: chi-square threshold.
 
     Returns:
-        (N,) accepted; the inverse of the accepted ones' joint covariance, (2K, 2K); and how the median of
-        their leave-one-out distances compares with what it should be: 1 if the noise is as it is said.
+        (N,) accepted; what whitens the accepted ones (agent.ekf.algebra.whiten), (2K, 2K); and the median of
+        their distances from what all others say, MEDIAN if the noise is as it is said and without any.
     """
-    accepted: Mask = np.ones(len(innovations), np.bool_)
     innovations = np.ascontiguousarray(innovations)
-    information = kernels.inverse(covariance)
-    distances = kernels.leave_one_out(innovations, information)
+    whitening = kernels.whiten(covariance)
+    distances = kernels.leave_one_out(innovations, whitening)
     if distances.max() <= gate:
-        return accepted, information, _excess(distances)
+        return np.ones(len(innovations), np.bool_), whitening, _median(distances)
+    return believe_some(innovations, covariance, gate)
+
+
+def believe_some(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
+    """The same where some do not agree with all the others."""
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:
         chosen = np.flatnonzero(np.repeat(accepted, 2))
-        information = kernels.inverse(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
-        distances = kernels.leave_one_out(innovations[accepted], information)
+        whitening = kernels.whiten(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
+        distances = kernels.leave_one_out(innovations[accepted], whitening)
         if not len(distances) or distances.max() <= gate:
-            return accepted, information, _excess(distances)
+            return accepted, whitening, _median(distances)
         accepted[np.flatnonzero(accepted)[int(np.argmax(distances))]] = False
 
 
-def _excess(distances: Array) -> float:
-    """How the median of squared distances compares with that of a chi-square; 1 without any."""
-    return float(np.sort(distances)[len(distances) // 2]) / MEDIAN if len(distances) else 1.0
+def _median(distances: Array) -> float:
+    return float(np.sort(distances)[len(distances) // 2]) if len(distances) else MEDIAN
 
 
 def _blocks(matrix: Array) -> Array:

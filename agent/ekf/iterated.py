@@ -86,15 +86,15 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         innovations = seen.slopes - sight.rays[:, :2] - back
         if first is None:
             first = innovations
-            accepted, information, _ = believe(innovations, spread, seen.gate)
+            accepted, whitening, _ = believe(innovations, spread, seen.gate)
             if not accepted.any():
                 return Fit(state, accepted, first, float("nan"))
         else:
             both = np.flatnonzero(np.repeat(accepted, 2))
-            information = kernels.inverse(spread[np.ix_(both, both)])
-        columns = columns[:, np.repeat(accepted, 2)]
-        residual = innovations[accepted].ravel()
-        step = columns @ (information @ residual)
+            whitening = kernels.whiten(np.ascontiguousarray(spread[np.ix_(both, both)]))
+        root = columns[:, np.repeat(accepted, 2)] @ whitening.T
+        white = whitening @ innovations[accepted].ravel()
+        step = root @ white
         new_posture, new_rays = state.stepped(step)
         change = _linear(by_posture, by_ray, new_posture - posture, (new_rays - rays)[slots])
         promised = sight.rays[:, :2] + change
@@ -102,8 +102,8 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         kept = see(posture, rays[slots], mount_forward).rays[:, :2]
         if np.abs(kept - promised)[accepted].max() < seen.linear:
             break
-    corrected = state.corrected(step, columns @ np.linalg.cholesky(information))
-    nis = float(residual @ information @ residual) / len(residual)
+    corrected = state.corrected(step, root)
+    nis = float(white @ white) / len(white)
     assert first is not None
     return Fit(corrected, accepted, first, nis)
 

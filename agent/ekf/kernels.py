@@ -13,7 +13,8 @@ from agent.ekf import algebra
 
 PRODUCTS = (
     "transition", "propagate", "ahead",
-    "finite_rows", "spread", "inverse", "leave_one_out", "pull", "condition",
+    "slots_of", "sighted", "told", "innovations", "vote",
+    "spread", "whiten", "leave_one_out", "examine", "wheel_errors", "condition",
 )  # fmt: skip
 
 

@@ -13,13 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.ekf import kernels
-from agent.ekf.gating import believe, pixel_gate
+from agent.ekf.gating import MEDIAN, Judgement, believe, believe_some, pixel_gate
 from agent.ekf.landmarks import Ids, LandmarkEstimates
 from agent.ekf.motion import WheelNoise
 from agent.ekf.moving_state import MovingState, Step
 from agent.ekf.pixel_noise import PixelNoise
 from agent.ekf.report import Health, UpdateReport
 from agent.ekf.settings import FilterSettings
+from agent.ekf.sighting import Pinhole, Sighting
+from agent.ekf.watch import Watch
+from agent.ekf.wheel_trust import WheelTrust
 from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
@@ -58,39 +61,28 @@ class MappingFilter:
         self.ids: Ids = np.zeros(0, np.int64)
         self.lost = 0
         self._camera = camera
-        self._wheels = WheelNoise(axle, wheel_noise, self.settings.wheel_floor)
-        self._focal = np.array([camera.fx, camera.fy])
-        self._centre = np.array([camera.cx, camera.cy])
+        self._pinhole = Pinhole(camera)
+        self._wheels = WheelTrust(WheelNoise(axle, wheel_noise, self.settings.wheel_floor), self.settings)
         self._gate = pixel_gate(self.settings.gate_probability)
-        self._noise = PixelNoise(self.settings.pixel_sigma, self._focal, self.settings.adaptation)
+        self._noise = PixelNoise(self.settings.pixel_sigma, self._pinhole.focal, self.settings.adaptation)
         self._posture_variances = np.square(np.array(self.settings.posture_noise, np.float64))
         self._settled = MovingState.at_anchor()
         self._step: Step | None = None
-        self._steps_unseen = 0
-        self._distrust = 0
-        self._baseline = 0.0
-        self._base = np.zeros(2)
-        self._last = (Health.GOOD, "")
+        self._watch = Watch(self.settings, camera.fx)
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are let go."""
-        root = self._wheels.root(odometry)
-        if self._distrust:
-            # Slip and lost encoders last for more than one step.
-            self._distrust -= 1
-            root = self._wheels.refuted_root(odometry, 1.0, self.settings.slip[0])
+        root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
         mount = self._camera.mount_forward
-        aside = self.settings.side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
         taken = Step.predict(self.state, odometry, root, aside, self._posture_variances, mount)
         stays = kernels.ahead(taken.rays, taken.scale, self.settings.nearest, self.settings.widest_slope)
-        if not stays.all():
-            self.lost += int((~stays).sum())
+        gone = len(stays) - int(np.count_nonzero(stays))
+        if gone:
+            self.lost += gone
             self.ids = self.ids[stays]
             taken = taken.kept(stays)
         self._step = taken
-        self._steps_unseen += 1
-        x, y = (taken.posture[:2] - self._base).tolist()
-        self._baseline = max(self._baseline, math.hypot(x, y))
+        self._watch.moved(taken.posture)
 
     def add(
         self,
@@ -116,9 +108,9 @@ class MappingFilter:
         if np.isin(ids, self.ids).any() or len(np.unique(ids)) != n:
             raise InvalidValue("add: a landmark can be added only once")
         rays = np.empty((n, 3))
-        rays[:, :2] = (pixels - self._centre) / self._focal
+        rays[:, :2] = self._pinhole.slopes(pixels)
         variances = np.empty((n, 3))
-        variances[:, :2] = (self.settings.pixel_sigma / self._focal) ** 2
+        variances[:, :2] = (self.settings.pixel_sigma / self._pinhole.focal) ** 2
         if inverse_depths is None or sigmas is None:
             rays[:, 2] = 1.0 / self.settings.prior_depth
             variances[:, 2] = (self.settings.prior_spread / self.settings.prior_depth) ** 2
@@ -126,7 +118,7 @@ class MappingFilter:
             rays[:, 2] = inverse_depths
             variances[:, 2] = np.square(sigmas)
         self._settle(self.state.grown(rays, variances))
-        self._base, self._baseline = self.state.posture[:2].copy(), 0.0
+        self._watch.took_up(self.state.posture)
         self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)])
 
     def update(self, ids: Ids, pixels: Array) -> UpdateReport:
@@ -137,36 +129,26 @@ class MappingFilter:
             pixels: (N, 2) px, undistorted; rows with NaN are ignored.
         """
         s = self.settings
-        self._steps_unseen = 0
         self._noise.begin_image()
-        slots, rows = self._slots(ids, pixels)
-        if not len(slots):
-            self._last = Health.BLIND, "no landmark of the filter is in view"
-            return UpdateReport.blind(ids, self._last[1])
-        slopes = (pixels[rows] - self._centre) / self._focal
+        seen = Sighting.of(self.ids, ids, pixels, self._pinhole)
+        if not len(seen.slots):
+            self._watch.saw(Health.BLIND, "no landmark of the filter is in view")
+            return UpdateReport.blind(ids, "no landmark of the filter is in view")
         by_wheels = self._step
-        if by_wheels is not None and s.relinearisations and len(slots) >= s.least_agreeing:
-            self._step = by_wheels.again(at=by_wheels.seems(slots, slopes, s.slip_sigmas))
-        innovations = slopes - self._rays[slots, :2]
-        believed, information, health, reason = self._believe(slots, innovations)
-        nis = math.nan
-        agreeing = int(np.count_nonzero(believed))
-        if agreeing:
-            if agreeing < len(slots):
-                slots, slopes = slots[believed], slopes[believed]
-            nis, slip = self._correct(slots, slopes, information)
+        if by_wheels is not None and s.relinearisations and len(seen.slots) >= s.least_agreeing:
+            self._step = by_wheels.again(at=by_wheels.seems(seen.slots, seen.slopes, s.slip_sigmas))
+        judged = self._judge(seen)
+        nis, health, reason = math.nan, judged.health, judged.reason
+        if judged.agreeing:
+            nis, slip = self._correct(seen, judged)
             if slip and health is Health.GOOD:
                 health, reason = Health.SLIP, slip
         else:
             # What is not believed must not choose where the step is linearised either.
             self._step = by_wheels
             self._settle(self.state)
-        accepted = np.zeros(len(ids), np.bool_)
-        accepted[rows] = believed
-        innovations_px = np.full((len(ids), 2), np.nan)
-        innovations_px[rows] = innovations * self._focal
-        self._last = health, reason
-        return UpdateReport(ids, accepted, innovations_px, nis, health, reason)
+        self._watch.saw(health, reason)
+        return seen.report(judged.believed, judged.innovations, nis, health, reason)
 
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
@@ -184,19 +166,7 @@ class MappingFilter:
     @property
     def health(self) -> tuple[Health, str]:
         """What holds the estimate up at present, and in words what is wrong; empty if nothing is."""
-        unseen = self._steps_unseen
-        if unseen >= self.settings.patience:
-            return Health.NO_IMAGE, f"no image for {unseen} steps"
-        if self._last[0] is not Health.GOOD:
-            return self._last
-        parallax = self._baseline * self._focal[0] / self.settings.prior_depth
-        if parallax < self.settings.parallax_px and not self.converged().any():
-            way = 1e3 * self._baseline
-            return (
-                Health.NO_PARALLAX,
-                f"the robot has moved by {way:.0f} mm since landmarks were taken up: no depths",
-            )
-        return self._last
+        return self._watch.health(lambda: bool(self.converged().any()))
 
     @property
     def pose(self) -> PoseGaussian:
@@ -213,18 +183,17 @@ class MappingFilter:
         """
         pose = self.pose
         self._settle(self.state.reanchored())
-        self._base = pose.mean.inverse().apply(self._base[None])[0]
+        self._watch.reanchored(pose.mean)
         return pose
 
     def predict_pixels(self, ids: Ids | None = None) -> Array:
         """(N, 2) px where landmarks are expected now; NaN for ids that the filter does not hold."""
-        pixels: Array = self._centre + self._focal * self._rays[:, :2]
+        pixels = self._pinhole.pixels(self._rays[:, :2])
         if ids is None:
             return pixels
-        slots, rows = self._slots(ids)
-        out = np.full((len(ids), 2), np.nan)
-        out[rows] = pixels[slots]
-        return out
+        # The last row is of those that are not held, whose slot is -1.
+        slots = kernels.slots_of(self.ids, np.ascontiguousarray(ids, np.int64))
+        return np.asarray(np.vstack([pixels, [math.nan, math.nan]])[slots], np.float64)
 
     def landmarks(self) -> LandmarkEstimates:
         """All landmarks as they are known now."""
@@ -246,57 +215,44 @@ class MappingFilter:
         """Go on from a state; no step waits for its image any more."""
         self._settled, self._step = state, None
 
-    def _slots(self, ids: Ids, pixels: Array | None = None) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Places in the state of those ids that are held and seen, and their rows among the ids given."""
-        if len(ids) == len(self.ids) and (ids == self.ids).all():
-            if pixels is not None:
-                rows = kernels.finite_rows(np.ascontiguousarray(pixels, np.float64))
-                return rows, rows
-            return np.arange(len(ids)), np.arange(len(ids))
-        _, slots, rows = np.intersect1d(self.ids, ids, return_indices=True)
-        if pixels is not None:
-            seen = np.isfinite(pixels[rows]).all(axis=1)
-            slots, rows = slots[seen], rows[seen]
-        return slots, rows
-
     def _spread(self, slots: NDArray[np.intp]) -> Array:
-        """(2N, 2N) joint covariance of the innovations of some landmarks."""
+        """(2m, 2m) joint covariance of the innovations of some landmarks."""
         spread: Array = kernels.spread(self.state.covariance, slots, self._noise.variances)
         return spread
 
-    def _believe(
-        self, slots: NDArray[np.intp], innovations: Array
-    ) -> tuple[NDArray[np.bool_], Array, Health, str]:
-        """Which of the landmarks seen to correct by, the inverse of their S, and what that tells."""
-        s, seen = self.settings, len(slots)
-        believed, information, excess = believe(innovations, self._spread(slots), self._gate)
-        agreeing = int(np.count_nonzero(believed))
-        health, reason = Health.GOOD, ""
-        if agreeing < s.least_agreeing_share * seen:
-            health, reason = Health.DISAGREEMENT, f"{agreeing} of {seen} landmarks agree"
+    def _judge(self, seen: Sighting) -> Judgement:
+        """Which of the landmarks seen to correct by, and what that tells of the wheels and the pixels."""
+        s, slots, expected = self.settings, seen.slots, self.state
+        innovations, whitening, worst, median = kernels.examine(
+            expected.rays, expected.covariance, slots, seen.slopes, self._noise.variances
+        )
+        believed = np.ones(len(slots), np.bool_)
+        if not worst <= self._gate:
+            believed, whitening, median = believe_some(innovations, self._spread(slots), self._gate)
+        agreeing, least = len(whitening) // 2, s.least_agreeing_share * len(slots)
+        if agreeing < least:
             if self._step is not None:
                 # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
-                step, self._step = self._step, self._step.again(wheel_root=np.diag(s.slip))
-                then_believed, then_information, _ = believe(innovations, self._spread(slots), self._gate)
-                agreeing = int(np.count_nonzero(then_believed))
-                if agreeing >= max(s.least_agreeing, s.least_agreeing_share * seen):
-                    self._distrust = s.distrust
-                    reason = f"the wheels are refuted by {agreeing} of {seen} landmarks"
-                    return then_believed, then_information, Health.SLIP, reason
+                step, self._step = self._step, self._step.again(wheel_root=self._wheels.slipped())
+                then_believed, then_whitening, _ = believe(innovations, self._spread(slots), self._gate)
+                then_agreeing = len(then_whitening) // 2
+                if then_agreeing >= max(s.least_agreeing, least):
+                    self._wheels.doubt()
+                    reason = f"the wheels are refuted by {then_agreeing} of {len(slots)} landmarks"
+                    return Judgement(innovations, then_believed, then_whitening, Health.SLIP, reason)
                 self._step = step
             # A few that agree among many that do not may as well be the wrong ones.
-            believed[:] = False
-        elif seen >= MANY:
-            self._noise.learn(excess)
+            reason = f"{agreeing} of {len(slots)} landmarks agree"
+            return Judgement.of_none(innovations, Health.DISAGREEMENT, reason)
+        if len(slots) >= MANY:
+            self._noise.learn(median / MEDIAN)
         elif agreeing < s.least_agreeing:
-            health, reason = (
-                Health.FEW,
-                f"{agreeing} of {seen} landmarks in view agree, {s.least_agreeing} are needed",
-            )
-        return believed, information, health, reason
+            reason = f"{agreeing} of {len(slots)} landmarks in view agree, {s.least_agreeing} are needed"
+            return Judgement(innovations, believed, whitening, Health.FEW, reason)
+        return Judgement(innovations, believed, whitening)
 
-    def _correct(self, slots: NDArray[np.intp], slopes: Array, information: Array) -> tuple[float, str]:
-        """Correct by believed measurements, whose innovations have this information.
+    def _correct(self, seen: Sighting, judged: Judgement) -> tuple[float, str]:
+        """Correct by what is believed.
 
         The image tells better than the wheels by how much the robot has turned, so the step is linearised
         at what it then seems to have been. Without this each step leaves a second-order error of one
@@ -306,27 +262,30 @@ class MappingFilter:
         Returns:
             Their NIS over its degrees of freedom; and what is wrong with the wheels, empty if nothing is.
         """
-        slip = ""
-        residual = (slopes - self._rays[slots, :2]).ravel()
+        slip, slots, slopes = "", seen.slots, seen.slopes
+        residual, whitening = judged.innovations, judged.whitening
+        if judged.agreeing < len(slots):
+            slots, slopes = slots[judged.believed], slopes[judged.believed]
+            residual = residual[judged.believed]
         for _ in range(self.settings.relinearisations):
             if self._step is None:
                 break
-            errors, at = self._step.wheel_errors(slots, residual, information), self._step.at
-            likely, surprise = self._step.if_erred(errors.likely), errors.surprise
+            at = self._step.at
+            likely, surprise = self._step.in_hindsight(slots, residual, whitening)
             if surprise > self.settings.slip_sigmas and not slip:
                 slip = f"the landmarks refute the wheels by {surprise:.0f} sigmas"
-                root = self._wheels.refuted_root(self._step.measured, surprise, self.settings.slip[0])
+                root = self._wheels.refuted(self._step.measured, surprise)
                 self._step = self._step.again(at=likely, wheel_root=root)
-                self._distrust = self.settings.distrust
             elif (
                 abs(likely.forward - at.forward) >= SAME_STEP[0] or abs(likely.turn - at.turn) >= SAME_STEP[1]
             ):
                 self._step = self._step.again(at=likely)
-                if self._distrust:
+                if self._wheels.doubted:
                     slip = slip or "the wheels were refuted a moment ago, and are again"
             else:
                 break
-            residual = (slopes - self._rays[slots, :2]).ravel()
-            information = kernels.inverse(self._spread(slots))
-        self._settle(self.state.corrected(slots, residual, information, self._noise.variances))
-        return float(residual @ information @ residual) / len(residual), slip
+            residual = kernels.innovations(self._rays, slots, slopes)
+            whitening = kernels.whiten(self._spread(slots))
+        state, squares = self.state.corrected(slots, residual, whitening)
+        self._settle(state)
+        return squares / residual.size, slip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -69,42 +68,22 @@ class MovingState:
         return MovingState(np.zeros(3), self.rays, covariance)
 
     def corrected(
-        self, slots: NDArray[np.intp], residual: Array, information: Array, variances: Array
-    ) -> MovingState:
+        self, slots: NDArray[np.intp], residual: Array, whitening: Array
+    ) -> tuple[MovingState, float]:
         """Kalman update by direct measurements of the slopes of some landmarks.
 
         Args:
             slots: (m,) which landmarks.
-            residual: (2m,) measured minus expected.
-            information: (2m, 2m) inverse of the residuals' joint covariance.
-            variances: (2,) of a measured slope.
+            residual: (m, 2) measured minus expected.
+            whitening: (2m, 2m) what whitens the residuals.
+
+        Returns:
+            The state after, and the residuals' squared Mahalanobis norm.
         """
-        step, covariance = kernels.condition(self.covariance, slots, information, variances, residual)
-        return MovingState(self.posture + step[:3], self.rays + step[3:].reshape(-1, 3), covariance)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class WheelErrors:
-    """What an image says of the wheels' errors in the step before it, in sigmas of theirs.
-
-    Attributes:
-        likely: (2,) the errors' posterior mean. It is also the score, the image's pull at the errors.
-        certainty: (2, 2) covariance of the score if the wheels are right: what the image could know of them.
-    """
-
-    likely: Array
-    certainty: Array
-
-    @property
-    def surprise(self) -> float:
-        """How far the score is from what right wheels allow, in its own sigmas.
-
-        Unlike `likely` it does not shrink with the wheels' noise: wheels that claim for certain to stand, as
-        with a lost encoder, are refuted as well.
-        """
-        (p, q), (_, r) = self.certainty.tolist()
-        x, y = self.likely.tolist()
-        return math.sqrt(max(r * x * x - 2.0 * q * x * y + p * y * y, 0.0) / max(p * r - q * q, 1e-300))
+        posture, rays, covariance, squares = kernels.condition(
+            self.posture, self.rays, self.covariance, slots, whitening, residual
+        )
+        return MovingState(posture, rays, covariance), squares
 
 
 @dataclass(eq=False, slots=True)
@@ -153,11 +132,12 @@ class Step:
         """Move the mean, with the exact motion; the covariance waits until somebody asks for it."""
         guess = at or measured
         posture, rays, scale, blocks, by_input = kernels.transition(
-            before.posture, before.rays, guess.forward, guess.turn, mount_forward
+            before.posture,
+            before.rays,
+            (guess.forward, guess.turn),
+            (measured.forward, measured.turn),
+            mount_forward,
         )
-        if at is not None:
-            shift = by_input[:, :2] @ np.array([measured.forward - at.forward, measured.turn - at.turn])
-            posture, rays = posture + shift[:3], rays + shift[3:].reshape(-1, 3)
         return Step(
             before, measured, wheel_root, side_slip, posture_variances, mount_forward, guess, posture, rays,
             scale, blocks, by_input,
@@ -185,41 +165,30 @@ class Step:
     def seems(self, slots: NDArray[np.intp], slopes: Array, most: float) -> Odometry:
         """Where to linearise, at a first glance at the image: a quarter of the landmarks may be wrong.
 
-        The image shows a turn as da = (1 + a^2) du2, alike for all landmarks, near and far; the way is left
-        as the wheels say. The landmarks vote by the mean of their middle half, whose error the half's width
-        tells; it and the wheels are weighed by their variances.
+        The turn is as the landmarks vote; the way is left as the wheels say.
 
         Args:
             slots: (m,) landmarks seen, m > 0.
             slopes: (m, 2) where.
             most: sigmas of the wheels by which the guess may be off what they say.
         """
-        a = self.rays[slots, 0]
-        turns = np.sort((slopes[:, 0] - a) / (1.0 + a * a))
-        quarter = len(turns) // 4
-        half = turns[quarter : len(turns) - quarter]
-        # A Gaussian's middle half is 1.35 sigma wide; its mean has 1.2 times the variance of the whole mean.
-        vote = 1.2 * (float(half[-1] - half[0]) / 1.35) ** 2 / len(turns)
-        wheels = self.wheel_root[1, 0] ** 2 + self.wheel_root[1, 1] ** 2
-        turn = float(half.sum()) / len(half) * wheels / (wheels + vote)
-        limit = most * math.sqrt(wheels)
-        return Odometry(self.measured.forward, self.measured.turn + min(max(turn, -limit), limit))
+        turn = kernels.vote(self.rays, slots, slopes, self.wheel_root, most)
+        return Odometry(self.measured.forward, self.measured.turn + turn)
 
-    def wheel_errors(self, slots: NDArray[np.intp], residual: Array, information: Array) -> WheelErrors:
-        """What the two wheels erred by in this step, given what was seen after it.
+    def in_hindsight(
+        self, slots: NDArray[np.intp], residual: Array, whitening: Array
+    ) -> tuple[Odometry, float]:
+        """What the robot did most likely, as is seen after it, and how many sigmas refute the wheels.
 
         Args:
             slots: (m,) landmarks seen.
-            residual: (2m,) measured minus expected.
-            information: (2m, 2m) inverse of the residuals' joint covariance.
+            residual: (m, 2) measured minus expected.
+            whitening: (2m, 2m) what whitens the residuals.
         """
-        pulled = self.wheel_root.T @ kernels.pull(self.by_input, slots, information, residual)
-        return WheelErrors(pulled[:, 2], pulled[:, :2] @ self.wheel_root)
-
-    def if_erred(self, errors: Array) -> Odometry:
-        """What the robot did if the wheels erred so, (2,) in sigmas."""
-        forward, turn = (self.wheel_root @ errors).tolist()
-        return Odometry(self.measured.forward + forward, self.measured.turn + turn)
+        forward, turn, surprise = kernels.wheel_errors(
+            self.by_input, self.wheel_root, slots, whitening, residual
+        )
+        return Odometry(self.measured.forward + forward, self.measured.turn + turn), surprise
 
     def kept(self, mask: NDArray[np.bool_]) -> Step:
         """The step of only some of the landmarks."""

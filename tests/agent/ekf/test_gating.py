@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from agent.ekf.gating import believe, chi_squares, one_point_consensus, pixel_gate
-from agent.ekf.kernels import inverse, leave_one_out
+from agent.ekf.kernels import leave_one_out, whiten
 
 
 def joint(n: int, shared: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +23,7 @@ def test_gate_is_the_chi_square_quantile(probability: float) -> None:
 def test_single_and_leave_one_out_distances() -> None:
     rng = np.random.default_rng(0)
     innovations, s = joint(7, 5.0, rng)
-    alone, given_others = chi_squares(innovations, s), leave_one_out(innovations, inverse(s))
+    alone, given_others = chi_squares(innovations, s), leave_one_out(innovations, whiten(s))
     for i in range(7):
         own = np.array([2 * i, 2 * i + 1])
         rest = np.delete(np.arange(14), own)
@@ -50,11 +50,12 @@ def test_outliers_hidden_by_a_shared_error_are_found() -> None:
         # Too small to be seen alone beside the shared 30 px.
         angle = rng.uniform(0, 2 * np.pi, 8)
         innovations[wrong] += rng.uniform(12, 25, (8, 1)) * np.column_stack([np.cos(angle), np.sin(angle)])
-        accepted, information, _ = believe(innovations, s, gate)
+        accepted, whitening, _ = believe(innovations, s, gate)
         assert not accepted[wrong].any()
         assert accepted.sum() >= 11
         chosen = np.flatnonzero(np.repeat(accepted, 2))
-        np.testing.assert_allclose(information @ s[np.ix_(chosen, chosen)], np.eye(len(chosen)), atol=1e-8)
+        white = whitening @ s[np.ix_(chosen, chosen)] @ whitening.T
+        np.testing.assert_allclose(white, np.eye(len(chosen)), atol=1e-8)
 
 
 def test_consensus_is_that_of_the_best_single_landmark() -> None:
@@ -80,6 +81,6 @@ def test_consensus_is_that_of_the_best_single_landmark() -> None:
 
 def test_nothing_plausible_means_nothing_believed() -> None:
     innovations = np.full((4, 2), 100.0) * np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
-    accepted, information, _ = believe(innovations, np.eye(8), pixel_gate(0.999))
+    accepted, whitening, _ = believe(innovations, np.eye(8), pixel_gate(0.999))
     assert not accepted.any()
-    assert information.shape == (0, 0)
+    assert whitening.shape == (0, 0)

@@ -1,0 +1,80 @@
+"""What an image shows of the mapping filter's landmarks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.ekf import kernels
+from agent.ekf.landmarks import Ids
+from agent.ekf.report import Health, UpdateReport
+from hybridmap.camera import Camera
+from hybridmap.pose import Array
+
+
+class Pinhole:
+    """Pixels and slopes of an ideal camera.
+
+    Attributes:
+        focal: (2,) px.
+        centre: (2,) px, principal point.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        """Of its intrinsics."""
+        self.focal = np.array([camera.fx, camera.fy])
+        self.centre = np.array([camera.cx, camera.cy])
+
+    def slopes(self, pixels: Array) -> Array:
+        """(N, 2) slopes (a, b) of pixels (N, 2)."""
+        return np.asarray((pixels - self.centre) / self.focal, np.float64)
+
+    def pixels(self, slopes: Array) -> Array:
+        """(N, 2) px of slopes (N, 2)."""
+        return np.asarray(self.centre + self.focal * slopes, np.float64)
+
+
+class Sighting(NamedTuple):
+    """The landmarks of a filter that an image shows.
+
+    Attributes:
+        ids: (N,) what was tracked, as it was given.
+        slots: (m,) places in the state of what is held and seen.
+        rows: (m,) their rows among the ids.
+        slopes: (m, 2) where they are seen, (pixel - principal point) / focal length.
+        focal: (2,) px.
+    """
+
+    ids: Ids
+    slots: NDArray[np.intp]
+    rows: NDArray[np.intp]
+    slopes: Array
+    focal: Array
+
+    @staticmethod
+    def of(held: Ids, ids: Ids, pixels: Array, pinhole: Pinhole) -> Sighting:
+        """What of the landmarks held is seen.
+
+        Args:
+            held: (n,) ids in the state's order.
+            ids: (N,) what was tracked.
+            pixels: (N, 2) px, undistorted; rows with NaN are not seen.
+            pinhole: of the camera.
+        """
+        slots, rows, slopes = kernels.sighted(
+            held,
+            np.ascontiguousarray(ids, np.int64),
+            np.ascontiguousarray(pixels, np.float64),
+            pinhole.centre,
+            pinhole.focal,
+        )
+        return Sighting(ids, slots, rows, slopes, pinhole.focal)
+
+    def report(
+        self, believed: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
+    ) -> UpdateReport:
+        """Of an update by what is seen: believed (m,), innovations (m, 2) slopes measured minus expected."""
+        accepted, innovations_px = kernels.told(len(self.ids), self.rows, believed, innovations, self.focal)
+        return UpdateReport(self.ids, accepted, innovations_px, mean_nis, health, reason)
