@@ -7,7 +7,7 @@
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk
-    mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, known, map
+    mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, known, map, explain, rule
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of whoever drives that body
@@ -140,6 +140,22 @@ class Keys:
     def any_server_map(self) -> str:
         """Pattern: whichever server answers."""
         return f"{self.root}/server/*/map"
+
+    def explain(self, server: str) -> str:
+        """Where a server says why nodes or maps are linked, or are not."""
+        return self._of_server("explain", server)
+
+    def any_explain(self) -> str:
+        """Pattern: whichever server answers."""
+        return f"{self.root}/server/*/explain"
+
+    def rule(self, server: str) -> str:
+        """Where a server is told what people rule: that nodes or maps shall not be linked."""
+        return self._of_server("rule", server)
+
+    def any_rule(self) -> str:
+        """Pattern: every server of the fleet."""
+        return f"{self.root}/server/*/rule"
 
     def server_status(self, server: str) -> str:
         """Where a server publishes what it is doing."""

@@ -6,6 +6,9 @@
     content            MessagePack, see `_pack`
     digest   32 bytes  SHA-256 over everything before
 
+Fields that an older program does not know it leaves alone; a file of an older program lacks them. The version
+is raised only when an older program would misread a file.
+
 Postures and landmarks have the wire's precision. A file is written beside its place and then moved there, so
 that a reader, or a loss of power, finds either the old file or the new one.
 """
@@ -18,15 +21,17 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
-from hybridmap.change import ChangeBody
+from hybridmap.change import ChangeBody, EdgePut
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from hybridmap.node import NodeId
+from hybridmap.node import Edge, NodeId
 from hybridmap.pose import PoseGaussian
+from hybridmap.ruling import Ruling
 from wire.codec import MAX_BODY_BYTES, decode_body, encode_body
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import POSTURE, pack_posture, unpack_posture
+from wire.ruling_codec import pack_ruling, read_ruling
 
 MAGIC = b"MAPWEAVE"
 VERSION = 1
@@ -35,8 +40,26 @@ DIGEST_BYTES = 32
 MAX_CONTENT_BYTES = 2**32 - 1
 MAX_ELEMENTS = 10_000_000
 MAX_TITLE = 1000
+MAX_REASON = 1024
 
 Kind = Literal["agent", "merged"]
+
+
+@dataclass(frozen=True, eq=False)
+class RefusedPair:
+    """Two nodes that looked alike and were not linked.
+
+    Attributes:
+        a: one node.
+        b: another one.
+        reason: in words.
+        edge: the link that was found, or what the robot itself said, as an edge; None if not even that.
+    """
+
+    a: NodeId
+    b: NodeId
+    reason: str
+    edge: Edge | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +71,16 @@ class MapFile:
         title: one line for people.
         changes: the map is their replay; a merged map's links are edges among them.
         postures: of a merged map's nodes: number of the component, posture in that component's frame.
+        refused: of a merged map: pairs that were not linked. Edges of robots that are refused are only here.
+        rulings: of people on what shall not be linked, in order.
     """
 
     kind: Kind
     title: str
     changes: tuple[ChangeBody, ...]
     postures: Mapping[NodeId, tuple[int, PoseGaussian]] = field(default_factory=dict)
+    refused: tuple[RefusedPair, ...] = ()
+    rulings: tuple[Ruling, ...] = ()
 
 
 def write_map_file(path: Path, content: MapFile) -> None:
@@ -146,7 +173,14 @@ def _pack(content: MapFile) -> bytes:
         for node, (component, posture) in content.postures.items()
     ]
     changes = [encode_body(body) for body in content.changes]
-    return pack({"kind": content.kind, "title": content.title, "changes": changes, "postures": postures})
+    fields = {"kind": content.kind, "title": content.title, "changes": changes, "postures": postures}
+    refused = [
+        [list(r.a), list(r.b), r.reason, b"" if r.edge is None else encode_body(EdgePut(r.edge))]
+        for r in content.refused
+    ]
+    return pack(
+        {**fields, "refused": refused, "rulings": [pack_ruling(ruling) for ruling in content.rulings]}
+    )
 
 
 def _unpack(content: bytes) -> MapFile:
@@ -167,7 +201,30 @@ def _unpack(content: bytes) -> MapFile:
         posture = unpack_posture(reader.as_binary(parts[2], "posture", POSTURE.size))
         component = reader.as_integer(parts[1], "component", 0, MAX_NUMBER)
         postures[reader.as_node_id(parts[0], "node")] = (component, posture)
-    return MapFile(kinds[name], reader.text("title", MAX_TITLE), changes, postures)
+    refused = tuple(
+        _read_refused(reader, value)
+        for value in (reader.array("refused", MAX_ELEMENTS) if reader.has("refused") else [])
+    )
+    rulings = tuple(
+        read_ruling(reader, value)
+        for value in (reader.array("rulings", MAX_ELEMENTS) if reader.has("rulings") else [])
+    )
+    return MapFile(kinds[name], reader.text("title", MAX_TITLE), changes, postures, refused, rulings)
+
+
+def _read_refused(reader: Reader, value: Any) -> RefusedPair:
+    parts = reader.as_array(value, "refusal", 32)
+    if len(parts) < 4:
+        raise reader.error("a refusal must be [node, node, reason, edge]")
+    a, b = (reader.as_node_id(part, "node") for part in parts[:2])
+    reason, encoded = (
+        reader.as_text(parts[2], "reason", MAX_REASON),
+        reader.as_binary(parts[3], "edge", MAX_BODY_BYTES),
+    )
+    body = decode_body(encoded) if encoded else None
+    if body is not None and not isinstance(body, EdgePut):
+        raise reader.error("what was refused must be an edge")
+    return RefusedPair(a, b, reason, None if body is None else body.edge)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -114,10 +114,7 @@ class Reader:
 
     def map_id(self, name: str) -> MapId:
         """[agent, epoch]."""
-        parts = self.as_array(self._get(name), name, 2)
-        if len(parts) != 2:
-            raise self.error(f"{name} must be [agent, epoch]")
-        return MapId(self.as_name(parts[0], name), self.as_integer(parts[1], f"{name}'s epoch", 0, MAX_EPOCH))
+        return self.as_map_id(self._get(name), name)
 
     def node_id(self, name: str) -> NodeId:
         """[agent, epoch, number]."""
@@ -130,6 +127,13 @@ class Reader:
         if not isinstance(value, list) or len(value) > most:
             raise self.error(f"{name} must be a list of at most {most}")
         return value
+
+    def as_map_id(self, value: Any, name: str) -> MapId:
+        """See `map_id`."""
+        parts = self.as_array(value, name, 2)
+        if len(parts) != 2:
+            raise self.error(f"{name} must be [agent, epoch]")
+        return MapId(self.as_name(parts[0], name), self.as_integer(parts[1], f"{name}'s epoch", 0, MAX_EPOCH))
 
     def as_node_id(self, value: Any, name: str) -> NodeId:
         """See `node_id`."""

@@ -1,0 +1,96 @@
+"""Merged maps as map files, and back: a file holds the parts, so that it can be explained or merged anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from hybridmap.change import EdgePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, MapId
+from hybridmap.ruling import Rulings
+from merge.credence import credences
+from merge.cutting import fragments_of
+from merge.joining import Solver
+from merge.links import MERGE_AUTHOR, Link, RefusedLink, link_of
+from merge.merged import MergedMap, Placement
+from merge.undoing import undo
+from wire.codec import element_of
+from wire.mapfile import MapFile, RefusedPair
+
+PROBABILITY = "probability"
+"""Name among the evidence of a link in a file: see merge.credence."""
+
+
+def map_file_of(merged: MergedMap) -> MapFile:
+    """All that a merged map is: nodes, edges, links with their probabilities, refusals, rulings, postures."""
+    whole = merged.union()
+    probabilities = credences(merged)
+    for link in merged.links:
+        edge = link.edge()
+        evidence = {**edge.evidence, PROBABILITY: probabilities[link.pair]}
+        whole.edges[edge.id] = replace(edge, evidence=evidence)
+    return MapFile(
+        "merged",
+        merged.summary(),
+        tuple(whole.contents()),
+        dict(merged.postures),
+        tuple(RefusedPair(r.a, r.b, r.reason, _edge(merged, r)) for r in merged.refused),
+        merged.rulings.made,
+    )
+
+
+def maps_of(content: MapFile) -> dict[MapId, HybridMap]:
+    """The robots' own maps in a file, with what was refused of their edges; links are not theirs."""
+    maps: dict[MapId, HybridMap] = {}
+    refused = (EdgePut(r.edge) for r in content.refused if r.edge is not None)
+    for body in (*content.changes, *refused):
+        element = element_of(body)
+        if not (isinstance(body, EdgePut) and _is_link(body.edge)):
+            maps.setdefault(element.map, HybridMap()).apply(body)
+    return maps
+
+
+def merged_of(content: MapFile) -> MergedMap:
+    """The merged map that a file holds: links and refusals as they are, postures and covariances solved anew.
+
+    Nothing is judged again, so a file is explained by what was decided when it was made.
+    """
+    maps, rulings = maps_of(content), Rulings(content.rulings)
+    links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
+    solved = Solver(fragments_of(undo(maps, (), rulings).maps)).solve(links)
+    postures = {
+        node: Placement(number, posture)
+        for number, graph in enumerate(solved)
+        for node, posture in graph.postures().items()
+    }
+    refused = tuple(_refused(pair) for pair in content.refused)
+    components = tuple(frozenset(graph.nodes) for graph in solved)
+    return MergedMap(dict(sorted(maps.items())), links, refused, components, postures, tuple(solved), rulings)
+
+
+def _is_link(edge: Edge) -> bool:
+    return edge.id.map == MapId(MERGE_AUTHOR, 0)
+
+
+def _links(edges: Iterable[Edge]) -> list[Link]:
+    found = []
+    for edge in edges:
+        if _is_link(edge):
+            evidence = {name: value for name, value in edge.evidence.items() if name != PROBABILITY}
+            found.append(link_of(replace(edge, evidence=evidence)))
+    return sorted(found, key=lambda link: link.pair)
+
+
+def _edge(merged: MergedMap, refused: RefusedLink) -> Edge | None:
+    if refused.edge is not None:
+        return merged.maps[refused.edge.map].edges[refused.edge]
+    return None if refused.link is None else refused.link.edge()
+
+
+def _refused(pair: RefusedPair) -> RefusedLink:
+    if pair.edge is None:
+        return RefusedLink(pair.a, pair.b, pair.reason)
+    return RefusedLink(
+        pair.a, pair.b, pair.reason, link_of(pair.edge), None if _is_link(pair.edge) else pair.edge.id
+    )
