@@ -90,6 +90,23 @@ def test_of_two_edges_the_cheaper_is_driven() -> None:
     assert route.edges == (NodeId("e", 1, 100),)
 
 
+def test_a_link_that_somebody_has_driven_costs_its_length() -> None:
+    """Two metres across a room, and a detour of four: the link is taken once it was driven, not before."""
+    places = [Pose2(0, 0), Pose2(2, 0), Pose2(1, 1.7)]
+    nodes = [node(k, place) for k, place in enumerate(places)]
+    edges = [
+        edge(1, nodes[0], nodes[1], EdgeKind.LOOP),
+        edge(2, nodes[0], nodes[2]),
+        edge(3, nodes[2], nodes[1]),
+    ]
+    one = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    around = find_route(one, nodes[0].id, nodes[1].id)
+    assert around.edges == (edges[1].id, edges[2].id)
+    one.apply(EdgePut(edge(4, nodes[0], nodes[1], EdgeKind.DRIVEN)))
+    straight = find_route(one, nodes[0].id, nodes[1].id)
+    assert straight.edges == (NodeId("e", 1, 4),) and straight.cost == pytest.approx(2.02)
+
+
 def test_links_between_maps_without_common_frame_are_driven() -> None:
     """The two maps' frames have nothing in common: only the measured link says that the nodes are near."""
     a, b = node(1, Pose2(0, 0)), node(1, Pose2(100, 100), "r1")
