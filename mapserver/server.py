@@ -19,6 +19,7 @@ from hybridmap.query import RelocalizeAnswer, View
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.desk import Desk, DeskSettings
+from mapserver.explainer import Explainer, RulingBook
 from mapserver.ingest import Ingest
 from mapserver.services import Services
 from mapserver.store import Store
@@ -75,6 +76,8 @@ class MapServer:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = Store(path)
         self._upkeep = Upkeep(s.merge_share, by_itself=not s.lockstep)
+        self._rulings = RulingBook(self._store)
+        self._upkeep.rule(self._rulings.rulings)
         self._desk = Desk(replace(s.desk, workers=0) if s.lockstep else s.desk)
         # Wall time says nothing of simulated time, and what it decided would not repeat itself.
         self._blockages = Blockages(BlockageSettings(forget=math.inf) if s.lockstep else BlockageSettings())
@@ -88,6 +91,9 @@ class MapServer:
         self._services = Services(
             self._bus, self._keys, self._name, self._in_step, self._desk, self._blockages, self.status
         )
+        self._explainer = Explainer(
+            self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule
+        )
         self._teller.start()
         return self
 
@@ -96,6 +102,7 @@ class MapServer:
     ) -> None:
         """Stop serving; everything that was acknowledged is on the disk already."""
         self._services.close()
+        self._explainer.close()
         self._desk.close()
         self._ingest.close()
         self._stop.set()
@@ -122,6 +129,8 @@ class MapServer:
             "components": len(merged.components),
             "links": len(between),
             "refused": sum(refusal.link is not None for refusal in merged.refused),
+            "rulings": len(merged.rulings.in_force),
+            "event": self._upkeep.event,
             "settled": self._upkeep.settled,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,

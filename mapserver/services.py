@@ -11,10 +11,11 @@ from hybridmap.errors import Busy, MapweaveError
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages
 from mapserver.desk import Desk
+from mapserver.mapfiles import map_file_of
 from wire.bus import Bus, Closing, Request
 from wire.keys import Keys
 from wire.log_messages import Scalar, encode_record
-from wire.mapfile import MapFile, pack_map_file
+from wire.mapfile import pack_map_file
 from wire.messages import (
     decode_known_request,
     decode_route_request,
@@ -96,9 +97,7 @@ class Services:
         return encode_known_answer(answer)
 
     def _map(self, payload: bytes) -> bytes:
-        merged = self._answers().merged
-        changes = tuple(merged.union().contents())
-        return pack_map_file(MapFile("merged", merged.summary(), changes, dict(merged.postures)))
+        return pack_map_file(map_file_of(self._answers().merged))
 
     def _tell_status(self, payload: bytes) -> bytes:
         self._answers()

@@ -9,12 +9,17 @@ import time
 
 from hybridmap.change import Change
 from hybridmap.errors import MapweaveError
+from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
 from mapserver.merger import Merger
 from mapserver.shared_index import SharedPlaceIndex
 from merge.merged import MergedMap
+from merge.parting import joinings, partings
 
 log = logging.getLogger(__name__)
+
+MOST_WORDS = 1000
+"""Characters of an event in a status message."""
 
 
 class Upkeep:
@@ -30,15 +35,21 @@ class Upkeep:
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(SharedPlaceIndex())
-        self._changes: queue.SimpleQueue[Change | threading.Event | None] = queue.SimpleQueue()
+        self._changes: queue.SimpleQueue[Change | Rulings | threading.Event | None] = queue.SimpleQueue()
         self._answers = Answers.of(self._merger, MergedMap.empty())
         self._dirty = False
+        self._event = ""
         self._thread = threading.Thread(target=self._work, name="merge", daemon=True)
 
     @property
     def answers(self) -> Answers:
         """From the newest merged map."""
         return self._answers
+
+    @property
+    def event(self) -> str:
+        """The newest of what has become one map, or is no longer one, with the reason."""
+        return self._event[:MOST_WORDS]
 
     @property
     def settled(self) -> bool:
@@ -52,6 +63,10 @@ class Upkeep:
     def take(self, change: Change) -> None:
         """Take note of a change, in the order of its log. Returns at once."""
         self._changes.put(change)
+
+    def rule(self, rulings: Rulings) -> None:
+        """Heed these rulings of people from now on, and no others. Returns at once."""
+        self._changes.put(rulings)
 
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
@@ -84,14 +99,27 @@ class Upkeep:
                     self._merge()
                 change.set()
                 continue
-            try:
-                self._merger.on_change(change)
-            except MapweaveError as error:
-                log.warning("change %s of %s is not merged: %s", change.sequence, change.map, error)
+            if isinstance(change, Rulings):
+                self._merger.rule(change)
+            else:
+                self._apply(change)
             self._dirty = True
             if time.monotonic() > rest_until + 2.0:
                 rest_until = time.monotonic()
 
+    def _apply(self, change: Change) -> None:
+        try:
+            self._merger.on_change(change)
+        except MapweaveError as error:
+            log.warning("change %s of %s is not merged: %s", change.sequence, change.map, error)
+
     def _merge(self) -> None:
         self._dirty = False
-        self._answers = Answers.of(self._merger, self._merger.merged())
+        before, merged = self._answers.merged, self._merger.merged()
+        self._answers = Answers.of(self._merger, merged)
+        for words in joinings(before, merged):
+            log.info("%s", words)
+            self._event = words
+        for words in partings(before, merged):
+            log.warning("%s", words)
+            self._event = words

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 from hybridmap.change import EdgePut
+from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Ruling, Rulings
@@ -78,6 +79,39 @@ def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Ruling
                 body for body in one.contents() if not (isinstance(body, EdgePut) and body.edge.id in gone)
             )
     return Undone(left, tuple(kept), tuple(refused), maps, rulings)
+
+
+def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
+    """Refuse a ruling that would change nothing: it is meant otherwise.
+
+    Args:
+        merged: what it is made about.
+        rulings: that were made before, merged already or not.
+        ruling: the new one.
+
+    Raises:
+        InvalidValue: there is nothing to undo, or nothing to take back.
+    """
+    first, second = ruling.ends
+    known = next((r for r in rulings.in_force if r.ends == ruling.ends), None)
+    if not ruling.apart:
+        if known is None:
+            raise InvalidValue(f"nothing that people have ruled keeps {first} and {second} apart")
+        return
+    if known is not None:
+        raise InvalidValue(f"{first} and {second} are apart already: {reason_of(known)}")
+    pairs = [link.pair for link in merged.links]
+    false = {refusal.edge for refusal in merged.refused}
+    pairs += [
+        (edge.a, edge.b)
+        for one in merged.maps.values()
+        for edge in one.edges.values()
+        if edge.kind in CLAIMS and edge.id not in false
+    ]
+    for a, b in pairs:
+        if {a, b} == {first, second} or {a.map, b.map} == {first, second}:
+            return
+    raise InvalidValue(f"no link joins {first} and {second}: there is nothing to undo")
 
 
 def reason_of(ruling: Ruling) -> str:

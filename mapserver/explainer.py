@@ -1,0 +1,131 @@
+"""People's questions why maps are one, and people's rulings that they shall not be."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from hybridmap.errors import InvalidFile, InvalidMessage
+from hybridmap.node import MapId, NodeId
+from hybridmap.ruling import Ruling, Rulings
+from mapserver.answers import Answers
+from mapserver.desk import Desk
+from mapserver.services import guarded
+from mapserver.store import Store
+from merge.explanation import explain_nodes
+from merge.explanation_maps import explain_fleet, explain_maps
+from merge.undoing import check_ruling, reason_of
+from wire.bus import Bus, Closing, Request
+from wire.explanation_messages import (
+    MAX_MAPS_TOLD,
+    decode_explain_request,
+    decode_ruling,
+    encode_maps,
+    encode_pair,
+)
+from wire.keys import Keys
+from wire.log_messages import encode_record
+from wire.ruling_codec import decode_rulings, encode_rulings
+
+log = logging.getLogger(__name__)
+
+NAME = "rulings"
+"""In the store."""
+
+
+class RulingBook:
+    """The server's record of what people have ruled, on its disk. Entries are added, never taken out."""
+
+    def __init__(self, store: Store) -> None:
+        """Read the record.
+
+        Raises:
+            InvalidFile: it is damaged.
+        """
+        self._store = store
+        found = store.result(NAME)
+        try:
+            self._rulings = Rulings() if found is None else decode_rulings(found)
+        except InvalidMessage as error:
+            raise InvalidFile(f"the server's record of rulings is damaged ({error})") from None
+
+    @property
+    def rulings(self) -> Rulings:
+        """All of them, in order."""
+        return self._rulings
+
+    def add(self, ruling: Ruling) -> None:
+        """Enter a ruling; it is on the disk when this returns.
+
+        Raises:
+            InvalidFile: the disk does not take it; then nothing has changed.
+        """
+        rulings = Rulings([*self._rulings.made, ruling])
+        self._store.put_result(NAME, encode_rulings(rulings))
+        self._rulings = rulings
+
+
+class Explainer:
+    """Declared on a bus until closed."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        name: str,
+        answers: Callable[[], Answers],
+        desk: Desk,
+        book: RulingBook,
+        rule: Callable[[Rulings], None],
+    ) -> None:
+        """Begin to answer.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            name: of the server in the fleet.
+            answers: the newest ones. May wait for them.
+            desk: explanations compare nodes, which takes long.
+            book: where rulings are kept.
+            rule: told all rulings whenever there is a new one.
+        """
+        self._answers = answers
+        self._desk = desk
+        self._book = book
+        self._rule = rule
+        self._turn = threading.Lock()
+        self._closing: list[Closing] = [
+            bus.serve(keys.explain(name), self._explain_later),
+            bus.serve(keys.rule(name), guarded(self._decree)),
+        ]
+
+    def close(self) -> None:
+        """Stop answering."""
+        for closing in self._closing:
+            closing.close()
+
+    def _explain_later(self, request: Request) -> None:
+        done = self._desk.submit(lambda: self._explain(request.payload))
+        done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
+
+    def _explain(self, payload: bytes) -> bytes:
+        ends = decode_explain_request(payload).ends
+        merged = self._answers().merged
+        if ends is None:
+            return encode_maps(explain_fleet(merged, MAX_MAPS_TOLD))
+        first, second = ends
+        if isinstance(first, NodeId) and isinstance(second, NodeId):
+            return encode_pair(explain_nodes(merged, first, second))
+        return encode_maps((explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),))
+
+    def _decree(self, payload: bytes) -> bytes:
+        ruling = decode_ruling(payload)
+        with self._turn:
+            check_ruling(self._answers().merged, self._book.rulings, ruling)
+            self._book.add(ruling)
+            self._rule(self._book.rulings)
+        first, second = ruling.ends
+        words = reason_of(ruling) if ruling.apart else f"may be linked again, says {ruling.who or 'somebody'}"
+        log.warning("%s and %s: %s", first, second, words)
+        return encode_record({"said": f"{first} and {second}: {words}"})

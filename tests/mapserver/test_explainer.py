@@ -1,0 +1,231 @@
+"""A server that says why, heeds what people rule, and does so after it was started again."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from hybridmap.errors import InvalidFile
+from hybridmap.explanation import MapsExplanation, Standing
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.ruling import Ends, Ruling
+from hybridmap.synthetic import room, take_map
+from mapserver.entry import Entry
+from mapserver.explainer import RulingBook
+from mapserver.mapfiles import map_file_of, maps_of, merged_of
+from mapserver.merger import Merger
+from mapserver.server import MapServer, ServerSettings
+from mapserver.store import Store
+from merge.merged import MergedMap
+from wire.bus import Reply
+from wire.codec import encode_change
+from wire.explanation_messages import (
+    ExplainRequest,
+    decode_maps,
+    decode_pair,
+    encode_explain_request,
+    encode_ruling,
+)
+from wire.keys import Keys
+from wire.log_messages import decode_record
+from wire.mapfile import MapFile, pack_map_file, unpack_map_file
+from wire.memory import MemoryBus, MemoryHub
+
+A, B = MapId("a", 1), MapId("b", 1)
+KEYS = Keys("fleet")
+
+
+def logs() -> dict[MapId, list[ChangeBody]]:
+    """Two robots have looked around in one room."""
+    rng = np.random.default_rng(6)
+    world = room(0, 0, 5, 4, 700, rng)
+    out: dict[MapId, list[ChangeBody]] = {}
+    for map_id in (A, B):
+        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(6)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+    return out
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The bytes of a server's store."""
+    path = tmp_path_factory.mktemp("store") / "s0.sqlite"
+    store = Store(path)
+    for map_id, bodies in logs().items():
+        entries = [
+            Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
+            for k, body in enumerate(bodies)
+        ]
+        store.apply(map_id, 7, entries, len(entries))
+    store.close()
+    return path.read_bytes()
+
+
+@pytest.fixture
+def path(stored: bytes, tmp_path: Path) -> Path:
+    path = tmp_path / "s0.sqlite"
+    path.write_bytes(stored)
+    return path
+
+
+class Asker:
+    """A person at the bus."""
+
+    def __init__(self, bus: MemoryBus) -> None:
+        self.bus = bus
+
+    def ask(self, key: str, payload: bytes) -> Reply:
+        (reply,) = self.bus.ask(key, payload, 20.0)
+        return reply
+
+    def maps(self) -> MapsExplanation:
+        request = encode_explain_request(ExplainRequest((A, B)))
+        (told,) = decode_maps(self.ask(KEYS.explain("s0"), request).payload)
+        return told
+
+    def rule(self, ends: Ends, apart: bool = True) -> Reply:
+        return self.ask(KEYS.rule("s0"), encode_ruling(Ruling(ends, apart, "anna", 10**18, "two kitchens")))
+
+    def status(self) -> dict[str, object]:
+        return dict(decode_record(self.ask(KEYS.server_status("s0"), b"").payload))
+
+    def merged(self) -> MapFile:
+        return unpack_map_file(self.ask(KEYS.server_map("s0"), b"").payload)
+
+
+@contextmanager
+def serving(path: Path) -> Iterator[Asker]:
+    hub = MemoryHub()
+    bus, asker = MemoryBus(hub), MemoryBus(hub)
+    try:
+        with MapServer(bus, KEYS, path, "s0", ServerSettings(lockstep=True)):
+            yield Asker(asker)
+    finally:
+        asker.close()
+        bus.close()
+
+
+def links(content: MapFile) -> set[tuple[NodeId, NodeId]]:
+    return {link.pair for link in merged_of(content).links}
+
+
+def same(one: MergedMap, two: MergedMap) -> None:
+    assert [link.pair for link in one.links] == [link.pair for link in two.links]
+    assert [(r.pair, r.reason, r.edge) for r in one.refused] == [
+        (r.pair, r.reason, r.edge) for r in two.refused
+    ]
+    assert one.components == two.components and one.rulings.made == two.rulings.made
+    for node, place in one.postures.items():
+        other = two.postures[node]
+        assert place.component == other.component
+        assert np.allclose(
+            place.merged_from_robot.mean.vector, other.merged_from_robot.mean.vector, atol=1e-5
+        )
+        assert np.allclose(
+            place.merged_from_robot.covariance, other.merged_from_robot.covariance, rtol=1e-3, atol=1e-8
+        )
+
+
+def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
+    with serving(path) as asker:
+        content = asker.merged()
+        pair = min(pair for pair in links(content) if pair[0].map != pair[1].map)
+        reply = asker.ask(KEYS.explain("s0"), encode_explain_request(ExplainRequest(pair)))
+        told = decode_pair(reply.payload)
+        assert told.standing is Standing.LINKED and (told.a.id, told.b.id) == pair
+        assert len(told.shared) == told.evidence["inliers"] and told.witnesses
+        assert asker.maps().joined
+        everything = decode_maps(
+            asker.ask(KEYS.explain("s0"), encode_explain_request(ExplainRequest())).payload
+        )
+        assert everything == (asker.maps(),)
+        unknown = ExplainRequest((NodeId("z", 1, 1), pair[0]))
+        reply = asker.ask(KEYS.explain("s0"), encode_explain_request(unknown))
+        assert "there is no map z.1; known are: a.1, b.1" in reply.error
+
+
+def test_what_is_undone_stays_undone_when_the_server_is_started_again(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    with serving(path) as asker:
+        assert str(asker.status()["event"]).startswith("a.1 and b.1 are one map now, by ")
+        assert asker.maps().joined
+        reply = asker.rule((A, B))
+        assert "two kitchens" in str(decode_record(reply.payload)["said"])
+        assert not asker.maps().joined and "undone with all links" in asker.maps().reason
+        event = str(asker.status()["event"])
+        assert event.startswith("a.1 and b.1 are no longer one map: ") and "anna" in event
+        assert event in caplog.messages
+        assert asker.status()["rulings"] == 1
+    with serving(path) as asker:
+        told = asker.maps()
+        assert not told.joined and [r.because for r in told.rulings] == ["two kitchens"]
+        assert "apart already" in asker.rule((A, B)).error
+        assert not asker.rule((A, B), apart=False).error
+        assert asker.maps().joined and len(asker.maps().rulings) == 2
+        assert "nothing that people have ruled keeps" in asker.rule((A, B), apart=False).error
+    with serving(path) as asker:
+        assert asker.maps().joined
+
+
+def test_one_link_of_many_can_be_undone(path: Path) -> None:
+    with serving(path) as asker:
+        before = links(asker.merged())
+        pair = min(before)
+        assert not asker.rule(pair).error
+        assert links(asker.merged()) == before - {pair}
+        neighbours = (NodeId("a", 1, 1), NodeId("a", 1, 3))
+        if neighbours not in before:
+            assert "nothing to undo" in asker.rule(neighbours).error
+
+
+def test_merged_without_a_server_is_the_same(path: Path) -> None:
+    with serving(path) as asker:
+        asker.rule(min(links(asker.merged())))
+        served = asker.merged()
+    offline = Merger()
+    for map_id, bodies in logs().items():
+        # As robots' files hold them.
+        content = unpack_map_file(pack_map_file(MapFile("agent", str(map_id), tuple(bodies))))
+        for body in content.changes:
+            offline.apply(map_id, body)
+    offline.rule(merged_of(served).rulings)
+    same(offline.merged(), merged_of(served))
+
+
+def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
+    with serving(path) as asker:
+        asker.rule((A, B))
+        content = asker.merged()
+    merged = merged_of(content)
+    again = unpack_map_file(pack_map_file(map_file_of(merged)))
+    same(merged, merged_of(again))
+    assert {r.pair: r.link is None for r in merged.refused} == {
+        r.pair: r.link is None for r in merged_of(again).refused
+    }
+    whole = {map_id: (set(one.nodes), set(one.edges)) for map_id, one in maps_of(content).items()}
+    for map_id, bodies in logs().items():
+        assert whole[map_id] == (
+            {body.node.id for body in bodies if isinstance(body, NodePut)},
+            {body.edge.id for body in bodies if isinstance(body, EdgePut)},
+        )
+    for link in merged.links:
+        (edge,) = [b.edge for b in content.changes if isinstance(b, EdgePut) and b.edge.id == link.edge().id]
+        assert 0.0 < edge.evidence["probability"] < 1.0
+
+
+def test_a_damaged_record_of_rulings_is_said(path: Path) -> None:
+    store = Store(path)
+    store.put_result("rulings", b"rubbish")
+    with pytest.raises(InvalidFile, match="record of rulings is damaged"):
+        RulingBook(store)
+    store.close()
