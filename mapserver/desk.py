@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
 
-from hybridmap.errors import Busy
+from hybridmap.errors import Busy, SettingsError
 
 _T = TypeVar("_T")
 
@@ -21,7 +21,9 @@ class DeskSettings:
 
     Attributes:
         workers: threads; 0: whoever asks does the work itself, one after the other and without a limit.
-        longest_wait: a question that would wait longer for a worker is refused, s.
+        longest_wait: a question that would wait longer for a worker, as far as is known, is refused, s.
+        too_late: one that has waited so many times as long all the same is refused, too: the others behind it
+            are answered in time then.
         first_guess: how long a question takes, before any was answered, s.
         smoothing: weight of the newest question in the mean time that one takes.
         longest_pause: nobody is sent away for longer, s.
@@ -29,9 +31,27 @@ class DeskSettings:
 
     workers: int = min(os.cpu_count() or 1, 4)
     longest_wait: float = 0.5
-    first_guess: float = 0.03
-    smoothing: float = 0.1
+    too_late: float = 1.5
+    first_guess: float = 0.1
+    smoothing: float = 0.2
     longest_pause: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work.
+
+        Raises:
+            SettingsError: a number out of range.
+        """
+        if not 0 <= self.workers <= 64:
+            raise SettingsError(f"desk: {self.workers} workers; use 0 to 64")
+        if not (self.longest_wait >= 0.0 and self.first_guess > 0.0 and self.longest_pause > 0.0):
+            raise SettingsError(
+                "desk: longest_wait must not be negative, first_guess and longest_pause positive"
+            )
+        if not self.too_late >= 1.0:
+            raise SettingsError(f"desk: too_late {self.too_late:g} must be 1 or more")
+        if not 0.0 < self.smoothing <= 1.0:
+            raise SettingsError(f"desk: smoothing {self.smoothing:g} must be above 0 and at most 1")
 
 
 class Desk:
@@ -64,7 +84,7 @@ class Desk:
         """Have something done.
 
         Returns:
-            Its result, or what it raised, some time later.
+            Its result, or what it raised, some time later; Busy if it has waited too long.
 
         Raises:
             Busy: it would wait too long; nothing was done.
@@ -82,7 +102,8 @@ class Desk:
                 self._refused += 1
                 raise Busy(self._next_appointment(wait))
             self._open += 1
-        return self._pool.submit(self._timed, work)
+        came = self._clock()
+        return self._pool.submit(self._in_time, work, came)
 
     def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
@@ -107,10 +128,19 @@ class Desk:
     def _next_appointment(self, wait: float) -> float:
         """In how many seconds somebody may come again: when the queue is half empty, behind all others."""
         s, now = self._settings, self._clock()
-        first = now + wait - 0.5 * s.longest_wait
+        first = now + max(wait - 0.5 * s.longest_wait, 0.0)
         self._appointment = max(self._appointment, first) + self._seconds / s.workers
         self._appointment = min(self._appointment, now + s.longest_pause)
         return self._appointment - now
+
+    def _in_time(self, work: Callable[[], _T], came: float) -> _T:
+        """What a worker does with a question when its turn has come."""
+        with self._lock:
+            if self._clock() - came > self._settings.too_late * self._settings.longest_wait:
+                self._open -= 1
+                self._refused += 1
+                raise Busy(self._next_appointment(self._wait()))
+        return self._timed(work)
 
     def _timed(self, work: Callable[[], _T]) -> _T:
         began = self._clock()

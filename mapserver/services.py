@@ -74,7 +74,8 @@ class Services:
             closing.close()
 
     def _relocalize_later(self, request: Request) -> None:
-        self._desk.submit(lambda: guarded(self._relocalize)(request))
+        done = self._desk.submit(lambda: self._relocalize(request.payload))
+        done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)

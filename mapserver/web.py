@@ -16,6 +16,7 @@ import logging
 import math
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from http import HTTPStatus
@@ -240,9 +241,9 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self.connection.shutdown(socket.SHUT_WR)
             self.connection.settimeout(1.0)
-            for _ in range(64):
-                if not self.connection.recv(1 << 18):
-                    return
+            end = time.monotonic() + PATIENCE
+            while self.connection.recv(1 << 18) and time.monotonic() < end:
+                pass
         except OSError:
             return
 

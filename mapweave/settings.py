@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from agent.pipeline import PipelineSettings
+from mapserver.desk import DeskSettings
 from wire.tables import build, read_toml
 
 
@@ -26,10 +27,17 @@ class NetworkSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """All settings of a process; each role reads what it needs."""
+    """All settings of a process; each role reads what it needs.
+
+    Attributes:
+        network: how to reach the fleet.
+        pipeline: of an agent.
+        desk: how a map server shares out the questions that take long.
+    """
 
     network: NetworkSettings = dataclasses.field(default_factory=NetworkSettings)
     pipeline: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
+    desk: DeskSettings = dataclasses.field(default_factory=DeskSettings)
 
 
 def load_settings(path: Path | None) -> Settings:

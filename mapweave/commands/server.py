@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
-        how = ServerSettings(lockstep=arguments.lockstep)
+        how = ServerSettings(lockstep=arguments.lockstep, desk=settings.desk)
         with ExitStack() as stack:
             server = MapServer(bus, keys, arguments.data / f"{name}.sqlite", name, how)
             stack.enter_context(server)

@@ -101,6 +101,30 @@ def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
         desk.close()
 
 
+def test_what_has_waited_too_long_is_refused_at_its_turn() -> None:
+    """Each question takes four times as long as was thought."""
+    clock = Clock()
+    settings = DeskSettings(1, longest_wait=0.5, too_late=1.5, first_guess=0.1)
+    desk, go, waited = Desk(settings, clock), threading.Event(), []
+
+    def work(came: float) -> None:
+        assert go.wait(10)
+        waited.append(clock.now - came)
+        clock.now += 0.4
+
+    futures = [desk.submit(lambda: work(100.0)) for _ in range(5)]
+    go.set()
+    refusals = [future.exception(10) for future in futures]
+    assert waited == pytest.approx([0.0, 0.4])
+    for refusal in refusals[2:]:
+        assert isinstance(refusal, Busy)
+        assert 0.0 < refusal.retry_after <= settings.longest_pause
+    assert refusals[:2] == [None, None]
+    assert desk.counters()["busy"] == 3
+    assert desk.counters()["open"] == 0
+    desk.close()
+
+
 def test_closing_finishes_what_was_taken_on() -> None:
     desk = Desk(DeskSettings(1, longest_wait=60.0))
     done: list[int] = []

@@ -44,7 +44,7 @@ class Served:
         self.room = room
         hub = MemoryHub()
         self.bus, self.asker = MemoryBus(hub), MemoryBus(hub)
-        desk = DeskSettings(workers=2, longest_wait=0.2, first_guess=0.1)
+        desk = DeskSettings(workers=2, longest_wait=0.2, too_late=1e3, first_guess=0.1)
         settings = ServerSettings(lockstep=lockstep, desk=desk)
         self.server = MapServer(self.bus, KEYS, room.path, "s0", settings)
         self.nodes = sorted(room.truth)
