@@ -21,6 +21,7 @@ from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.recognition import Recognition, register
+from hybridmap.selection import SelectionSettings, choose, worth
 
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
@@ -35,6 +36,7 @@ class CartographerSettings:
 
     Attributes:
         most_landmarks: landmarks that a node keeps.
+        selection: what a node may cost on the wire, and which landmarks it keeps if they cost more.
         least_landmarks: a view with fewer becomes no node.
         depth_share: a landmark is kept if its depth's sigma is below this share of the depth.
         depth_floor: what a depth is never better than: m, and share of the depth.
@@ -52,6 +54,7 @@ class CartographerSettings:
     """
 
     most_landmarks: int = 150
+    selection: SelectionSettings = field(default_factory=SelectionSettings)
     least_landmarks: int = 6
     depth_share: float = 0.25
     depth_floor: tuple[float, float] = (0.01, 0.015)
@@ -225,16 +228,19 @@ class Cartographer:
             depths[seat[sure]] = ahead[sure]
             sigmas[seat[sure]] = np.sqrt(np.maximum(spread[sure], 1e-12))
         with np.errstate(invalid="ignore"):
-            good = np.flatnonzero((depths > 0.05) & (sigmas < s.depth_share * depths))[: s.most_landmarks]
+            good = np.flatnonzero((depths > 0.05) & (sigmas < s.depth_share * depths))
         # Tracks err alike for a while, which neither filter nor triangulation knows.
         sigmas = np.hypot(sigmas, s.depth_floor[0] + s.depth_floor[1] * depths)
         landmarks = Landmarks(
             view.features.pixels[good].astype(np.float32), view.features.codes[good],
             depths[good].astype(np.float32), sigmas[good].astype(np.float32),
         )  # fmt: skip
+        seen = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
+        likely = worth(seen, good / max(len(view.tracks), 1))
+        kept = choose(landmarks, likely, camera, s.selection)[: s.most_landmarks]
         # Rounded now, the robot works with the same numbers as everybody who gets the node.
-        landmarks, order = settle(landmarks, camera)
-        return landmarks, view.tracks[good[order]]
+        landmarks, order = settle(landmarks.take(kept), camera)
+        return landmarks, view.tracks[good[kept[order]]]
 
     def _edge(self, a: Placed, b: Placed, a_from_b: PoseGaussian) -> Edge:
         _, in_a, in_b = np.intersect1d(a.tracks, b.tracks, return_indices=True)

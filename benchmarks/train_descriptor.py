@@ -47,6 +47,15 @@ FEATURES = 700
 STEP = 0.035
 """Finer steps keep hardly more matches, see docs/decisions/landmarks.md."""
 
+WHITENING = 0.5
+"""0: principal components, 1: linear discriminants."""
+
+FLOOR = 0.1
+"""Share of the mean variance of change that is added to every direction: so much is not known of it."""
+
+SAME_PX, SAME_DISTANCE = 3.0, 0.75
+"""Features this near to each other are the same one, if they look alike at all."""
+
 SMOOTHING = 0.01
 """Share of each column's frequencies that is spread widely: other images have other tails."""
 
@@ -57,47 +66,72 @@ SHARE_FLOOR, SHARE_DECAY, UNKNOWN = 0.02, 0.6, 0.02
 """Depths are seldom known better than to 2 %, e times as badly is 5 times as rare, and some not at all."""
 
 
-def sift_of(image: Image) -> NDArray[np.float32]:
-    """(N, 128) descriptors."""
+def sift_of(image: Image) -> tuple[Array, NDArray[np.float32]]:
+    """Pixels (N, 2) and descriptors (N, 128)."""
     detector = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02)  # type: ignore[attr-defined]
-    found = detector.detectAndCompute(image, None)[1]
-    return np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
+    keypoints, found = detector.detectAndCompute(image, None)
+    if found is None:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    return np.array([k.pt for k in keypoints], np.float64), np.asarray(found, np.float32)
 
 
-def training_images() -> list[Image]:
-    """Photographs and pages, and each from elsewhere."""
+def warped_descriptors() -> tuple[NDArray[np.float32], Array]:
+    """SIFT (N, 128) of photographs and pages, and what changes in RootSIFT (M, 128) when they are warped."""
     rng = np.random.default_rng(SEED)
     images = [load(name) for name in TRAINED_ON] + [printed_page(rng) for _ in range(PRINTED_PAGES)]
-    return [seen for image in images for _ in range(WARPS) for seen in (image, warp(image, rng)[0])]
+    every, changes = [], []
+    for image in track(images, "training images"):
+        pixels, sift = sift_of(image)
+        for _ in range(WARPS):
+            other, b_from_a = warp(image, rng)
+            pixels_b, sift_b = sift_of(other)
+            every += [sift, sift_b]
+            at = cv2.perspectiveTransform(pixels[:, None], b_from_a)[:, 0]
+            a, b = np.nonzero(np.linalg.norm(at[:, None] - pixels_b[None], axis=2) < SAME_PX)
+            change = root_sift(sift[a]) - root_sift(sift_b[b])
+            # Features of other sizes and orientations at the same place are others.
+            changes.append(change[np.linalg.norm(change, axis=1) < SAME_DISTANCE])
+    return np.concatenate(every), np.concatenate(changes).astype(np.float64)
 
 
-def room_images() -> list[Image]:
-    """Views of simulated rooms."""
+def room_descriptors() -> NDArray[np.float32]:
+    """SIFT (N, 128) of views of simulated rooms."""
     rng = np.random.default_rng(SEED + 1)
-    return [room_drive(rng, 1).images[0] for _ in track(range(ROOMS), "rooms")]
+    views = [room_drive(rng, 1).images[0] for _ in track(range(ROOMS), "rooms")]
+    return np.concatenate([sift_of(view)[1] for view in views])
 
 
 def train() -> LandmarkTables:
     """Make the tables; always the same ones."""
-    images = np.concatenate([sift_of(image) for image in track(training_images(), "training images")])
-    mean, basis = principal_axes(root_sift(images).astype(np.float64))
+    images, changes = warped_descriptors()
+    mean, basis = telling_axes(root_sift(images).astype(np.float64), changes)
     bare = np.full((DIMENSIONS, SYMBOLS), (1 << TOTAL_BITS) // SYMBOLS)
     tables = LandmarkTables(mean, basis, STEP, bare, share_frequencies(), cell_frequencies())
-    rooms = np.concatenate([sift_of(image) for image in room_images()])
     # As many of both kinds: a robot sees rooms, but nobody knows which.
-    codes = [quantise(project(sift, tables), tables) for sift in (images, rooms)]
+    codes = [quantise(project(sift, tables), tables) for sift in (images, room_descriptors())]
     shares = [np.array([np.bincount(c[:, k], minlength=SYMBOLS) for k in range(DIMENSIONS)]) for c in codes]
     counts = sum(s / s.sum(axis=1, keepdims=True) for s in shares) / 2
     frequencies = np.array([whole_frequencies(widened(row)) for row in counts])
     return LandmarkTables(mean, basis, STEP, frequencies, tables.shares, tables.cells)
 
 
-def principal_axes(roots: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and the axes of greatest spread, in half precision as they are stored."""
+def telling_axes(roots: Array, changes: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and the axes that tell features apart, in half precision as they are stored.
+
+    Half way between principal components and linear discriminants (Mikolajczyk and Matas, ICCV 2007):
+    before the axes of greatest spread are taken, directions in which the same feature changes from view to
+    view are shortened, by the fourth root of that variance. Then all are scaled to the spread of before.
+    """
     mean = roots.mean(axis=0)
-    centred = roots - mean
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    basis = vectors[:, ::-1][:, :DIMENSIONS]
+    spread = np.cov(roots.T)
+    change = changes.T @ changes / (2 * len(changes))
+    change += FLOOR * np.trace(change) / len(change) * np.eye(len(change))
+    values, vectors = np.linalg.eigh(change)
+    shorten = (vectors * values ** (-WHITENING / 2)) @ vectors.T
+    _, axes = np.linalg.eigh(shorten @ spread @ shorten)
+    basis = shorten @ axes[:, ::-1]
+    basis *= np.sqrt(np.trace(spread) / np.trace(basis.T @ spread @ basis))
+    basis = basis[:, :DIMENSIONS]
     basis *= np.sign(basis[np.abs(basis).argmax(axis=0), np.arange(DIMENSIONS)])
     return mean.astype(np.float32), basis.astype(np.float16).astype(np.float32)
 
@@ -146,9 +180,9 @@ def bits_of(codes: NDArray[np.uint8], tables: LandmarkTables) -> float:
 def compared(tables: LandmarkTables) -> dict[str, Any]:
     """What trained tables cost, and how far they are from the shipped ones."""
     rng = np.random.default_rng(SEED + 2)
-    rooms = np.concatenate([sift_of(room_drive(rng, 1).images[0]) for _ in range(10)])
-    held_out = np.concatenate([sift_of(load(name)) for name in HELD_OUT])
-    trained = np.concatenate([sift_of(load(name)) for name in TRAINED_ON])
+    rooms = np.concatenate([sift_of(room_drive(rng, 1).images[0])[1] for _ in range(10)])
+    held_out = np.concatenate([sift_of(load(name))[1] for name in HELD_OUT])
+    trained = np.concatenate([sift_of(load(name))[1] for name in TRAINED_ON])
     bits = {
         f"bits_{name}": bits_of(quantise(project(sift, tables), tables), tables)
         for name, sift in (("trained_on", trained), ("held_out", held_out), ("other_rooms", rooms))

@@ -1,10 +1,10 @@
-"""Compact SIFT: 512 bytes become 32 small numbers, about 13.5 bytes on the wire, and most matches survive.
+"""Compact SIFT: 512 bytes become 32 small numbers, about 13.3 bytes on the wire, and most matches survive.
 
 A descriptor is made RootSIFT (Arandjelovic and Zisserman, CVPR 2012: divide by the L1 norm, take square
-roots, so that Euclidean distance compares histograms by the Hellinger kernel), centred, projected on a
-fixed 32-dimensional PCA basis, and each coordinate is rounded to a whole number of steps, the same step for
-all. With a coder that spends bits by frequency (wire.landmark_codec) that is within a quarter of a bit a
-coordinate of the best that any rounding can do (Gish and Pierce 1968).
+roots, so that Euclidean distance compares histograms by the Hellinger kernel), centred, projected on 32 fixed
+axes that tell features apart (benchmarks.train_descriptor), and each coordinate is rounded to a whole number
+of steps, the same step for all. With a coder that spends bits by frequency (wire.landmark_codec) that is
+within a quarter of a bit a coordinate of the best that any rounding can do (Gish and Pierce 1968).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def decode(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
         codes: (N, 32) uint8.
 
     Returns:
-        (N, 32) float32, centred RootSIFT in the PCA basis.
+        (N, 32) float32, centred RootSIFT on those axes.
 
     Raises:
         InvalidValue: the input is not (N, 32) bytes.

@@ -37,7 +37,7 @@ class LandmarkTables:
 
     Attributes:
         mean: (128,) float32, mean RootSIFT descriptor.
-        basis: (128, 32) float32, orthonormal columns.
+        basis: (128, 32) float32, the axes on which descriptors are projected.
         step: of the grid on which each coordinate is rounded.
         codes: (32, 64) int64, frequencies of the symbols of each coordinate.
         shares: (64,) int64, likewise of a depth's uncertainty, see hybridmap.grid.

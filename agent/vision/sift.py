@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -83,16 +84,23 @@ class Sift:
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Find the features of a grey image (H, W)."""
-        keypoints = self._detector.detect(image, None)
-        keypoints = self._spread(self._trackable(list(keypoints), image), image.shape[1], image.shape[0])
+        keypoints, descriptors = self.describe(image)
         if not keypoints:
             return Features(
                 np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, CODE_BYTES), np.uint8), np.zeros(0)
             )
-        keypoints, descriptors = self._detector.compute(image, keypoints)
         raw = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
         responses = np.array([k.response for k in keypoints], dtype=np.float64)
         return Features(raw, self._lens.undistort(raw), encode(descriptors), responses)
+
+    def describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
+        """The same before they are coded: keypoints, strongest first, and (N, 128) SIFT."""
+        keypoints = self._detector.detect(image, None)
+        keypoints = self._spread(self._trackable(list(keypoints), image), image.shape[1], image.shape[0])
+        if not keypoints:
+            return [], np.zeros((0, 128), np.float32)
+        keypoints, descriptors = self._detector.compute(image, keypoints)
+        return keypoints, np.asarray(descriptors, np.float32)
 
     def _trackable(self, keypoints: list[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[cv2.KeyPoint]:
         """Those that are held in both directions by the image around them (Shi and Tomasi 1994)."""
