@@ -37,6 +37,8 @@ class AppearanceSettings:
         exact: an arrival known no better than this is told as such, m.
         patience: s without getting nearer or surer after which a goal that is nearer than twice what is
             known of it counts as reached: there is nothing more to see.
+        settled: rad, where one landmark would be seen so far off from where it was believed, the way is
+            thought over anew; for less, a plan would be mended all the time.
     """
 
     servo: ServoSettings = field(default_factory=lambda: ServoSettings(field_margin=0.08))
@@ -46,6 +48,7 @@ class AppearanceSettings:
     lost_ticks: int = 10
     exact: float = 0.01
     patience: float = 10.0
+    settled: float = 0.02
 
 
 class AppearanceServo:
@@ -58,6 +61,7 @@ class AppearanceServo:
         self._servo = Servo(description, self.settings.servo)
         self._lost = 0
         self._best, self._waited = math.inf, 0.0
+        self._points: Array = np.zeros((0, 3))
 
     @property
     def switches(self) -> int:
@@ -68,6 +72,7 @@ class AppearanceServo:
         """Take a new goal; see Servo.start."""
         self._lost = 0
         self._best, self._waited = math.inf, 0.0
+        self._points = points_in_goal
         return self._servo.start(goal_from_robot.mean, points_in_goal)
 
     def command(
@@ -94,7 +99,11 @@ class AppearanceServo:
         self._wait(left + sigma)
         if self._waited > s.patience and left < 2.0 * sigma and sigma > s.exact:
             return self._face(pose, sigma)
-        step = self._servo.command(pose, points_in_goal, visible, obstacles)
+        if self._moved(pose, points_in_goal):
+            # The robot stands elsewhere too: lines drawn from where it was thought to be are wrong.
+            self._points = points_in_goal
+            self._servo.start(pose, points_in_goal)
+        step = self._servo.command(pose, self._points, visible, obstacles)
         if step.state == "arrived":
             return self._arrived(step, sigma)
         if sigma > s.unsure * max(left, 0.05) and step.command.forward != 0.0:
@@ -112,6 +121,17 @@ class AppearanceServo:
     def spread(goal_from_robot: PoseGaussian) -> float:
         """Largest standard deviation of the position, m."""
         return math.sqrt(max(float(np.linalg.eigvalsh(goal_from_robot.covariance[:2, :2])[-1]), 0.0))
+
+    def _moved(self, pose: Pose2, points: Array) -> bool:
+        """Whether landmarks are no longer where the servo believes them, as seen from a posture."""
+        if points.shape != self._points.shape:
+            return True
+        before, now = (pose.inverse().apply(where) for where in (self._points, points))
+        off = np.arctan2(now[:, 1], now[:, 0]) - np.arctan2(before[:, 1], before[:, 0])
+        off = np.abs(np.remainder(off + math.pi, 2.0 * math.pi) - math.pi)
+        # What was never seen is NaN on both sides.
+        same = (off <= self.settings.settled) | (np.isnan(now[:, 0]) & np.isnan(before[:, 0]))
+        return not bool(same.all())
 
     def _wait(self, off: float) -> None:
         """Count for how long the goal has come no nearer, or been known no better: `off` m in all."""

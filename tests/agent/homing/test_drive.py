@@ -88,3 +88,29 @@ def test_it_gives_up_with_a_reason_when_nothing_is_seen() -> None:
     assert steps[-1].state == "stuck"
     assert "fewer than 4" in steps[-1].reason
     assert steps[-1].command.forward == steps[-1].command.turn == 0.0
+
+
+def test_a_way_that_was_drawn_from_a_wrong_place_is_drawn_anew() -> None:
+    """At first the robot thinks itself 40 cm aside; then it knows better, and parks without to and fro."""
+    rng = np.random.default_rng(0)
+    camera = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
+    robot = RobotDescription(camera)
+    depths, slopes = rng.uniform(1.5, 5.0, 40), rng.uniform(-0.5, 0.5, 40)
+    points = np.column_stack([depths, slopes * depths, 0.25 + rng.uniform(-0.3, 0.3, 40) * depths])
+    pose, wrong = Pose2(-1.4, 1.0, 0.2), Pose2(0.2, -0.4, 0.1)
+    servo = AppearanceServo(robot)
+    servo.start(PoseGaussian.from_sigmas(wrong @ pose, 0.3, 0.1), wrong.apply(points))
+    for tick in range(300):
+        visible = camera.contains(camera.project(pose.inverse().apply(points)))
+        if tick < 20:
+            # As bearings have it: robot and landmarks are moved alike, and at the goal they are not.
+            believed, where = PoseGaussian.from_sigmas(wrong @ pose, 0.3, 0.1), wrong.apply(points)
+        else:
+            believed, where = PoseGaussian.from_sigmas(pose, 0.01, 0.005), points
+        step = servo.command(believed, where + 1e-4 * rng.normal(size=points.shape), visible, NOTHING)
+        if step.state == "arrived":
+            break
+        way, turn = step.command.forward * robot.tick, step.command.turn * robot.tick
+        pose = pose @ Pose2(way * math.cos(turn / 2), way * math.sin(turn / 2), turn)
+    assert step.state == "arrived"
+    assert math.hypot(pose.x, pose.y) < 0.01
