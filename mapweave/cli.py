@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from hybridmap.errors import MapweaveError
-from mapweave.commands import agent, demo, map_file, relocalize, replay, server, sim
+from mapweave.commands import agent, demo, evaluate, map_file, relocalize, replay, server, sim
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help."
 
@@ -20,7 +20,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
     )
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (demo, server, sim, agent, map_file, replay, relocalize):
+    for command in (demo, server, sim, agent, map_file, replay, relocalize, evaluate):
         command.add_to(commands)
     return top
 

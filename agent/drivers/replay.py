@@ -54,6 +54,18 @@ def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, f
     return camera, (k1, k2, p1, p2, k3)
 
 
+def images_of(folder: Path) -> list[Path]:
+    """The images of a recording in the order of the numbers in their names.
+
+    Raises:
+        DeviceError: there are none.
+    """
+    images = [p for p in (folder / "images").glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        raise DeviceError(f"{folder}: no images in images/ (png, jpg, pgm or bmp)")
+    return sorted(images, key=_natural_order)
+
+
 class Replay:
     """The Robot protocol over a recording. It takes no commands."""
 
@@ -72,10 +84,7 @@ class Replay:
                 f"{folder}: no such folder; a recording is a folder with images/ and camera.toml"
             )
         self._camera, self._distortion = read_camera(folder / "camera.toml")
-        images = [p for p in (folder / "images").glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
-        if not images:
-            raise DeviceError(f"{folder}: no images in images/ (png, jpg, pgm or bmp)")
-        self._images = sorted(images, key=_natural_order)
+        self._images = images_of(folder)
         self._times = _read_times(folder / "times.txt", len(self._images))
         self._odometry = _read_odometry(folder / "odometry.csv", len(self._images))
         self._frames = _read_split(folder / "splits.toml", robot, len(self._images))

@@ -32,6 +32,8 @@ COMMANDS = [
     "map show",
     "replay",
     "relocalize",
+    "eval",
+    "eval relocalize",
 ]
 
 

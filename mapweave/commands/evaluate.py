@@ -1,0 +1,73 @@
+"""`mapweave eval`: how well something works on a recording of one's own."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command and what it can evaluate."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "eval",
+        help="measure on a recording of your own",
+        description="Measure how well something works on real recordings.",
+        epilog="Each has its own --help.",
+    )
+    kinds = parser.add_subparsers(title="what", metavar="WHAT", required=True)
+    relocalize: argparse.ArgumentParser = kinds.add_parser(
+        "relocalize",
+        help="map from one pass of a recording, ask from the others",
+        description="Map from one pass of a recording, ask where each image of the others was taken, and "
+        "print recall and error. A drive with odometry.csv and splits.toml: the first robot maps as if "
+        "carried along, the others ask; truth.csv tells what is right. Photographs with lap_truth.csv: the "
+        "images that are no query are the map, by appearance alone.",
+    )
+    relocalize.add_argument("folder", type=Path, help="recording: images/ and what it has besides")
+    relocalize.add_argument(
+        "--camera", type=Path, metavar="FILE", help="camera.toml for photographs (default: the folder's)"
+    )
+    relocalize.add_argument(
+        "--focal", type=float, metavar="PX", help="focal length for photographs without a camera.toml"
+    )
+    relocalize.add_argument("--out", type=Path, metavar="DIR", help="write each answer to a table there")
+    relocalize.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    relocalize.add_argument(
+        "--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline"
+    )
+    relocalize.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Examine and print."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapweave.commands.network import settings_of
+    from mapweave.examination.examine import examine
+
+    pipeline = settings_of(arguments).pipeline
+    console = Console(stderr=True)
+    examination = examine(arguments.folder, arguments.camera, arguments.focal, pipeline, console)
+    report = examination.report()
+    if arguments.out is not None:
+        for path in examination.write(arguments.out):
+            console.print(f"answers in {path}")
+    if arguments.json:
+        print(json.dumps(report))
+        return 0
+    flat = {name: value for name, value in report.items() if not isinstance(value, dict)}
+    others = {name: value for name, value in report.items() if isinstance(value, dict)}
+    table = Table("", str(report["verified"]), *others, title=f"{arguments.folder}")
+    for name, value in flat.items():
+        if name != "verified":
+            table.add_row(name, _shown(value), *(_shown(other.get(name, "")) for other in others.values()))
+    Console(file=sys.stdout).print(table)
+    return 0
+
+
+def _shown(value: object) -> str:
+    return "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

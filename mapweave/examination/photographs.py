@@ -1,0 +1,240 @@
+"""Photographs of a walk without odometry: images of the first pass are places, those of the second ask.
+
+Depths cannot be had from one image every few metres without a known focal length, so the places are nodes
+whose landmarks have none: appearance alone. A candidate is verified by epipolar geometry. That of a robot,
+whose camera stays level at one height, is more exacting than that of a camera that is carried by hand; both
+judge the same candidates.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.drivers.replay import images_of
+from agent.observation import RobotDescription
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.bearing_recognition import recognise_bearings
+from hybridmap.camera import Camera
+from hybridmap.errors import DeviceError
+from hybridmap.evidence import cells
+from hybridmap.matching import match
+from hybridmap.node import Landmarks, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, View
+from mapserver.placeindex import PlaceIndex
+from mapweave.examination.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class PhotographSettings:
+    """When an image counts as recognised; the numbers are as in BearingRecognitionSettings where it has them.
+
+    Attributes:
+        candidates: places that are compared with a question.
+        gate_px: largest distance from an epipolar line.
+        least_inliers: matches that agree.
+        least_share: of all matches.
+        least_cells: cells of the 6 x 4 grid with an inlier, in either image.
+        least_evidence: how much likelier than chance, nats.
+        apart: places further from each other than so many images are not neighbours,
+        comparable: and with this share of the best one's inliers the other one makes it ambiguous.
+    """
+
+    candidates: int = 8
+    gate_px: float = 2.0
+    least_inliers: int = 12
+    least_share: float = 0.5
+    least_cells: int = 4
+    least_evidence: float = 20.0
+    apart: int = 2
+    comparable: float = 0.6
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Which places show what a question shows, by the numbers of their images: from `low` to `high`."""
+
+    best: int
+    low: int
+    high: int
+
+
+class Photographs:
+    """The images of a folder, cut into two passes by its lap_truth.csv.
+
+    Attributes:
+        places: images of the first pass, by number.
+        questions: images of the others.
+        references: what is right for each question; None where no image of the first pass shows the place.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Read the table.
+
+        Raises:
+            DeviceError: a file is missing or wrong.
+        """
+        path = folder / "lap_truth.csv"
+        self.references = _read_references(path)
+        numbered = {_number(image): image for image in images_of(folder)}
+        missing = sorted(set(self.references) - set(numbered))
+        if missing:
+            raise DeviceError(f"{path}: there is no image {missing[0]}")
+        self.questions = {number: numbered[number] for number in self.references}
+        self.places = {n: image for n, image in numbered.items() if n not in self.references}
+        if not self.places:
+            raise DeviceError(f"{path}: every image is a question, so there is no first pass")
+
+
+Geometry = Callable[[Node, View], int]
+"""How many landmarks of a place agree with a view; 0 if it is not recognised."""
+
+
+def planar(node: Node, view: View) -> int:
+    """By the geometry of a level camera at one height (hybridmap.bearing_recognition)."""
+    found = recognise_bearings(node, view, np.random.default_rng(node.id.number))
+    return 0 if found is None else found.inliers
+
+
+def general(node: Node, view: View, settings: PhotographSettings | None = None) -> int:
+    """By the fundamental matrix, which leaves a camera free in all six directions (OpenCV's RANSAC)."""
+    s = settings or PhotographSettings()
+    pairs = match(node.landmarks.codes, view.codes)
+    if len(pairs) < s.least_inliers:
+        return 0
+    here, there = node.landmarks.pixels[pairs[:, 0]], view.pixels[pairs[:, 1]]
+    _, mask = cv2.findFundamentalMat(here, there, cv2.FM_RANSAC, s.gate_px, 0.999, 2000)
+    agreeing = np.zeros(len(pairs), bool) if mask is None else mask[:, 0].astype(bool)
+    count = int(agreeing.sum())
+    if count < max(s.least_inliers, s.least_share * len(pairs)):
+        return 0
+    if evidence(count, len(pairs), s.gate_px, view.camera.height) < s.least_evidence:
+        return 0
+    spread = min(cells(here[agreeing], node.camera), cells(there[agreeing], view.camera))
+    return count if spread >= s.least_cells else 0
+
+
+def evidence(
+    inliers: int, matches: int, gate_px: float, height_px: int, used: int = 7, tries: int = 2000
+) -> float:
+    """Nats: Chernoff's bound on so many wrong matches near their lines, without those that made the lines."""
+    inliers, matches = inliers - used, matches - used
+    chance = 2.0 * gate_px / height_px
+    if matches <= 0 or inliers <= chance * matches:
+        return 0.0
+    share = inliers / matches
+    rest = (1.0 - share) * math.log((1.0 - share) / (1.0 - chance)) if share < 1.0 else 0.0
+    return matches * (share * math.log(share / chance) + rest) - math.log(tries)
+
+
+GEOMETRIES: dict[str, Geometry] = {"general": general, "planar": planar}
+
+
+class AppearanceMap:
+    """Places by their looks alone."""
+
+    def __init__(
+        self, camera: Camera, distortion: tuple[float, ...], settings: PhotographSettings | None = None
+    ):
+        """Begin with none, for a camera and its lens."""
+        self._camera = camera
+        self._sift = Sift(Lens(RobotDescription(camera, distortion)))  # type: ignore[arg-type]
+        self._settings = settings or PhotographSettings()
+        self._index = PlaceIndex()
+        self._nodes: dict[int, Node] = {}
+
+    def add(self, number: int, image: Path) -> None:
+        """One more place."""
+        view = self._view(image)
+        unknown = np.full(len(view), np.nan, np.float32)
+        landmarks = Landmarks(view.pixels, view.codes, unknown, unknown)
+        nowhere = PoseGaussian(Pose2(), np.zeros((3, 3)))
+        self._nodes[number] = Node(NodeId("photo", 1, number), 0, nowhere, self._camera, landmarks)
+        self._index.add(self._nodes[number])
+
+    def ask(self, number: int, image: Path, reference: Reference | None) -> Iterator[tuple[str, Verdict]]:
+        """Where an image was taken, by each geometry."""
+        began = time.perf_counter()
+        view = self._view(image)
+        extract_ms = 1e3 * (time.perf_counter() - began)
+        for name, geometry in GEOMETRIES.items():
+            began = time.perf_counter()
+            ranked = [node_id.number for node_id, _ in self._index.query(view, self._settings.candidates)]
+            certainty, place = self._judge(ranked, view, geometry)
+            answer_ms = 1e3 * (time.perf_counter() - began)
+            yield (
+                name,
+                Verdict(
+                    query=str(number),
+                    expected=reference is not None,
+                    certainty=certainty,
+                    place="" if place is None else str(place),
+                    right=None if place is None else _is_right(place, reference),
+                    first=_is_right(ranked[0], reference) if ranked else False,
+                    error_frames=math.nan
+                    if place is None or reference is None
+                    else abs(place - reference.best),
+                    extract_ms=extract_ms,
+                    answer_ms=answer_ms,
+                ),
+            )
+
+    def _judge(self, ranked: list[int], view: View, geometry: Geometry) -> tuple[Certainty, int | None]:
+        s = self._settings
+        inliers = {number: geometry(self._nodes[number], view) for number in ranked}
+        best = max(ranked, key=lambda number: inliers[number], default=None)
+        if best is None or not inliers[best]:
+            return Certainty.UNKNOWN, None
+        rivals = [n for n in ranked if abs(n - best) > s.apart and inliers[n] >= s.comparable * inliers[best]]
+        return (Certainty.AMBIGUOUS if rivals else Certainty.FOUND), best
+
+    def _view(self, path: Path) -> View:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise DeviceError(f"{path}: not an image that can be read")
+        if image.shape != (self._camera.height, self._camera.width):
+            raise DeviceError(
+                f"{path} is {image.shape[1]}x{image.shape[0]} px, "
+                f"but the camera's images are {self._camera.width}x{self._camera.height}"
+            )
+        grey: NDArray[np.uint8] = np.asarray(image, np.uint8)
+        return self._sift.extract(grey).view(self._camera)
+
+
+def _is_right(place: int, reference: Reference | None) -> bool:
+    return reference is not None and reference.low <= place <= reference.high
+
+
+def _number(image: Path) -> int:
+    digits = re.findall(r"\d+", image.stem)
+    if not digits:
+        raise DeviceError(f"{image}: no number in its name")
+    return int(digits[-1])
+
+
+def _read_references(path: Path) -> dict[int, Reference | None]:
+    references: dict[int, Reference | None] = {}
+    try:
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                best, low, high = (row[name] for name in ("ref_best", "ref_lo", "ref_hi"))
+                known = Reference(int(best), int(low), int(high)) if best else None
+                references[int(row["query"])] = known
+    except KeyError as missing:
+        raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    if not references:
+        raise DeviceError(f"{path}: no questions in it")
+    return references
