@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from agent.driven import driven_edge
 from agent.ekf.triangulation import triangulate
 from agent.observation import RobotDescription
+from agent.placed import HERE, Placed
 from agent.surveyor import Traverse
 from agent.tracking import Tracking
 from agent.view import View
@@ -18,16 +19,13 @@ from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.grid import settle
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.pose import PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.recognition import Recognition, register
 from hybridmap.selection import SelectionSettings, choose, worth
 
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
-
-HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
-"""A posture relative to itself."""
 
 
 @dataclass(frozen=True)
@@ -67,23 +65,6 @@ class CartographerSettings:
     loop_sigma: float = 0.12
     loop_gate: float = 25.0
     loop_floor: tuple[float, float] = (0.05, 0.03)
-
-
-@dataclass(eq=False)
-class Placed:
-    """A node that was made or recognised, and where the current anchor stands from it.
-
-    Attributes:
-        node: the node.
-        tracks: (N,) the track of each landmark, -1 for one that has none.
-        node_from_anchor: posture of the current anchor.
-        evidence: of its recognition; empty for a node that was just made.
-    """
-
-    node: Node
-    tracks: NDArray[np.int64]
-    node_from_anchor: PoseGaussian = HERE
-    evidence: dict[str, float] = field(default_factory=dict)
 
 
 class Cartographer:

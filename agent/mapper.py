@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agent.cartographer import HERE, Cartographer, CartographerSettings
+from agent.cartographer import Cartographer, CartographerSettings
 from agent.ekf.report import Health
 from agent.observation import Observation, RobotDescription
+from agent.placed import HERE
 from agent.surveyor import Traverse
 from agent.track_settings import TrackingSettings
 from agent.tracking import Tracking

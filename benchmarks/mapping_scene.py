@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.cartographer import HERE
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings
 from agent.exploration import ExplorerSettings
 from agent.mapper import MapperSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
+from agent.placed import HERE
 from agent.servo.image_drive import ImageDrive, ImageDriveSettings
 from agent.tracking import Tracking
 from agent.view import View

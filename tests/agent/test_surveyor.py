@@ -82,16 +82,16 @@ def test_a_passage_is_told_when_the_next_node_is_reached():
 
 
 def test_what_is_measured_is_as_good_as_it_says():
-    """Means over 200 drives: no surer than it is right, and not much less sure either."""
+    """The mean over 60 drives: no surer than it is right, and not much less sure either."""
     nees = []
-    for seed in range(200):
+    for seed in range(60):
         drive = Drive(seed, SurveyorSettings(floor=(0.0, 0.0)))
         drive.by(A, 20)
         drive.by(None, 10)
         drive.by(B, 60)
         [traverse] = drive.measured
         nees.append(traverse.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[B]))
-    assert 1.0 < np.mean(nees) < 3.6
+    assert 1.0 < np.mean(nees) < 4.0
 
 
 def test_a_node_that_was_not_come_near_is_passed_over():

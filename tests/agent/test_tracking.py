@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from agent.cartographer import HERE
 from agent.observation import Observation, Odometry
+from agent.placed import HERE
 from agent.track_settings import TrackingSettings
 from agent.tracking import Tracking
 from agent.vision.lens import Lens
