@@ -5,10 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
+import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import add_network, connect, network_of, settings_of
+
+if TYPE_CHECKING:
+    from hybridmap.node import Node, NodeId
+    from hybridmap.query import RelocalizeAnswer
+    from mapweave.settings import NetworkSettings
+    from wire.keys import Keys
+    from wire.zenoh_bus import ZenohBus
 
 
 def add_to(commands: Any) -> None:
@@ -23,6 +32,10 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--camera", type=Path, metavar="FILE",
         help="camera.toml with the intrinsics (default: beside the image or one folder up)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--draw", type=Path, metavar="PNG",
+        help="draw the best candidate's landmarks beside the image, joined where they match",
     )  # fmt: skip
     parser.add_argument("--timeout", type=float, default=5.0, metavar="S", help="longest wait for an answer")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -39,14 +52,18 @@ def run(arguments: argparse.Namespace) -> int:
     from agent.observation import RobotDescription
     from agent.vision.lens import Lens
     from agent.vision.sift import Sift
-    from hybridmap.errors import DeviceError, NotConnected
+    from hybridmap.errors import DeviceError
     from hybridmap.query import Certainty
+    from mapserver.answer_json import answer_record
+    from mapweave.match_picture import draw_matches
     from wire.messages import decode_relocalize_answer, encode_view
 
     places = [arguments.image.parent / "camera.toml", arguments.image.parent.parent / "camera.toml"]
     camera_file = arguments.camera or next((p for p in places if p.exists()), None)
     if camera_file is None:
         raise DeviceError("no camera.toml beside the image: give the intrinsics with --camera FILE")
+    if arguments.draw is not None and arguments.draw.suffix.lower() != ".png":
+        raise DeviceError(f"{arguments.draw}: the picture will be a PNG; end its name with .png")
     camera, distortion = read_camera(camera_file)
     image = cv2.imread(str(arguments.image), cv2.IMREAD_GRAYSCALE) if arguments.image.exists() else None
     if image is None:
@@ -56,46 +73,74 @@ def run(arguments: argparse.Namespace) -> int:
             f"{arguments.image} is {image.shape[1]}x{image.shape[0]} px, "
             f"but {camera_file} says {camera.width}x{camera.height}"
         )
-    features = Sift(Lens(RobotDescription(camera, distortion))).extract(np.asarray(image, np.uint8))
+    grey = np.asarray(image, np.uint8)
+    lens = Lens(RobotDescription(camera, distortion))
+    view = Sift(lens).extract(grey).view(camera)
     network = network_of(arguments, settings_of(arguments))
     bus, keys = connect(network)
+    node: Node | None = None
     try:
-        where = ", ".join(network.endpoints)
-        if not bus.wait_connected(arguments.timeout):
-            raise NotConnected(f"no router at {where}: start `mapweave server` or give --connect")
-        replies = bus.ask(keys.any_relocalize(), encode_view(features.view(camera)), arguments.timeout)
+        payload = _ask(bus, network, keys.any_relocalize(), encode_view(view), arguments.timeout)
+        answer = decode_relocalize_answer(payload)
+        if arguments.draw is not None and answer.candidates:
+            node = _node(bus, keys, network, answer.candidates[0].node, arguments.timeout)
     finally:
         bus.close()
-    if not replies:
-        raise NotConnected(f"a router is up at {where}, but no map server of fleet {network.fleet} answered")
-    good = [r for r in replies if not r.error]
-    if not good:
-        raise NotConnected(f"the map server refused: {replies[0].error}")
-    answer = decode_relocalize_answer(good[0].payload)
-    candidates: list[dict[str, Any]] = []
-    for place in answer.candidates:
-        merged = place.merged_from_robot
-        sigma = np.sqrt(np.diag(place.node_from_robot.covariance))
-        candidates.append({
-            "node": str(place.node),
-            "node_from_robot": place.node_from_robot.mean.vector.tolist(),
-            "sigma": sigma.tolist(),
-            "merged_from_robot": None if merged is None else merged.mean.vector.tolist(),
-            "component": place.component,
-            "inliers": place.inliers,
-            "probability": place.probability,
-        })  # fmt: skip
     if arguments.json:
-        report = {"certainty": str(answer.certainty), "reason": answer.reason, "candidates": candidates}
-        print(json.dumps(report))
+        print(json.dumps(answer_record(answer)))
     else:
-        print(f"{answer.certainty}: {answer.reason}")
-        for row in candidates:
-            x, y, heading = row["node_from_robot"]
-            sx, sy, sh = row["sigma"]
-            print(
-                f"  node {row['node']}: {x:+.3f} m ahead, {y:+.3f} m left, {math.degrees(heading):+.1f} deg "
-                f"(sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
-                f"{row['inliers']} landmarks agree, probability {row['probability']:.3f}"
-            )
+        _print(answer)
+    if node is not None:
+        best = answer.candidates[0].node_from_robot.mean
+        draw_matches(arguments.draw, grey, lens, node, view, best)
+    elif arguments.draw is not None:
+        print(f"{arguments.draw} is not drawn: no place was recognised", file=sys.stderr)
     return 0 if answer.certainty is Certainty.FOUND else 2
+
+
+def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
+    """Ask until somebody answers; a server that is busy is asked again when it said."""
+    from hybridmap.errors import NotConnected
+
+    where, end = ", ".join(network.endpoints), time.monotonic() + patience
+    if not bus.wait_connected(patience):
+        raise NotConnected(f"no router at {where}: start `mapweave server` or give --connect")
+    while True:
+        replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
+        for reply in replies:
+            if not reply.error:
+                return reply.payload
+        if not replies:
+            raise NotConnected(
+                f"a router is up at {where}, but no map server of fleet {network.fleet} answered"
+            )
+        pause = replies[0].retry_after
+        if not pause or time.monotonic() + pause > end:
+            raise NotConnected(f"the map server refused: {replies[0].error}")
+        time.sleep(pause)
+
+
+def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, patience: float) -> Node:
+    """A node of the merged map: the beginning of the way from itself to itself."""
+    from hybridmap.errors import NotConnected
+    from wire.messages import RouteRequest, decode_route_answer, encode_route_request
+
+    request = encode_route_request(RouteRequest(node_id, node_id))
+    way = decode_route_answer(_ask(bus, network, keys.any_route(), request, patience))
+    if not way.legs or way.legs[0].node.id != node_id:
+        raise NotConnected(f"the map server did not give node {node_id}: {way.reason}")
+    return way.legs[0].node
+
+
+def _print(answer: RelocalizeAnswer) -> None:
+    import numpy as np
+
+    print(f"{answer.certainty}: {answer.reason}")
+    for place in answer.candidates:
+        x, y, heading = place.node_from_robot.mean.vector
+        sx, sy, sh = np.sqrt(np.diag(place.node_from_robot.covariance))
+        print(
+            f"  node {place.node}: {x:+.3f} m ahead, {y:+.3f} m left, {math.degrees(heading):+.1f} deg "
+            f"(sigma {sx:.3f} m, {sy:.3f} m, {math.degrees(sh):.1f} deg), "
+            f"{place.inliers} landmarks agree, probability {place.probability:.3f}"
+        )

@@ -1,0 +1,172 @@
+"""`mapweave relocalize` and its picture, against a map server over Zenoh in this process."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+
+from agent.observation import RobotDescription
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.camera import Camera
+from hybridmap.change import Change, NodePut
+from hybridmap.errors import Busy
+from hybridmap.node import Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import View
+from mapserver.entry import Entry
+from mapserver.server import MapServer
+from mapserver.services import Services
+from mapserver.store import Store
+from mapweave.cli import main
+from mapweave.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
+from wire.bus_settings import BusSettings
+from wire.codec import encode_change
+from wire.keys import Keys
+from wire.zenoh_bus import ZenohBus
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
+CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+WALL = 2.4
+"""Distance of the photographed wall from the node, m."""
+MOVED = Pose2(0.3, 0.1, 0.06)
+"""`node_from_robot` of the robot that asks."""
+
+
+def picture(node_from_robot: Pose2) -> np.ndarray:
+    """(240, 320) grey: one photograph on a wall and one, half hidden, half a metre behind it."""
+    image = np.full((240, 320), 90, np.uint8)
+    hung = [
+        (skimage.data.coffee(), WALL + 0.6, 0.3, 1.6, 2.6),
+        (skimage.data.astronaut(), WALL, 1.7, 1.2, 1.6),
+    ]
+    for photo, x, y, z, width in hung:
+        grey = cv2.GaussianBlur(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+        height = width * grey.shape[0] / grey.shape[1]
+        corners = np.array([[x, y, z], [x, y - width, z], [x, y - width, z - height], [x, y, z - height]])
+        seen = CAMERA.project(node_from_robot.inverse().apply(corners)).astype(np.float32)
+        own = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (grey.shape[1], grey.shape[0]) - 0.5
+        to_image = cv2.getPerspectiveTransform(own.astype(np.float32), seen)
+        mask = cv2.warpPerspective(np.full_like(grey, 255), to_image, (320, 240))
+        drawn = cv2.warpPerspective(grey, to_image, (320, 240), flags=cv2.INTER_AREA)
+        image = np.where(mask > 127, drawn, image).astype(np.uint8)
+    return image
+
+
+def view_of(image: np.ndarray) -> View:
+    return Sift(Lens(RobotDescription(CAMERA))).extract(image).view(CAMERA)
+
+
+@pytest.fixture(scope="module")
+def node() -> Node:
+    """The place, with depths as they are."""
+    view = view_of(picture(Pose2()))
+    y = -(view.pixels[:, 0] - CAMERA.cx) / CAMERA.fx * WALL
+    depths = np.where((y <= 1.7) & (y >= 0.1), WALL, WALL + 0.6).astype(np.float32)
+    landmarks = Landmarks(view.pixels, view.codes, depths, (0.01 * depths).astype(np.float32))
+    here = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+    return Node(NodeId("r0", 1, 1), 0, here, CAMERA, landmarks)
+
+
+@pytest.fixture(scope="module")
+def served(node: Node, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """An endpoint where a map server knows the place."""
+    path = tmp_path_factory.mktemp("server") / "s0.sqlite"
+    store = Store(path)
+    map_id = MapId("r0", 1)
+    store.apply(map_id, 7, [Entry.read(map_id, 1, encode_change(Change(map_id, 1, 0, NodePut(node))))], 1)
+    store.close()
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    bus = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
+    with MapServer(bus, Keys("demo"), path, "s0") as server:
+        assert server.settle(30)
+        yield endpoint
+    bus.close()
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    cv2.imwrite(str(tmp_path / "moved.png"), picture(MOVED))
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    return tmp_path / "moved.png"
+
+
+def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
+    drawn = tmp_path / "matches.png"
+    assert main(["relocalize", str(photo), "--connect", served, "--json", "--draw", str(drawn)]) == 0
+    answer = json.loads(capfd.readouterr().out)
+    assert answer["certainty"] == "found"
+    (place,) = answer["candidates"]
+    assert place["node_from_robot"] == pytest.approx([MOVED.x, MOVED.y, MOVED.heading], abs=0.03)
+    image = cv2.imread(str(drawn))
+    assert image.shape[1] > 2 * 320
+    # Lines are smoothed.
+    assert (np.abs(image.astype(int) - GREEN) < 40).all(axis=2).sum() > 1000
+    # As people read it.
+    assert main(["relocalize", str(photo), "--connect", served]) == 0
+    assert "node r0.1.1: +0.3" in capfd.readouterr().out
+
+
+def test_what_is_not_known_is_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
+    cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
+    drawn = tmp_path / "matches.png"
+    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == 2
+    said = capfd.readouterr()
+    assert said.out.startswith("unknown: ")
+    assert said.err == f"{drawn} is not drawn: no place was recognised\n"
+    assert not drawn.exists()
+    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(tmp_path / "a.jpg")]) == 1
+    assert "end its name with .png" in capfd.readouterr().err
+
+
+def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypatch) -> None:
+    real, asked = Services._relocalize, []
+
+    def busy_twice(self: Services, payload: bytes) -> bytes:
+        asked.append(1)
+        if len(asked) <= 2:
+            raise Busy(0.2)
+        return real(self, payload)
+
+    monkeypatch.setattr(Services, "_relocalize", busy_twice)
+    assert main(["relocalize", str(photo), "--connect", served]) == 0
+    assert len(asked) == 3
+    monkeypatch.setattr(Services, "_relocalize", lambda *_: (_ for _ in ()).throw(Busy(60.0)))
+    assert main(["relocalize", str(photo), "--connect", served]) == 1
+    assert "the map server refused: busy, retry after 60.0 s" in capfd.readouterr().err
+
+
+def test_what_agrees_is_what_the_posture_explains(node: Node) -> None:
+    """By hand, match by match; a posture that is wrong explains next to nothing."""
+    view = view_of(picture(MOVED))
+    overlay = Overlay.of(node, view, MOVED)
+    assert overlay.agreeing.sum() > 20
+    for (a, b), agrees in zip(overlay.pairs, overlay.agreeing, strict=True):
+        x, y, z = node.points_in_robot[a]
+        there = MOVED.inverse().apply(np.array([[x, y, z]]))[0]
+        u = CAMERA.cx - CAMERA.fx * there[1] / there[0]
+        v = CAMERA.cy - CAMERA.fy * (there[2] - 0.3) / there[0]
+        assert agrees == (np.hypot(*(view.pixels[b] - (u, v))) <= AGREES_PX)
+    wrong = Overlay.of(node, view, Pose2(-1.0, 0.8, -0.3))
+    assert wrong.agreeing.sum() < 0.1 * len(wrong.pairs)
+
+
+def test_wide_images_stand_above_each_other(node: Node, tmp_path: Path) -> None:
+    view = view_of(picture(MOVED))
+    wide = Camera(640, 240, 277.0, 277.0, 319.5, 119.5, mount_height=0.3)
+    moved = View(view.pixels + np.array([160, 0], np.float32), view.codes, wide)
+    image = np.full((240, 640), 90, np.uint8)
+    broad = Node(node.id, 0, node.map_from_robot, wide, node.landmarks)
+    draw_matches(tmp_path / "wide.png", image, Lens(RobotDescription(wide)), broad, moved, MOVED)
+    drawn = cv2.imread(str(tmp_path / "wide.png"))
+    assert drawn.shape[1] == 2 * 640
+    assert drawn.shape[0] > 4 * 240
