@@ -30,7 +30,7 @@ class DeskSettings:
     """
 
     workers: int = min(os.cpu_count() or 1, 4)
-    longest_wait: float = 0.5
+    longest_wait: float = 0.4
     too_late: float = 1.5
     first_guess: float = 0.1
     smoothing: float = 0.2

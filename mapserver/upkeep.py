@@ -112,11 +112,19 @@ class Upkeep:
             self._merger.on_change(change)
         except MapweaveError as error:
             log.warning("change %s of %s is not merged: %s", change.sequence, change.map, error)
+        except Exception:  # a defect with one change must not end all merging
+            log.exception("change %s of %s is not merged", change.sequence, change.map)
 
     def _merge(self) -> None:
         self._dirty = False
-        before, merged = self._answers.merged, self._merger.merged()
-        self._answers = Answers.of(self._merger, merged)
+        before = self._answers.merged
+        try:
+            merged = self._merger.merged()
+            self._answers = Answers.of(self._merger, merged)
+        except Exception:  # questions are answered from the map before; the next change is the next chance
+            log.exception("the merged map could not be made anew")
+            self._event = "the merged map could not be made anew: see the server's log"
+            return
         for words in joinings(before, merged):
             log.info("%s", words)
             self._event = words

@@ -20,6 +20,7 @@ from mapserver.merger import Merger
 from mapserver.relocalization import Relocalizer
 from mapserver.server import MapServer, ServerSettings
 from mapserver.shared_index import SharedPlaceIndex
+from merge.merged import MergedMap
 from wire.bus import Reply
 from wire.keys import Keys
 from wire.log_messages import decode_record
@@ -175,6 +176,24 @@ def test_what_is_wrong_is_said_and_costs_no_worker(
         for _ in range(5):
             assert served.where().error == "the server failed: a defect"
     assert "no answer to" in caplog.text
+    assert not served.where().error
+
+
+def test_a_merge_that_fails_is_logged_and_the_next_one_succeeds(
+    served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(self: Merger) -> MergedMap:
+        raise ZeroDivisionError("a defect")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Merger, "merged", broken)
+        served.server._upkeep._dirty = True
+        assert served.server.settle(20)
+    assert "the merged map could not be made anew" in caplog.text
+    assert "could not be made anew" in str(served.server.status()["event"])
+    served.quick_ones()
+    served.server._upkeep._dirty = True
+    assert served.server.settle(20)
     assert not served.where().error
 
 
