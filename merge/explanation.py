@@ -76,9 +76,7 @@ def explain_nodes(
             else f"{fresh.weight} landmarks agree on one posture"
         )
         standing = Standing.UNCOMPARED
-        reason = (
-            f"the merge compared others, that look more alike or are no neighbours; compared now: {words}"
-        )
+        reason = f"they share too little, are neighbours, or others share more; compared now: {words}"
         link = None if isinstance(fresh, RefusedLink) else fresh
     geometry = link or (refusal.link if refusal else None)
     found = replace(

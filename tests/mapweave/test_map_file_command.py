@@ -69,6 +69,8 @@ def test_the_summary_of_an_agents_map(agent_file, capfd):
         "nodes": len(TOUR),
         "edges": {"turned": len(TOUR) - 1},
         "links": 0,
+        "refused": 0,
+        "rulings": 0,
         "components": 1,
         "landmarks_per_node_median": float(np.median(counts)),
         "picture": str(agent_file.with_suffix(".png")),

@@ -1,0 +1,94 @@
+"""`mapweave map explain`: why nodes or maps are linked, or are not."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.network import add_network
+
+if TYPE_CHECKING:
+    from hybridmap.explanation import MapsExplanation, PairExplanation
+    from hybridmap.node import MapId, NodeId
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "explain",
+        help="why two nodes or two maps are linked, or are not",
+        description="Say why two nodes (r0.1.17 r1.1.5) are linked or are not, or why two maps (r0.1 r1.1) "
+        "are one or are not, with every number behind it; without ends, of each two maps. A running server "
+        "is asked, or a map file.",
+    )
+    parser.add_argument("ends", nargs="*", metavar="NODE|MAP", help="two nodes or two maps")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="explain this map file; no server is asked")
+    parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the landmarks of the two nodes")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Ask, print, draw."""
+    from hybridmap.errors import InvalidValue
+    from hybridmap.node import MapId, NodeId
+    from mapweave.commands.map_ends import EXAMPLE, ends_of
+    from mapweave.explained import maps_values, maps_words, pair_values, pair_words
+
+    ends = ends_of(arguments.ends) if arguments.ends else None
+    first, second = ends or (None, None)
+    if isinstance(first, NodeId) and isinstance(second, NodeId):
+        pair = explained_nodes(arguments, first, second)
+        values, lines = pair_values(pair), pair_words(pair)
+        if arguments.draw is not None:
+            from mapweave.link_picture import draw_link
+
+            draw_link(pair, arguments.draw)
+            values["picture"] = str(arguments.draw)
+            lines.append(f"  picture       {arguments.draw}")
+    else:
+        if arguments.draw is not None:
+            raise InvalidValue(f"--draw needs two nodes: {EXAMPLE}")
+        maps = None if ends is None else (MapId(*ends[0][:2]), MapId(*ends[1][:2]))
+        told = explained_maps(arguments, maps)
+        values = {"maps": [maps_values(one) for one in told]}
+        lines = [line for one in told for line in maps_words(one)] or ["there are no two maps"]
+    print(json.dumps(values) if arguments.json else "\n".join(lines))
+    return 0
+
+
+def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> PairExplanation:
+    """Two nodes of a map file, or of what a server has."""
+    from mapserver.mapfiles import merged_of
+    from mapweave.commands.map_ends import ask
+    from merge.explanation import explain_nodes
+    from wire.explanation_messages import ExplainRequest, decode_pair, encode_explain_request
+    from wire.keys import Keys
+    from wire.mapfile import read_map_file
+
+    if arguments.map is not None:
+        return explain_nodes(merged_of(read_map_file(arguments.map)), a, b)
+    request = encode_explain_request(ExplainRequest((a, b)))
+    return decode_pair(ask(arguments, Keys.any_explain, request)[0].payload)
+
+
+def explained_maps(
+    arguments: argparse.Namespace, ends: tuple[MapId, MapId] | None
+) -> tuple[MapsExplanation, ...]:
+    """Two maps of a map file, or of what a server has; each two of them without ends."""
+    from mapserver.mapfiles import merged_of
+    from mapweave.commands.map_ends import ask
+    from merge.explanation_maps import explain_fleet, explain_maps
+    from wire.explanation_messages import MAX_MAPS_TOLD, ExplainRequest, decode_maps, encode_explain_request
+    from wire.keys import Keys
+    from wire.mapfile import read_map_file
+
+    if arguments.map is None:
+        request = encode_explain_request(ExplainRequest(ends))
+        return decode_maps(ask(arguments, Keys.any_explain, request)[0].payload)
+    merged = merged_of(read_map_file(arguments.map))
+    return explain_fleet(merged, MAX_MAPS_TOLD) if ends is None else (explain_maps(merged, *ends),)

@@ -1,0 +1,52 @@
+"""`mapweave map import`: a pose graph of others, optimised as the merge optimises."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "import",
+        help="optimise others' pose graph (g2o)",
+        description="Read a planar pose graph (g2o), optimise it with the back end of the merge, write it "
+        "again with the optimised poses. It has no landmarks, so it is no map that a robot could use; it "
+        "shows how good the back end is.",
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="a .g2o file")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="OUT", help="the optimised .g2o file"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, optimise, write, say how much better it is."""
+    from dataclasses import replace
+
+    from mapweave.g2o import read_g2o, write_g2o
+    from mapweave.g2o_optimum import optimum_of
+
+    graph = read_g2o(arguments.file)
+    poses = optimum_of(graph)
+    write_g2o(arguments.out, replace(graph, poses=poses))
+    outcome = {
+        "out": str(arguments.out),
+        "vertices": len(poses),
+        "edges": len(graph.edges),
+        "chi2_before": graph.chi2(),
+        "chi2": graph.chi2(poses),
+    }
+    if arguments.json:
+        print(json.dumps(outcome))
+    else:
+        print(
+            f"{arguments.out}: {len(poses)} vertices, {len(graph.edges)} edges, "
+            f"chi-square {outcome['chi2_before']:.6g} before, {outcome['chi2']:.6g} now"
+        )
+    return 0

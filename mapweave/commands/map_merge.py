@@ -1,0 +1,79 @@
+"""`mapweave map merge`: map files become one, without a server."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hybridmap.hybrid_map import HybridMap
+    from hybridmap.node import MapId
+    from hybridmap.ruling import Rulings
+    from merge.merged import MergedMap
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "merge",
+        help="merge map files without a server",
+        description="Merge map files as the map server does: robots' own maps, or merged ones, which are "
+        "taken apart and merged anew. What people have ruled in any of them holds.",
+    )
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="a .mapweave file")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the merged map's file")
+    parser.add_argument("--json", action="store_true", help="print the outcome as one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Merge, write, say what has become of it."""
+    from mapserver.mapfiles import map_file_of
+    from mapweave.offline import parts_of
+    from merge.explanation_maps import explain_fleet
+    from merge.merged import MergedMap
+    from merge.parting import joinings
+    from wire.mapfile import read_map_file, write_map_file
+
+    maps, rulings = parts_of({path: read_map_file(path) for path in arguments.files})
+    merged = merged_with_progress(maps, rulings)
+    write_map_file(arguments.out, map_file_of(merged))
+    joined = joinings(MergedMap.empty(), merged)
+    apart = [one.reason for one in explain_fleet(merged, 20) if not one.joined]
+    if arguments.json:
+        outcome = {
+            "out": str(arguments.out),
+            "nodes": len(merged.postures),
+            "maps": [str(one) for one in merged.maps],
+            "components": len(merged.components),
+            "links": sum(not link.within for link in merged.links),
+            "loops": sum(link.within for link in merged.links),
+            "refused": sum(refusal.link is not None for refusal in merged.refused),
+            "joined": list(joined),
+            "apart": apart,
+        }
+        print(json.dumps(outcome))
+    else:
+        print(f"{arguments.out}: {merged.summary()}")
+        for words in (*joined, *apart):
+            print(f"  {words}")
+    return 0
+
+
+def merged_with_progress(maps: dict[MapId, HybridMap], rulings: Rulings) -> MergedMap:
+    """Merge, with a bar on stderr for people."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from mapweave.offline import merge_parts
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("reading nodes")
+
+        def told(done: int, of: int) -> None:
+            words = "reading nodes" if done < of else "comparing and joining"
+            bar.update(task, description=words, completed=done, total=of if done < of else None)
+
+        return merge_parts(maps, rulings, told)

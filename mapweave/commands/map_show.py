@@ -1,0 +1,86 @@
+"""`mapweave map show`: what is in a map file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    show: argparse.ArgumentParser = actions.add_parser(
+        "show",
+        help="summary and picture of a map file",
+        description="Check a map file, print a summary and draw a picture of it beside it.",
+    )
+    show.add_argument("file", type=Path, help="a .mapweave file")
+    show.add_argument("--out", type=Path, metavar="PNG", help="picture (default: beside the file, as .png)")
+    show.add_argument("--no-picture", action="store_true", help="summary only")
+    show.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    show.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the summary, draw the picture."""
+    import numpy as np
+
+    from hybridmap.hybrid_map import HybridMap
+    from hybridmap.node import EdgeKind
+    from hybridmap.ruling import Rulings
+    from mapweave.picture import MapPicture, draw_map
+    from wire.mapfile import read_map_file
+
+    content = read_map_file(arguments.file)
+    hybrid = HybridMap(content.changes)
+    if content.postures:
+        # Components have frames of their own; only the largest can be drawn without pretending.
+        sizes: dict[int, int] = {}
+        for component, _ in content.postures.values():
+            sizes[component] = sizes.get(component, 0) + 1
+        largest = max(sizes, key=lambda c: (sizes[c], -c))
+        postures = {n: p.mean for n, (c, p) in content.postures.items() if c == largest}
+    else:
+        sizes = {k: len(nodes) for k, nodes in enumerate(hybrid.components())}
+        postures = {n.id: n.map_from_robot.mean for n in hybrid.nodes.values()}
+    landmarks = [len(n.landmarks) for n in hybrid.nodes.values()]
+    kinds: dict[str, int] = {}
+    for edge in hybrid.edges.values():
+        kinds[str(edge.kind)] = kinds.get(str(edge.kind), 0) + 1
+    summary = {
+        "file": str(arguments.file),
+        "kind": content.kind,
+        "title": content.title,
+        "bytes": arguments.file.stat().st_size,
+        "maps": sorted({str(n.map) for n in hybrid.nodes}),
+        "nodes": len(hybrid.nodes),
+        "edges": kinds,
+        "links": sum(e.kind is EdgeKind.MERGED for e in hybrid.edges.values()),
+        "refused": sum(pair.edge is not None for pair in content.refused),
+        "rulings": len(Rulings(content.rulings).in_force),
+        "components": len(sizes),
+        "landmarks_per_node_median": float(np.median(landmarks)) if landmarks else 0.0,
+    }
+    if not arguments.no_picture and postures:
+        out = arguments.out or arguments.file.with_suffix(".png")
+        seen = [
+            postures[n.id].apply(n.points_in_robot[n.landmarks.has_depth, :2])
+            for n in hybrid.nodes.values()
+            if n.id in postures
+        ]
+        points = np.concatenate(seen) if seen else np.zeros((0, 2))
+        draw_map(MapPicture(content.title, postures, list(hybrid.edges.values()), landmarks=points), out)
+        summary["picture"] = str(out)
+    if arguments.json:
+        print(json.dumps(summary))
+    else:
+        for key, value in summary.items():
+            print(f"{key.replace('_', ' '):26} {_text(value)}")
+    return 0
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{count} {kind}" for kind, count in value.items()) or "none"
+    return ", ".join(value) if isinstance(value, list) else str(value)

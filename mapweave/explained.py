@@ -1,0 +1,173 @@
+"""Explanations as words for people, and as plain values for programs."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from hybridmap.explanation import MapsExplanation, NearMiss, PairExplanation, Standing
+from hybridmap.pose import Array, PoseGaussian
+from hybridmap.ruling import Ruling
+
+MOST_WITNESSES = 12
+"""Lines of other links; `--json` has all."""
+TITLES = {
+    Standing.LINKED: "are linked",
+    Standing.REFUSED: "are not linked",
+    Standing.UNDONE: "are not linked",
+    Standing.UNCOMPARED: "were not compared by the merge",
+}
+
+
+def pair_words(told: PairExplanation) -> list[str]:
+    """The explanation of two nodes, line by line."""
+    lines = [f"{told.a.id} and {told.b.id} {TITLES[told.standing]}: {told.reason}"]
+    lines.append(
+        f"  landmarks     {len(told.a.landmarks)} and {len(told.b.landmarks)}; "
+        f"{len(told.matches)} look alike, {len(told.shared)} agree on one posture"
+    )
+    if told.a_from_b is not None:
+        lines.append(f"  b seen from a {_posture(told.a_from_b)}")
+        off = told.residuals_px[np.isfinite(told.residuals_px)]
+        if len(off):
+            lines.append(f"  residuals     median {np.median(off):.1f} px, worst {off.max():.1f} px")
+        numbers = ", ".join(f"{name} {value:.3g}" for name, value in sorted(told.evidence.items()))
+        lines.append(f"  evidence      {numbers}")
+    if told.misfit is not None:
+        misfit = told.misfit
+        lines.append(f"  in the map    {_posture(misfit.merged_a_from_b)}")
+        rest = "nothing else says how they stand" if misfit.alone else "others say it too"
+        lines.append(f"  off by        {_vector(misfit.off)}, {_sigmas(misfit.strain2)}; {rest}")
+    elif told.a_from_b is not None:
+        lines.append("  in the map    nothing joins the two")
+    if told.probability is not None:
+        percent = _percent(told.probability)
+        lines.append(f"  probability   {percent} that it is right, judged for itself by the rest of the map")
+    agree = sum(witness.agrees for witness in told.witnesses)
+    if told.witnesses:
+        lines.append(
+            f"  other links   {agree} of {len(told.witnesses)} between the same pieces of map agree:"
+        )
+    for witness in sorted(told.witnesses, key=lambda w: w.distance2)[:MOST_WITNESSES]:
+        word = "agrees" if witness.agrees else "contradicts"
+        kept = "stands" if witness.kept else "refused"
+        lines.append(f"    {witness.a} - {witness.b}: {word}, {_sigmas(witness.distance2)}, {kept}")
+    if len(told.witnesses) > MOST_WITNESSES:
+        lines.append(f"    and {len(told.witnesses) - MOST_WITNESSES} more; --json tells all")
+    lines += [f"  {claim}" for claim in told.claims]
+    lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
+    return lines
+
+
+def maps_words(told: MapsExplanation) -> list[str]:
+    """The explanation of two maps, line by line."""
+    lines = [told.reason]
+    if not told.joined:
+        lines.append(
+            f"  {told.refused} links refused, {told.unverified} alike pairs without a common posture"
+        )
+    if told.nearest:
+        lines.append("  nearest to a link:")
+    lines += [f"    {_near(near)}" for near in told.nearest]
+    lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
+    return lines
+
+
+def pair_values(told: PairExplanation) -> dict[str, Any]:
+    """The explanation of two nodes for `--json`."""
+    misfit = told.misfit
+    return {
+        "a": str(told.a.id),
+        "b": str(told.b.id),
+        "standing": str(told.standing),
+        "reason": told.reason,
+        "landmarks": [len(told.a.landmarks), len(told.b.landmarks)],
+        "matches": told.matches.tolist(),
+        "shared": told.shared.tolist(),
+        "residuals_px": [None if np.isnan(value) else float(value) for value in told.residuals_px],
+        "a_from_b": None if told.a_from_b is None else _gaussian(told.a_from_b),
+        "evidence": told.evidence,
+        "probability": told.probability,
+        "misfit": None
+        if misfit is None
+        else {
+            "merged_a_from_b": _gaussian(misfit.merged_a_from_b),
+            "off": misfit.off.tolist(),
+            "strain2": misfit.strain2,
+            "alone": misfit.alone,
+        },
+        "witnesses": [
+            {"a": str(w.a), "b": str(w.b), "distance2": w.distance2, "agrees": w.agrees, "kept": w.kept}
+            for w in told.witnesses
+        ],
+        "claims": list(told.claims),
+        "rulings": [_ruling_values(ruling) for ruling in told.rulings],
+    }
+
+
+def maps_values(told: MapsExplanation) -> dict[str, Any]:
+    """The explanation of two maps for `--json`."""
+    return {
+        "first": str(told.first),
+        "second": str(told.second),
+        "joined": told.joined,
+        "reason": told.reason,
+        "links": told.links,
+        "landmarks": told.landmarks,
+        "refused": told.refused,
+        "unverified": told.unverified,
+        "nearest": [
+            {"a": str(n.a), "b": str(n.b), "matches": n.matches, "inliers": n.inliers, "lacks": n.lacks}
+            for n in told.nearest
+        ],
+        "rulings": [_ruling_values(ruling) for ruling in told.rulings],
+    }
+
+
+def _gaussian(posture: PoseGaussian) -> dict[str, Any]:
+    return {"mean": posture.mean.vector.tolist(), "covariance": posture.covariance.tolist()}
+
+
+def _ruling_values(ruling: Ruling) -> dict[str, Any]:
+    return {
+        "ends": [str(end) for end in ruling.ends],
+        "apart": ruling.apart,
+        "who": ruling.who,
+        "stamp_ns": ruling.stamp_ns,
+        "because": ruling.because,
+    }
+
+
+def _posture(posture: PoseGaussian) -> str:
+    sigma = np.sqrt(np.diag(posture.covariance))
+    spread = f"{sigma[0]:.3f} m, {sigma[1]:.3f} m, {math.degrees(sigma[2]):.1f} deg"
+    return f"{_vector(posture.mean.vector)} (sigma {spread})"
+
+
+def _vector(vector: Array) -> str:
+    return f"{vector[0]:+.3f} m ahead, {vector[1]:+.3f} m left, {math.degrees(vector[2]):+.1f} deg"
+
+
+def _sigmas(chi2: float) -> str:
+    return f"{math.sqrt(chi2):.1f} standard deviations"
+
+
+def _percent(probability: float) -> str:
+    if probability > 0.9999:
+        return "over 99.99%"
+    return f"{probability:.2%}" if probability > 0.0001 else f"{100.0 * probability:.2g}%"
+
+
+def _near(near: NearMiss) -> str:
+    return f"{near.a} - {near.b}: {near.matches} look alike, {near.inliers} agree; {near.lacks}"
+
+
+def _ruling(ruling: Ruling) -> str:
+    when = datetime.fromtimestamp(ruling.stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    word = "ruled that they shall not be linked" if ruling.apart else "ruled that they may be linked again"
+    why = f': "{ruling.because}"' if ruling.because else ""
+    ends = f"{ruling.ends[0]} and {ruling.ends[1]}"
+    return f"{when} {ruling.who or 'somebody'} {word} ({ends}){why}"

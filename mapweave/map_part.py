@@ -1,0 +1,83 @@
+"""A part of a merged map that is one, as others' tools want it: numbered places and measurements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from hybridmap.errors import InvalidValue
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import EdgeId, Node, NodeId
+from hybridmap.pose import Pose2
+from merge.credence import credences
+from merge.cutting import fragments_of
+from merge.merged import MergedMap
+from merge.posegraph import Measurement
+from merge.undoing import undo
+
+
+@dataclass(frozen=True, eq=False)
+class MapPart:
+    """One component of a merged map.
+
+    Attributes:
+        merged: the whole map.
+        component: its number, 0 is the largest.
+    """
+
+    merged: MergedMap
+    component: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse a component that is not there (InvalidValue)."""
+        count = len(self.merged.components)
+        if not 0 <= self.component < count:
+            known = f"its components are 0 to {count - 1}" if count else "it has no nodes"
+            raise InvalidValue(f"the map has no component {self.component}; {known}")
+
+    @cached_property
+    def nodes(self) -> tuple[NodeId, ...]:
+        """In the order of ids."""
+        return tuple(sorted(self.merged.components[self.component]))
+
+    @cached_property
+    def numbers(self) -> dict[NodeId, int]:
+        """0, 1, 2 ... by node: others' tools know no ids like ours."""
+        return {node: k for k, node in enumerate(self.nodes)}
+
+    @cached_property
+    def graph(self) -> HybridMap:
+        """Nodes and edges of the part, links among them; what is refused is not there."""
+        whole = self.merged.union()
+        for node in [node for node in whole.nodes if node not in self.numbers]:
+            del whole.nodes[node]
+        for edge in list(whole.edges.values()):
+            if edge.a not in self.numbers or edge.b not in self.numbers:
+                del whole.edges[edge.id]
+        return whole
+
+    @cached_property
+    def links(self) -> frozenset[EdgeId]:
+        """Which edges are links, found by looking."""
+        return frozenset(link.edge().id for link in self.merged.links)
+
+    @cached_property
+    def probabilities(self) -> dict[tuple[NodeId, NodeId], float]:
+        """Of the links."""
+        return credences(self.merged)
+
+    @property
+    def measurements(self) -> list[Measurement]:
+        """Those whose optimum the postures are."""
+        left = undo(self.merged.maps, (), self.merged.rulings).maps
+        own = [m for fragment in fragments_of(left) for m in fragment.measurements]
+        links = [Measurement(*link.pair, link.a_from_b, robust=True) for link in self.merged.links]
+        return [m for m in (*own, *links) if m.a in self.numbers]
+
+    def node(self, node: NodeId) -> Node:
+        """A node."""
+        return self.merged.maps[node.map].nodes[node]
+
+    def pose(self, node: NodeId) -> Pose2:
+        """Posture in the component's frame."""
+        return self.merged.postures[node].merged_from_robot.mean

@@ -1,0 +1,245 @@
+"""`mapweave map explain | unmerge | merge`, on files and against a real server process."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.synthetic import room, take_map
+from mapserver.entry import Entry
+from mapserver.mapfiles import merged_of
+from mapserver.store import Store
+from mapweave.cli import main
+from mapweave.trial.children import Children, free_port
+from wire.bus_settings import BusSettings
+from wire.codec import encode_change
+from wire.mapfile import MapFile, read_map_file, write_map_file
+from wire.zenoh_bus import ZenohBus
+
+R0, R1, R2 = MapId("r0", 1), MapId("r1", 1), MapId("r2", 1)
+
+
+def logs() -> dict[MapId, list[ChangeBody]]:
+    """Two robots in one room, a third elsewhere."""
+    rng = np.random.default_rng(8)
+    here, there = room(0, 0, 5, 4, 700, rng), room(0, 0, 5, 4, 700, rng)
+    out: dict[MapId, list[ChangeBody]] = {}
+    for map_id, world in ((R0, here), (R1, here), (R2, there)):
+        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(5)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+    return out
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Each robot's own map, and the merged one last."""
+    folder = tmp_path_factory.mktemp("maps")
+    paths = []
+    for map_id, bodies in logs().items():
+        paths.append(folder / f"{map_id.agent}.mapweave")
+        write_map_file(paths[-1], MapFile("agent", str(map_id), tuple(bodies)))
+    merged = folder / "merged.mapweave"
+    assert main(["map", "merge", *map(str, paths), "-o", str(merged)]) == 0
+    return [*paths, merged]
+
+
+Said = Callable[..., str]
+
+
+@pytest.fixture
+def said(capfd: pytest.CaptureFixture[str]) -> Said:
+    """What a command that succeeds prints."""
+
+    def run(*arguments: object) -> str:
+        capfd.readouterr()
+        assert main([str(a) for a in arguments]) == 0
+        return capfd.readouterr().out
+
+    return run
+
+
+def links(path: Path) -> list[tuple[NodeId, NodeId]]:
+    return [link.pair for link in merged_of(read_map_file(path)).links if not link.within]
+
+
+def test_merging_says_what_is_one_and_what_is_not(files: list[Path], said: Said, tmp_path: Path) -> None:
+    out = said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave")
+    assert "15 nodes, 3 maps, 2 components" in out and "r0.1 and r1.1 are one map now, by " in out
+    assert "r0.1 and r2.1 are not one map: " in out
+    told = json.loads(said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave", "--json"))
+    assert told["maps"] == ["r0.1", "r1.1", "r2.1"] and told["components"] == 2 and len(told["apart"]) == 2
+    assert told["links"] == len(links(files[3]))
+
+
+def test_merging_in_steps_is_merging_at_once(files: list[Path], said: Said, tmp_path: Path) -> None:
+    said("map", "merge", files[1], files[2], "-o", tmp_path / "two.mapweave")
+    said("map", "merge", tmp_path / "two.mapweave", files[0], "-o", tmp_path / "three.mapweave")
+    assert (tmp_path / "three.mapweave").read_bytes() == files[3].read_bytes()
+
+
+def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path: Path) -> None:
+    pair = links(files[3])[0]
+    picture = tmp_path / "pictures" / "link.png"
+    out = said("map", "explain", *pair, "--map", files[3], "--draw", picture)
+    for word in (
+        "are linked: ",
+        "b seen from a",
+        "residuals",
+        "in the map",
+        "probability",
+        "other links",
+        "evidence",
+    ):
+        assert word in out
+    image = cv2.imread(str(picture))
+    assert image is not None and image.shape[1] > 1000
+    # The first colours of the scale, that of lines with small residuals, are really there.
+    blue, green, red = (image[..., k].astype(int) for k in range(3))
+    assert ((blue - green > 40) & (red - green > 20)).sum() > 500
+    told = json.loads(said("map", "explain", *pair[::-1], "--map", files[3], "--json"))
+    assert told["standing"] == "linked" and len(told["shared"]) == len(told["residuals_px"])
+    assert np.shape(told["a_from_b"]["covariance"]) == (3, 3)
+
+
+def test_maps_are_explained(files: list[Path], said: Said) -> None:
+    told = json.loads(said("map", "explain", "--map", files[3], "--json"))["maps"]
+    assert [(one["first"], one["second"], one["joined"]) for one in told] == [
+        ("r0.1", "r2.1", False), ("r1.1", "r2.1", False), ("r0.1", "r1.1", True),
+    ]  # fmt: skip
+    assert "are one map: " in said("map", "explain", "r1.1", "r0.1", "--map", files[3])
+    assert said("map", "explain", "--map", files[0]) == "there are no two maps\n"
+
+
+def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path: Path) -> None:
+    path = tmp_path / "m.mapweave"
+    path.write_bytes(files[3].read_bytes())
+    out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", "--map", path)
+    assert "r0.1 and r1.1 are not one map: undone with all links" in out and not links(path)
+    assert "by anna on 20" in out and '"two kitchens"' in out
+    assert json.loads(said("map", "show", path, "--no-picture", "--json"))["rulings"] == 1
+    # A later merge with others heeds it too.
+    said("map", "merge", path, "-o", path)
+    assert not links(path)
+    out = said("map", "unmerge", "r1.1", "r0.1", "--undo", "--by", "bob", "--map", path)
+    assert "are one map" in out and links(path) == links(files[3])
+    out = said("map", "explain", "r0.1", "r1.1", "--map", path)
+    assert "anna ruled that they shall not" in out and "bob ruled that they may be linked again" in out
+    pair = links(path)[0]
+    said("map", "unmerge", *pair, "--map", path, "-o", tmp_path / "one.mapweave")
+    assert links(tmp_path / "one.mapweave") == [other for other in links(path) if other != pair]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["explain", "r0.1.1"], "give two nodes or two maps, not 1"),
+        (["explain", "r0.1.1", "r1.1"], "are a node and a map"),
+        (["explain", "here", "there"], "'here' is neither a node nor a map"),
+        (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
+        (["explain", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; its 5 nodes are 1 to 9"),
+        (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes"),
+        (["explain", "--draw", "x.png"], "--draw needs two nodes"),
+        (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo"),
+        (["unmerge", "r0.1", "r0.1"], "two different maps"),
+        (["unmerge", "r0.1", "r1.1", "--undo"], "nothing that people have ruled keeps r0.1 and r1.1 apart"),
+        (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line"),
+    ],
+)
+def test_bad_input_is_one_line(
+    files: list[Path], capfd: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    before = files[3].read_bytes()
+    capfd.readouterr()
+    assert main(["map", *arguments, "--map", str(files[3])]) == 1
+    out, err = capfd.readouterr()
+    assert out == "" and len(err.splitlines()) == 1 and words in err
+    assert files[3].read_bytes() == before and not Path("x.png").exists()
+
+
+def test_files_that_do_not_fit_are_one_line(
+    files: list[Path], capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    capfd.readouterr()
+    out = tmp_path / "m.mapweave"
+    assert main(["map", "merge", str(files[0]), str(files[3]), "-o", str(out)]) == 1
+    assert "map r0.1 is in " in capfd.readouterr().err and not out.exists()
+    assert main(["map", "unmerge", "r0.1", "r1.1", "--map", str(files[0])]) == 1
+    assert "of kind agent, not merged" in capfd.readouterr().err
+    assert main(["map", "unmerge", "r0.1", "r1.1", "-o", str(out)]) == 1
+    assert "--out goes with --map" in capfd.readouterr().err
+
+
+@contextmanager
+def serving(folder: Path, port: int) -> Iterator[None]:
+    """A real server process on a store that is there already."""
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with Children(folder / "logs") as children:
+        children.start("server", ["server", "--fleet", "why", "--listen", endpoint, "--data", str(folder)])
+        bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
+        try:
+            end = time.monotonic() + 30
+            while not bus.connected():
+                children.check()
+                assert time.monotonic() < end
+                time.sleep(0.05)
+        finally:
+            bus.close()
+        yield
+        children.end("server")
+
+
+def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_again(
+    files: list[Path], said: Said, tmp_path: Path
+) -> None:
+    store = Store(tmp_path / "s0.sqlite")
+    for map_id, bodies in logs().items():
+        entries = [
+            Entry.read(map_id, k + 1, encode_change(Change(map_id, k + 1, 0, body)))
+            for k, body in enumerate(bodies)
+        ]
+        store.apply(map_id, 7, entries, len(entries))
+    store.close()
+    port = free_port()
+    at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}"]
+    with serving(tmp_path, port):
+        end = time.monotonic() + 30
+        while "r0.1 and r1.1 are one map: " not in said("map", "explain", *at):
+            assert time.monotonic() < end, "the server has not merged"
+        pair = links(files[3])[0]
+        # The same numbers from the server as from the file that was merged without one.
+        served, offline = (
+            json.loads(said("map", "explain", *pair, "--json", *where)) for where in (at, ["--map", files[3]])
+        )
+        assert served["shared"] == offline["shared"] and served["reason"] == offline["reason"]
+        assert served["probability"] == pytest.approx(offline["probability"], rel=1e-4)
+        assert [w["a"] for w in served["witnesses"]] == [w["a"] for w in offline["witnesses"]]
+        out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", *at)
+        assert "r0.1 and r1.1 are not one map: undone with all links" in out
+    with serving(tmp_path, port):
+        end = time.monotonic() + 30
+        while "known are: none" in (out := said_or_refused(said, "map", "explain", "r0.1", "r1.1", *at)):
+            assert time.monotonic() < end
+        assert "r0.1 and r1.1 are not one map: undone with all links" in out and "two kitchens" in out
+        out = said("map", "unmerge", "r0.1", "r1.1", "--undo", *at)
+        assert "r0.1 and r1.1 are one map: " in out
+    log = "".join(path.read_text() for path in (tmp_path / "logs").iterdir())
+    assert "r0.1 and r1.1 are no longer one map: " in log
+
+
+def said_or_refused(said: Said, *arguments: object) -> str:
+    """A server that has only just started knows no maps yet."""
+    try:
+        return said(*arguments)
+    except AssertionError:
+        return "known are: none"
