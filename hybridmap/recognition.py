@@ -135,9 +135,33 @@ def examine_view(
     Returns:
         A recognition, or why there is none.
     """
+    s = settings or RecognitionSettings()
+    return examine_matches(node, view, match(node.landmarks.codes, view.codes, s.matching), s, rng)
+
+
+def examine_matches(
+    node: Node,
+    view: View,
+    pairs: NDArray[np.int64],
+    settings: RecognitionSettings | None,
+    rng: np.random.Generator,
+) -> Recognition | Refusal:
+    """The same for features that are matched already.
+
+    Args:
+        node: the place.
+        view: the image's features.
+        pairs: (K, 2), landmark of the node and feature of the view; no index twice in a column.
+        settings: when an image counts as recognised; None for the defaults.
+        rng: draws hypotheses.
+
+    Returns:
+        A recognition, or why there is none.
+    """
     unknown = np.full(len(view), np.nan, np.float32)
     seen = Landmarks(view.pixels, view.codes, unknown, unknown)
-    return _examine(node.landmarks, node.camera, seen, view.camera, settings or RecognitionSettings(), rng)
+    s = settings or RecognitionSettings()
+    return _examine(node.landmarks, node.camera, seen, view.camera, pairs, s, rng)
 
 
 def examine_nodes(
@@ -157,7 +181,9 @@ def examine_nodes(
     Returns:
         A recognition whose `node_from_robot` is `a_from_b`, or why there is none.
     """
-    return _examine(a.landmarks, a.camera, b.landmarks, b.camera, settings or RecognitionSettings(), rng)
+    s = settings or RecognitionSettings()
+    pairs = match(a.landmarks.codes, b.landmarks.codes, s.matching)
+    return _examine(a.landmarks, a.camera, b.landmarks, b.camera, pairs, s, rng)
 
 
 def _examine(
@@ -165,10 +191,10 @@ def _examine(
     camera_a: Camera,
     b: Landmarks,
     camera_b: Camera,
+    pairs: NDArray[np.int64],
     s: RecognitionSettings,
     rng: np.random.Generator,
 ) -> Recognition | Refusal:
-    pairs = match(a.codes, b.codes, s.matching)
     forward = a.has_depth[pairs[:, 0]]
     backward = ~forward & b.has_depth[pairs[:, 1]]
     usable = np.concatenate([pairs[forward], pairs[backward]])

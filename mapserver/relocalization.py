@@ -7,19 +7,31 @@ the recognitions are certain of.
 
 from __future__ import annotations
 
-import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hybridmap.matching import match
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
-from hybridmap.recognition import Recognition, RecognitionSettings, Refusal, examine_view
-from mapserver.placeindex import PlaceIndex
+from hybridmap.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
+from mapserver.belief import probabilities
+from mapserver.seenplaces import SeenPlace, Sighting, fuse, supported
 from merge.merged import MergedMap
+
+
+class Retrieval(Protocol):
+    """Finds nodes that look like a view, for example mapserver.placeindex.PlaceIndex."""
+
+    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+        """At most k nodes with how much they look like it, best first."""
+        ...
+
 
 NOWHERE = -1
 """Component of a node that is not in the merged map yet."""
@@ -37,43 +49,23 @@ class RelocalizationSettings:
         floor_heading: the same, rad.
         alone: landmarks that must agree if one node speaks alone. Two nodes that say the same, found each
             by its own, are much better evidence than one: parts of unlike places look alike.
-        comparable: support of a second place, as a share of the best one's, that makes it ambiguous.
+        explained_px: a match nearer than this to where a posture found elsewhere expects it speaks for that.
+        faint: a node that looks so much less like the view than one that was recognised is not looked at.
+        comparable: a second place is a rival if it explains so much of what the best one explains, or if
+            so much of what it should see is seen, as compared with the best one.
+        slight: a place that explains less of what the best one explains is no rival in any case.
     """
 
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
-    candidates: int = 8
+    candidates: int = 16
     gate: float = 16.3
     floor_xy: float = 0.05
     floor_heading: float = 0.03
     comparable: float = 0.6
+    slight: float = 0.25
+    explained_px: float = 12.0
+    faint: float = 0.25
     alone: int = 18
-
-
-@dataclass(frozen=True, eq=False)
-class _Sighting:
-    """A node that was recognised in the view."""
-
-    node: NodeId
-    recognition: Recognition
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Sightings that agree on one posture, best first.
-
-    Attributes:
-        sightings: of one place.
-        best_from_robot: posture in the first one's frame, combined.
-        features: of the view that they explain together.
-    """
-
-    sightings: list[_Sighting]
-    best_from_robot: PoseGaussian
-    features: frozenset[int]
-
-    @property
-    def best(self) -> _Sighting:
-        return self.sightings[0]
 
 
 class Relocalizer:
@@ -81,7 +73,7 @@ class Relocalizer:
 
     def __init__(
         self,
-        index: PlaceIndex,
+        index: Retrieval,
         node_of: Callable[[NodeId], Node | None],
         merged: MergedMap,
         settings: RelocalizationSettings | None = None,
@@ -107,23 +99,70 @@ class Relocalizer:
         ranked = self._index.query(view, s.candidates)
         if not ranked:
             return _unknown("no node of any map has features like these")
-        sightings: list[_Sighting] = []
+        sightings, refusals = self.look(view, ranked)
+        return self.conclude(sightings) if sightings else _unknown(_best_refusal(refusals))
+
+    def look(
+        self, view: View, ranked: Sequence[tuple[NodeId, float]]
+    ) -> tuple[list[Sighting], list[tuple[NodeId, Refusal]]]:
+        """Compare a view with nodes, as far as it can matter.
+
+        Args:
+            view: the image's features.
+            ranked: nodes with how much they look like it, best first.
+
+        Returns:
+            Those that were recognised, and why others were not.
+        """
+        s = self._settings
+        sightings: list[Sighting] = []
         refusals: list[tuple[NodeId, Refusal]] = []
-        for node_id, _ in ranked:
+        best_score = 0.0
+        for node_id, score in ranked:
+            sure = any(one.recognition.inliers >= s.alone for one in sightings)
             node = self._node_of(node_id)
-            if node is None:
+            if node is None or (sure and score < s.faint * best_score):
+                continue
+            pairs = match(node.landmarks.codes, view.codes, s.recognition.matching)
+            if sure and not self._may_differ(node, pairs, view, sightings):
                 continue
             seed = zlib.crc32(view.codes.tobytes(), zlib.crc32(str(node_id).encode()))
-            verdict = examine_view(node, view, s.recognition, np.random.default_rng(seed))
+            verdict = examine_matches(node, view, pairs, s.recognition, np.random.default_rng(seed))
             if isinstance(verdict, Recognition):
-                sightings.append(_Sighting(node_id, verdict))
+                sightings.append(Sighting(node_id, verdict))
+                best_score = max(best_score, score)
             else:
                 refusals.append((node_id, verdict))
-        if not sightings:
-            return _unknown(_best_refusal(refusals))
-        return self._judge(self._places(sightings))
+        return sightings, refusals
 
-    def _places(self, sightings: list[_Sighting]) -> list[_Place]:
+    def conclude(self, sightings: Sequence[Sighting]) -> RelocalizeAnswer:
+        """Say what follows from the nodes that were recognised."""
+        if not sightings:
+            return _unknown("no node was recognised")
+        return self._judge(self.places(sightings))
+
+    def _may_differ(
+        self, node: Node, pairs: NDArray[np.int64], view: View, sightings: Sequence[Sighting]
+    ) -> bool:
+        """Whether a node may be a rival of those that were recognised.
+
+        It is none if too few features match that the posture found does not explain already.
+        """
+        s = self._settings
+        best = max(sightings, key=lambda sighting: sighting.recognition.inliers)
+        least = max(s.recognition.least_inliers, s.slight * best.recognition.inliers)
+        if len(pairs) < least:
+            return False
+        relative = self._merged.relative(node.id, best.node)
+        if relative is None:
+            return True
+        robot_from_node = (relative @ best.recognition.node_from_robot).mean.inverse()
+        points = node.landmarks.take(pairs[:, 0]).points_in_robot(node.camera)
+        off = view.camera.project(robot_from_node.apply(points)) - view.pixels[pairs[:, 1]]
+        explained = np.hypot(off[:, 0], off[:, 1]) < s.explained_px
+        return len(pairs) - int(explained.sum()) >= least
+
+    def places(self, sightings: Sequence[Sighting]) -> list[SeenPlace]:
         """Group the sightings by agreement, best supported place first."""
         left = sorted(sightings, key=lambda one: (-one.recognition.inliers, one.node))
         places = []
@@ -138,11 +177,11 @@ class Relocalizer:
                 agreeing.append(one)
                 combined = fuse(combined, estimate)
             features = frozenset(int(f) for one in agreeing for f in one.recognition.pairs[:, 1])
-            places.append(_Place(agreeing, combined, features))
+            places.append(SeenPlace(agreeing, combined, features))
             left = others
         return sorted(places, key=lambda place: (-len(place.features), place.best.node))
 
-    def _in_frame_of(self, node: NodeId, one: _Sighting) -> PoseGaussian | None:
+    def _in_frame_of(self, node: NodeId, one: Sighting) -> PoseGaussian | None:
         """A sighting's estimate in another node's frame; None if the map does not join the two."""
         relative = self._merged.relative(node, one.node)
         return None if relative is None else relative @ one.recognition.node_from_robot
@@ -154,12 +193,16 @@ class Relocalizer:
         d = between.mean.vector
         return float(d @ np.linalg.solve(between.covariance + floor, d)) < s.gate
 
-    def _judge(self, places: list[_Place]) -> RelocalizeAnswer:
+    def _judge(self, places: list[SeenPlace]) -> RelocalizeAnswer:
         s = self._settings
         most = len(places[0].features)
-        rivals = [place for place in places if len(place.features) >= s.comparable * most]
-        total = sum(len(place.features) for place in places)
-        candidates = tuple(self._whereabouts(place, len(place.features) / total) for place in places)
+        supports = supported(places)
+        rivals = [
+            place for place, support in zip(places, supports, strict=True)
+            if len(place.features) >= s.comparable * most
+            or (len(place.features) >= s.slight * most and support.seen >= s.comparable * supports[0].seen)
+        ]  # fmt: skip
+        candidates = tuple(map(self._whereabouts, places, probabilities(supports)))
         best = places[0].best
         words = f"{best.recognition.inliers} landmarks of {best.node} agree"
         if len(rivals) == 1:
@@ -174,7 +217,7 @@ class Relocalizer:
             words += ", and nothing joins their parts of the map yet"
         return RelocalizeAnswer(Certainty.AMBIGUOUS, candidates, words)
 
-    def _whereabouts(self, place: _Place, share_of_support: float) -> Whereabouts:
+    def _whereabouts(self, place: SeenPlace, probability: float) -> Whereabouts:
         best = place.best
         placement = self._merged.postures.get(best.node)
         return Whereabouts(
@@ -183,39 +226,8 @@ class Relocalizer:
             None if placement is None else placement.merged_from_robot @ place.best_from_robot,
             NOWHERE if placement is None else placement.component,
             best.recognition.inliers,
-            probability(best.recognition) * share_of_support,
+            probability,
         )
-
-
-def probability(recognition: Recognition) -> float:
-    """That a recognition is of the right place, before it is compared with other places.
-
-    A logistic curve over the inliers and their share of the usable matches, set by hand: 10 inliers at half
-    of the matches give 0.73, 20 at 80 % 0.985, 40 at 90 % 0.9999. It knows nothing of how often places look
-    alike.
-    """
-    share = recognition.inliers / max(recognition.usable, 1)
-    logit = 1.0 + (recognition.inliers - 10) / 5.0 + 4.0 * (share - 0.5)
-    return 1.0 / (1.0 + math.exp(-logit))
-
-
-def fuse(first: PoseGaussian, second: PoseGaussian) -> PoseGaussian:
-    """Combine two estimates of one posture whose errors may have anything in common.
-
-    Covariance intersection (Julier and Uhlmann 1997) with the weight that gives the smallest trace: the same
-    view and often the same landmarks are behind both, so adding their information would count them twice.
-    """
-    difference = (first.mean.inverse() @ second.mean).vector
-    information = [np.linalg.inv(one.covariance + 1e-12 * np.eye(3)) for one in (first, second)]
-    best: tuple[float, float] = (math.inf, 0.0)
-    for weight in np.linspace(0.0, 1.0, 11):
-        together = np.linalg.inv((1 - weight) * information[0] + weight * information[1])
-        best = min(best, (float(together.trace()), float(weight)))
-    weight = best[1]
-    covariance = np.linalg.inv((1 - weight) * information[0] + weight * information[1])
-    step = covariance @ (weight * information[1] @ difference)
-    mean = first.mean @ type(first.mean).from_vector(step)
-    return PoseGaussian(mean, 0.5 * (covariance + covariance.T))
 
 
 def _best_refusal(refusals: list[tuple[NodeId, Refusal]]) -> str:

@@ -11,9 +11,11 @@ from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
 from hybridmap.route import RouteSettings
 from hybridmap.synthetic import Sensing, World, room, take_map, take_view
+from mapserver.belief import Support, probabilities
 from mapserver.merger import Merger
-from mapserver.relocalization import Relocalizer, fuse, probability
+from mapserver.relocalization import Relocalizer
 from mapserver.routes import Router, RouterSettings
+from mapserver.seenplaces import fuse
 from merge.merged import MergedMap
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -230,14 +232,18 @@ def test_fusing_never_claims_more_than_the_better_estimate_and_both_allow(
     assert again.mean.distance(first.mean) < 1e-9
 
 
-def test_probability_grows_with_support() -> None:
-    class Fake:
-        def __init__(self, inliers: int, usable: int) -> None:
-            self.inliers, self.usable = inliers, usable
+def test_probability_grows_with_support_and_falls_with_rivals() -> None:
+    def told(**changes: float) -> float:
+        known = {"inliers": 20, "share": 0.7, "seen": 0.4, "sightings": 1, "others": 0.0}
+        return probabilities([Support(**{**known, **changes})])[0]  # type: ignore[arg-type]
 
-    values = [probability(Fake(k, 40)) for k in (10, 20, 30, 40)]  # type: ignore[arg-type]
-    assert values == sorted(values) and 0 < values[0] < values[-1] < 1
-    assert probability(Fake(20, 40)) < probability(Fake(20, 22))  # type: ignore[arg-type]
+    more = [told(inliers=n) for n in (10, 20, 40, 80)]
+    rivals = [told(others=share) for share in (0.0, 0.5, 1.0, 2.0)]
+    assert more == sorted(more) and rivals == sorted(rivals, reverse=True)
+    assert told(share=0.9) > told(share=0.4) and told(sightings=3) >= told()
+    assert told(inliers=60) > 0.95, "nothing speaks against it"
+    twin = Support(60, 0.8, 0.5, 2, 1.0)
+    assert probabilities([twin, twin]) == pytest.approx([0.5, 0.5], abs=0.1), "one of two that look the same"
 
 
 def test_routes_lead_from_map_to_map_by_measured_edges(scene: Scene, merger: Merger) -> None:

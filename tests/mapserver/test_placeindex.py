@@ -109,8 +109,8 @@ def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) 
 
 def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[Node], list[Pose2]]) -> None:
     world, nodes, tour = building
-    index = filled(nodes, PlaceIndexSettings(exact=1500, probes=0.2))
-    assert not index._flat
+    index = filled(nodes, PlaceIndexSettings(small=500, exact=1500))
+    assert index._flat is None
     rng = np.random.default_rng(5)
     hits = 0
     for node, stop in zip(nodes, tour, strict=True):
@@ -132,3 +132,67 @@ def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pos
     assert index.query(view) == [] and index.overlaps(bare) == {} and len(index) == 1
     index.remove(bare.id)
     assert len(index) == 0
+
+
+def everywhere() -> PlaceIndexSettings:
+    """Cells, of which all are searched: then nothing may be missing."""
+    return PlaceIndexSettings(small=300, growth=2.0, probes=10_000, overlap_probes=10_000)
+
+
+def test_cells_of_which_all_are_searched_answer_like_no_cells(
+    building: tuple[World, list[Node], list[Pose2]],
+) -> None:
+    world, nodes, tour = building
+    plain, cells = filled(nodes), filled(nodes, everywhere())
+    for index in (plain, cells):
+        index.remove(nodes[4].id)
+        index.add(nodes[7])
+    assert cells._cells is not None and cells.landmarks == plain.landmarks
+    for stop in tour[::5]:
+        view, _ = take_view(world, stop, np.random.default_rng(7))
+        one, two = plain.query(view, 6), cells.query(view, 6)
+        assert [score for _, score in one] == pytest.approx([score for _, score in two], rel=1e-3)
+        assert {node for node, _ in one[:3]} == {node for node, _ in two[:3]}
+
+
+def test_many_at_once_are_the_same_as_one_by_one(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    one, many = filled(nodes), PlaceIndex()
+    many.extend([*nodes, nodes[2]])
+    view, _ = take_view(world, tour[3], np.random.default_rng(8))
+    assert one.query(view, 9) == many.query(view, 9) and many.landmarks == one.landmarks
+
+
+def test_cells_are_learned_beside_the_questions(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    """What comes and goes while new cells are learned is in them."""
+    world, nodes, tour = building
+    settings = PlaceIndexSettings(small=300, exact=600, growth=2.0, patience=500, probes=10_000)
+    index = PlaceIndex(settings)
+    index.extend(nodes[:8])
+    index.add(nodes[8])
+    index.remove(nodes[0].id)
+    index.extend(nodes[9:])
+    for stop, node in zip(tour[9:12], nodes[9:12], strict=True):
+        view, _ = take_view(world, stop, np.random.default_rng(9))
+        assert node.id in dict(index.query(view, 3)), "searchable at once"
+    index.settle()
+    plain = filled(nodes[1:])
+    assert index.landmarks == plain.landmarks
+    view, _ = take_view(world, tour[5], np.random.default_rng(10))
+    ours, theirs = dict(index.query(view, 5)), dict(plain.query(view, 5))
+    assert set(ours) == set(theirs)
+
+
+def test_an_index_that_cannot_learn_says_so_and_goes_on(
+    building: tuple[World, list[Node], list[Pose2]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    world, nodes, tour = building
+    monkeypatch.setattr("mapserver.placeindex.Cells", None)
+    index = PlaceIndex(PlaceIndexSettings(small=300, growth=2.0, patience=300))
+    index.extend(nodes)
+    index.settle()
+    view, _ = take_view(world, tour[1], np.random.default_rng(11))
+    assert index.query(view, 1)[0][0] == nodes[1].id
+    assert "could not be made faster" in caplog.text

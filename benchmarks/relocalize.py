@@ -1,0 +1,186 @@
+"""Where am I, among a thousand places and among a million: recall, false answers, time and memory.
+
+    python -m benchmarks.relocalize [--nodes N ...] [--queries N] [--seed N] [--json]
+
+A thousand places are real: simulated buildings (offices, a warehouse, a ring corridor, rooms with twins)
+looked at with the robot's camera and eyes and made into nodes as uncertain as a robot's. Beyond these, places
+are made of real views of other buildings (benchmarks.relocalize_distractors). Asked are views near mapped
+postures, then disturbed ones, views of twin rooms, and views of buildings that nobody has mapped: to the last
+two "here" is always a false answer. The ceiling compares every view with every real place by whole SIFT
+descriptors; a bag of visual words answers the same questions through the same verification. The first run
+takes its pictures (some minutes) and keeps them in the system's folder for temporary files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.relocalize_distractors import AGENT, gather
+from benchmarks.relocalize_exhaustive import Exhaustive
+from benchmarks.relocalize_peer import Vocabulary, WordIndex
+from benchmarks.relocalize_places import joined, mapped, mapped_sites
+from benchmarks.relocalize_queries import KINDS, Query, known, nowhere, twins
+from benchmarks.relocalize_score import Reply, ask, figures, judged, recall_by_kind, share
+from hybridmap.descriptor import decode
+from hybridmap.node import Node, NodeId
+from mapserver.placeindex import PlaceIndex
+from mapserver.relocalization import Relocalizer
+
+REAL = 1000
+"""Places that are real, at most."""
+DONORS = 800
+"""Views behind the others."""
+PEER_AT_MOST = 100_000
+"""Beyond, the bag of words is left out: it is not what is asked."""
+
+
+class Bench:
+    """All that is asked of every size."""
+
+    def __init__(self, seed: int, real: int, count: int, bar: Progress) -> None:
+        """Take the pictures, or read them."""
+        self.seed, self.bar = seed, bar
+        sites = mapped_sites(seed)
+        with self.task("places", real) as step:
+            self.places = mapped(sites, real, seed, step)
+        self.truth = {place.node.id: place for place in self.places}
+        self.queries: list[Query] = []
+        for kind in KINDS:
+            with self.task(kind, count) as step:
+                self.queries += known(kind, count, sites, self.places, seed, step)
+        with self.task("twins", count) as step:
+            self.queries += twins(count, sites, self.places, seed, step)
+        with self.task("nowhere", count) as step:
+            self.queries += nowhere(count, seed, step)
+        with self.task("views of other buildings", DONORS) as step:
+            self.distractors = gather(DONORS, self.places, seed, step)
+        self.merged = joined(self.places, seed)
+
+    @contextmanager
+    def task(self, name: str, total: int) -> Iterator[Callable[[], None]]:
+        """A line of progress."""
+        task = self.bar.add_task(name, total=total)
+        yield lambda: self.bar.advance(task)
+        self.bar.update(task, completed=total, total=total)
+
+    def node(self, node_id: NodeId) -> Node | None:
+        """A node of the fleet, whichever size it has."""
+        if node_id.agent == AGENT:
+            return self.distractors.node(node_id.number)
+        place = self.truth.get(node_id)
+        return None if place is None else place.node
+
+    def nodes(self, size: int) -> Iterator[Node]:
+        """The fleet's nodes, at a size."""
+        yield from (place.node for place in self.places[:size])
+        yield from (self.distractors.node(k) for k in range(size - len(self.places)))
+
+    def asked(self, name: str, relocalizer: Relocalizer) -> list[Reply]:
+        """All answers."""
+        with self.task(name, len(self.queries)) as step:
+            return ask(relocalizer.answer, self.queries, self.truth, step)
+
+    def ceiling(self, kinds: list[str]) -> dict[str, float]:
+        """Recall of the exhaustive search by kind."""
+        chosen = [query for query in self.queries if query.kind in kinds]
+        judge = Relocalizer(PlaceIndex(), self.node, self.merged)
+        exhaustive = Exhaustive(self.places, judge)
+        replies = []
+        with self.task("exhaustive", len(chosen)) as step:
+            for query in chosen:
+                replies.append(judged(query, exhaustive.answer(query), self.truth))
+                step()
+        return {
+            kind: share([r for r in replies if r.query.kind == kind], lambda r: r.recalled) for kind in kinds
+        }
+
+
+def resident() -> float:
+    """MB of memory that the process holds now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+def measured(bench: Bench, size: int, peer: bool) -> dict[str, Any]:
+    """Everything at one size."""
+    index, before, began = PlaceIndex(), resident(), time.perf_counter()
+    with bench.task(f"{size} nodes: index", size) as step:
+        for node in bench.nodes(size):
+            index.add(node)
+            step()
+    built = time.perf_counter() - began
+    grown = resident() - before
+    replies = bench.asked(f"{size} nodes", Relocalizer(index, bench.node, bench.merged))
+    out: dict[str, Any] = {
+        **figures(replies), "build_s": round(built, 1), "memory_mb": round(grown, 1),
+        "index_bytes_per_node": round(1e6 * grown / size), "recall": recall_by_kind(replies),
+    }  # fmt: skip
+    if peer and size <= PEER_AT_MOST:
+        sample = np.concatenate([decode(p.node.landmarks.codes) for p in bench.places])
+        words = WordIndex(list(bench.nodes(size)), Vocabulary(sample, bench.seed))
+        theirs = figures(
+            bench.asked(f"{size} nodes: bag of words", Relocalizer(words, bench.node, bench.merged))
+        )
+        for name in ("recall_at_1", "false_accept", "p50_ms", "p95_ms"):
+            out[f"peer_{name}"] = theirs[name]
+    return out
+
+
+def table(sizes: dict[str, dict[str, Any]]) -> Table:
+    """For people."""
+    out = Table("figure", *sizes, title="nodes")
+    names = [name for name in next(iter(sizes.values())) if name != "recall"]
+    for name in names:
+        out.add_row(name, *(f"{one.get(name, float('nan')):g}" for one in sizes.values()))
+    for kind in next(iter(sizes.values()))["recall"]:
+        out.add_row(f"recall, {kind}", *(f"{one['recall'][kind]:g}" for one in sizes.values()))
+    return out
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.relocalize", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "--nodes", type=int, nargs="+", default=[1000, 10_000], help="sizes of the fleet's map"
+    )
+    parser.add_argument("--queries", type=int, default=200, help="of each kind (default 200)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ceilings", nargs="*", default=["near"], choices=list(KINDS), help="kinds of views")
+    parser.add_argument("--no-peer", action="store_true", help="without the bag of words")
+    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    arguments = parser.parse_args()
+    if min(arguments.nodes) < 100 or arguments.queries < 4 or arguments.seed < 0:
+        parser.error("at least 100 nodes, 4 queries and a seed that is not negative are needed")
+    console = Console(stderr=arguments.json)
+    sizes, real = sorted(set(arguments.nodes)), min(REAL, min(arguments.nodes))
+    with Progress(console=console) as bar:
+        bench = Bench(arguments.seed, real, arguments.queries, bar)
+        ceiling = bench.ceiling(arguments.ceilings)
+        found = {str(size): measured(bench, size, not arguments.no_peer) for size in sizes}
+    for one in found.values():
+        one["recall_exhaustive"] = ceiling.get("near", float("nan"))
+    console.print(table(found))
+    console.print(f"exhaustive: {ceiling}; load of the machine {os.getloadavg()[0]:.1f}")
+    if arguments.json:
+        keyed = {
+            name: {size: one.get(name) for size, one in found.items()} for name in next(iter(found.values()))
+        }
+        print(json.dumps({**keyed, "recall_exhaustive_by_kind": ceiling, "load": os.getloadavg()[0]}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""Places of a large fleet, made of real ones: the left of one real view beside the right of another.
+
+A landmark keeps its real pixel and depth; its descriptor is changed by a difference that a real landmark had
+between two real views. So distractors look like each other as much as real places do, with real geometry in
+either half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.relocalize_pictures import Wish
+from benchmarks.relocalize_places import (
+    CLEARANCE,
+    LEAST_LANDMARKS,
+    Place,
+    Progress,
+    donor_sites,
+    photographed,
+    placed,
+)
+from hybridmap.descriptor import decode, quantise
+from hybridmap.matching import match
+from hybridmap.node import Landmarks, Node, NodeId
+
+AGENT = "d"
+"""Of all distractors."""
+CUT = (0.25, 0.75)
+"""Where the cut between the two views may be, as shares of the width."""
+PIXEL_SIGMA, DEPTH_SIGMA = 1.0, 0.03
+"""px, and share of the depth, by which landmarks move."""
+
+
+@dataclass(frozen=True, eq=False)
+class Distractors:
+    """As many places as are wanted; number k is always the same.
+
+    Attributes:
+        donors: nodes that a robot would make of real views.
+        differences: (M, 32) float32, what real landmarks' decoded descriptors differed by between two views.
+        seed: of all.
+    """
+
+    donors: Sequence[Node]
+    differences: NDArray[np.float32]
+    seed: int
+
+    def node(self, number: int) -> Node:
+        """A place."""
+        rng = np.random.default_rng([self.seed, 0xD157, number])
+        i, j = rng.choice(len(self.donors), 2, replace=False).tolist()
+        left, right = self.donors[i], self.donors[j]
+        cut = left.camera.width * rng.uniform(*CUT)
+        a, b = left.landmarks, right.landmarks
+        a, b = a.take(a.pixels[:, 0] < cut), b.take(b.pixels[:, 0] >= cut)
+        n = len(a) + len(b)
+        vectors = decode(np.concatenate([a.codes, b.codes]))
+        vectors += self.differences[rng.integers(0, len(self.differences), n)]
+        pixels = np.concatenate([a.pixels, b.pixels]) + rng.normal(0, PIXEL_SIGMA, (n, 2)).astype(np.float32)
+        scales = (1 + rng.normal(0, DEPTH_SIGMA, n)).astype(np.float32)
+        landmarks = Landmarks(
+            pixels, quantise(vectors), np.concatenate([a.depths, b.depths]) * scales,
+            np.concatenate([a.depth_sigmas, b.depth_sigmas]) * scales,
+        )  # fmt: skip
+        return Node(NodeId(AGENT, 1, number), 0, left.map_from_robot, left.camera, landmarks)
+
+
+def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -> Distractors:
+    """Look at buildings that are neither mapped nor asked about.
+
+    Args:
+        count: views of them.
+        places: real nodes, of whose neighbours the differences are taken.
+        seed: of the buildings.
+        progress: called once a view.
+    """
+    donors: list[Node] = []
+    for number, site in enumerate(donor_sites(seed)):
+        rng = np.random.default_rng([seed, 0xD0, number])
+        wishes = [
+            Wish(site.world.plan.random_free_pose(rng, CLEARANCE)) for _ in range(round(site.share * count))
+        ]
+        made = [placed(p, NodeId("donor", 1, 1), -1, rng).node for p in photographed(site, wishes, progress)]
+        donors += [node for node in made if len(node.landmarks) >= LEAST_LANDMARKS]
+    return Distractors(donors, differences(places, seed), seed)
+
+
+def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> NDArray[np.float32]:
+    """(M, 32) of landmarks that two nodes share, by matches that the geometry confirms."""
+    rng = np.random.default_rng([seed, 0xD1F])
+    found: list[NDArray[np.float32]] = []
+    for k in rng.permutation(len(places))[: 4 * pairs].tolist():
+        one = places[k]
+        near = [
+            other for other in places
+            if other is not one and other.site == one.site and _alike(one, other)
+        ]  # fmt: skip
+        if not near:
+            continue
+        other = near[int(rng.integers(len(near)))]
+        matches = match(one.node.landmarks.codes, other.node.landmarks.codes)
+        a, b = one.node.landmarks.take(matches[:, 0]), other.node.landmarks.take(matches[:, 1])
+        there = one.world_from_node.inverse() @ other.world_from_node
+        at = other.node.camera.project(there.inverse().apply(a.points_in_robot(one.node.camera)))
+        right = np.linalg.norm(at - b.pixels, axis=1) < 4.0
+        found.append(decode(a.codes[right]) - decode(b.codes[right]))
+        if len(found) == pairs:
+            break
+    return np.concatenate(found).astype(np.float32)
+
+
+def _alike(one: Place, other: Place) -> bool:
+    between = one.world_from_node.inverse() @ other.world_from_node
+    return abs(between.heading) < 0.5 and abs(between.x) < 1.0 and abs(between.y) < 1.0
