@@ -8,6 +8,7 @@ import numpy as np
 
 from agent.fix import Fix
 from agent.localizer import Localizer
+from hybridmap.grid import snap
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array
@@ -63,7 +64,8 @@ class Refinement:
         if landmarks is None:
             return None
         self._told.add(node.id)
-        return replace(node, landmarks=landmarks)
+        # Rounded now, the robot works with the same numbers as everybody who gets the node.
+        return replace(node, landmarks=snap(landmarks, node.camera))
 
 
 def refined(mapped: Landmarks, depths: Array, sigmas: Array, s: RefinementSettings) -> Landmarks | None:

@@ -162,8 +162,17 @@ def restore_landmarks(rounded: Rounded, codes: NDArray[np.uint8], camera: Camera
     return Landmarks(pixels, codes, *restore_depths(rounded.share, rounded.depth))
 
 
+def snap(landmarks: Landmarks, camera: Camera) -> Landmarks:
+    """Landmarks as everybody will have them, in the order in which edges refer to them.
+
+    Raises:
+        InvalidValue: see `round_landmarks`.
+    """
+    return restore_landmarks(round_landmarks(landmarks, camera), landmarks.codes, camera)
+
+
 def settle(landmarks: Landmarks, camera: Camera) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Landmarks as everybody will have them, by rows and from left to right, and which each one was.
+    """The same for a new node: by rows and from left to right, and which each one was.
 
     Raises:
         InvalidValue: see `round_landmarks`.

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
-from hybridmap.grid import FINE_BITS, PixelGrid, restore_depths, round_depths, settle
+from hybridmap.grid import FINE_BITS, PixelGrid, restore_depths, round_depths, settle, snap
 from hybridmap.node import Landmarks
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)
@@ -85,3 +85,19 @@ def test_depths_beyond_use_are_unknown() -> None:
     assert not share.any()
     assert not depth.any()
     assert all(np.isnan(a).all() for a in restore_depths(share, depth))
+
+
+def test_snapped_landmarks_keep_their_order() -> None:
+    """Edges of a node refer to its landmarks by number, also where a node is told anew."""
+    random = np.random.default_rng(6)
+    pixels = (random.uniform(0, 1, (50, 2)) * [319, 239]).astype(np.float32)
+    codes = random.integers(0, 64, (50, 32)).astype(np.uint8)
+    away = random.uniform(0.5, 5, 50).astype(np.float32)
+    every = Landmarks(pixels, codes, away, away / 20)
+    snapped = snap(every, CAMERA)
+    assert np.array_equal(snapped.codes, codes)
+    assert np.abs(snapped.pixels - pixels).max() <= 1 / 16
+    settled, order = settle(every, CAMERA)
+    for name in ("pixels", "depths", "depth_sigmas"):
+        assert np.array_equal(getattr(settled, name), getattr(snapped, name)[order])
+        assert np.array_equal(getattr(snap(snapped, CAMERA), name), getattr(snapped, name))
