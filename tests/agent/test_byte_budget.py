@@ -1,0 +1,63 @@
+"""What a user lets a node cost is what it costs on the wire, and it is the same node for everybody."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agent.mapper import Mapper, MapperSettings
+from hybridmap.change import Change, NodePut
+from hybridmap.errors import InvalidValue, SettingsError
+from hybridmap.node import MapId, Node
+from hybridmap.pose import Pose2
+from wire.codec import decode_body, encode_body, encode_change
+from wire.tables import build
+
+FRAMING = 80
+"""What the transport adds."""
+
+
+def mapped(walls, description, most_bytes: int) -> Node:
+    """A node of the walls, made under a budget as a settings file gives it."""
+    table = {"cartographer": {"selection": {"most_bytes": most_bytes}}}
+    mapper = Mapper(MapId("r0", 1), description, build(MapperSettings, table, "robot.toml"))
+    there, before = np.arange(0.0, 0.4, 0.025), Pose2()
+    for tick, x in enumerate([*there, *there[::-1]], 1):
+        observation = walls.observe(before, Pose2(x), tick)
+        mapper.step(observation)
+        if not mapper.started:
+            mapper.begin(observation)
+        before = Pose2(x)
+    mapper.finish(observation)
+    (node,) = mapper.map.nodes.values()
+    return node
+
+
+def cost(node: Node) -> int:
+    return len(encode_change(Change(node.id.map, 100_000, node.stamp_ns, NodePut(node)))) + FRAMING
+
+
+def test_a_node_costs_what_it_may(walls, description):
+    large, small = (mapped(walls, description, most) for most in (3000, 900))
+    assert cost(large) <= 3000
+    assert 650 < cost(small) <= 900
+    assert 15 < len(small.landmarks) < len(large.landmarks)
+    # What a small node keeps is of the large one, and lies as far apart.
+    assert {bytes(code) for code in small.landmarks.codes} <= {bytes(code) for code in large.landmarks.codes}
+    assert (np.ptp(small.landmarks.pixels, axis=0) > 0.8 * np.ptp(large.landmarks.pixels, axis=0)).all()
+
+
+def test_the_robot_has_the_numbers_that_everybody_gets(walls, description):
+    node = mapped(walls, description, 3000)
+    sent = decode_body(encode_body(NodePut(node)))
+    assert isinstance(sent, NodePut)
+    for name in ("pixels", "codes", "depths", "depth_sigmas"):
+        assert np.array_equal(getattr(sent.node.landmarks, name), getattr(node.landmarks, name))
+    assert (np.diff(node.landmarks.pixels[:, 1]) >= 0).all()
+
+
+def test_a_budget_that_leaves_no_room_is_refused():
+    with pytest.raises(InvalidValue, match="660 at least"):
+        build(MapperSettings, {"cartographer": {"selection": {"most_bytes": 100}}}, "robot.toml")
+    with pytest.raises(SettingsError, match="did you mean 'most_bytes'"):
+        build(MapperSettings, {"cartographer": {"selection": {"most_byte": 1000}}}, "robot.toml")
