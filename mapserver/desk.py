@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -21,17 +22,18 @@ class DeskSettings:
 
     Attributes:
         workers: threads; 0: whoever asks does the work itself, one after the other and without a limit.
-        longest_wait: a question that would wait longer for a worker, as far as is known, is refused, s.
-        too_late: one that has waited so many times as long all the same is refused, too: the others behind it
-            are answered in time then.
+        in_time: a question that would have its answer later than this, as far as is known, is refused, unless
+            a worker is free, s.
+        too_late: one whose turn comes so late that its answer would take so many times as long is refused
+            as well: the others behind it are answered in time then.
         first_guess: how long a question takes, before any was answered, s.
         smoothing: weight of the newest question in the mean time that one takes.
         longest_pause: nobody is sent away for longer, s.
     """
 
     workers: int = min(os.cpu_count() or 1, 4)
-    longest_wait: float = 0.4
-    too_late: float = 1.5
+    in_time: float = 0.7
+    too_late: float = 1.25
     first_guess: float = 0.1
     smoothing: float = 0.2
     longest_pause: float = 10.0
@@ -44,10 +46,8 @@ class DeskSettings:
         """
         if not 0 <= self.workers <= 64:
             raise SettingsError(f"desk: {self.workers} workers; use 0 to 64")
-        if not (self.longest_wait >= 0.0 and self.first_guess > 0.0 and self.longest_pause > 0.0):
-            raise SettingsError(
-                "desk: longest_wait must not be negative, first_guess and longest_pause positive"
-            )
+        if not (self.in_time > 0.0 and self.first_guess > 0.0 and self.longest_pause > 0.0):
+            raise SettingsError("desk: in_time, first_guess and longest_pause must be positive")
         if not self.too_late >= 1.0:
             raise SettingsError(f"desk: too_late {self.too_late:g} must be 1 or more")
         if not 0.0 < self.smoothing <= 1.0:
@@ -76,7 +76,7 @@ class Desk:
         self._answered = 0
         self._refused = 0
         self._seconds = self._settings.first_guess
-        self._appointment = -float("inf")
+        self._appointment = -math.inf
         workers = self._settings.workers
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="desk") if workers else None
 
@@ -98,12 +98,12 @@ class Desk:
             return done
         with self._lock:
             wait = self._wait()
-            if wait > self._settings.longest_wait:
+            if wait > 0.0 and wait + self._seconds > self._settings.in_time:
                 self._refused += 1
                 raise Busy(self._next_appointment(wait))
             self._open += 1
-        came = self._clock()
-        return self._pool.submit(self._in_time, work, came)
+            latest = self._clock() + self._settings.too_late * self._settings.in_time
+        return self._pool.submit(self._unless_late, work, latest if wait > 0.0 else math.inf)
 
     def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
@@ -128,15 +128,15 @@ class Desk:
     def _next_appointment(self, wait: float) -> float:
         """In how many seconds somebody may come again: when the queue is half empty, behind all others."""
         s, now = self._settings, self._clock()
-        first = now + max(wait - 0.5 * s.longest_wait, 0.0)
+        first = now + max(wait - 0.5 * s.in_time, 0.0)
         self._appointment = max(self._appointment, first) + self._seconds / s.workers
         self._appointment = min(self._appointment, now + s.longest_pause)
         return self._appointment - now
 
-    def _in_time(self, work: Callable[[], _T], came: float) -> _T:
+    def _unless_late(self, work: Callable[[], _T], latest: float) -> _T:
         """What a worker does with a question when its turn has come."""
         with self._lock:
-            if self._clock() - came > self._settings.too_late * self._settings.longest_wait:
+            if self._clock() + self._seconds > latest:
                 self._open -= 1
                 self._refused += 1
                 raise Busy(self._next_appointment(self._wait()))

@@ -44,21 +44,28 @@ class Counter:
         self.desk.close()
 
 
-@pytest.mark.parametrize(("workers", "seconds", "longest"), [(1, 0.1, 0.5), (2, 0.05, 0.5), (4, 0.2, 0.1)])
-def test_what_is_taken_on_begins_in_time(workers: int, seconds: float, longest: float) -> None:
-    counter = Counter(DeskSettings(workers, longest_wait=longest, first_guess=seconds))
+@pytest.mark.parametrize(("workers", "seconds", "in_time"), [(1, 0.1, 0.65), (2, 0.05, 0.51), (4, 0.2, 0.23)])
+def test_what_is_taken_on_is_answered_in_time(workers: int, seconds: float, in_time: float) -> None:
+    counter = Counter(DeskSettings(workers, in_time=in_time, first_guess=seconds))
     while not counter.ask():
         assert counter.taken < 1000
-    # The last one taken waits for all others but those that run; one more would have waited too long.
-    assert (counter.taken - workers) * seconds / workers <= longest + 1e-9
-    assert (counter.taken - workers + 1) * seconds / workers > longest - 1e-9
+    # The last one taken waits for all that were behind those at work; one more would wait too long.
+    behind = counter.taken - workers
+    assert behind * seconds / workers + seconds <= in_time or behind == 0
+    assert (behind + 1) * seconds / workers + seconds > in_time
+    counter.end()
+
+
+def test_a_free_worker_takes_on_whatever_it_costs() -> None:
+    counter = Counter(DeskSettings(2, in_time=0.1, first_guess=5.0))
+    assert [counter.ask() > 0.0 for _ in range(4)] == [False, False, True, True]
     counter.end()
 
 
 def test_a_crowd_that_was_refused_comes_back_one_after_the_other() -> None:
     """Fifty ask at once and keep to what they are told: the queue never fills again."""
     workers, seconds = 2, 0.05
-    settings = DeskSettings(workers, longest_wait=0.5, first_guess=seconds)
+    settings = DeskSettings(workers, in_time=0.5, first_guess=seconds)
     counter = Counter(settings)
     pauses = [pause for pause in (counter.ask() for _ in range(50)) if pause]
     assert counter.taken + len(pauses) == 50
@@ -70,7 +77,7 @@ def test_a_crowd_that_was_refused_comes_back_one_after_the_other() -> None:
     step = seconds / workers
     for k, pause in enumerate(pauses):
         waiting = open_ones + k - pause / step - workers
-        assert waiting * step <= settings.longest_wait
+        assert waiting * step + seconds <= settings.in_time
     assert pauses[-1] < 50 * step + 0.1, "and nobody waits for nothing"
     counter.end()
 
@@ -104,7 +111,7 @@ def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
 def test_what_has_waited_too_long_is_refused_at_its_turn() -> None:
     """Each question takes four times as long as was thought."""
     clock = Clock()
-    settings = DeskSettings(1, longest_wait=0.5, too_late=1.5, first_guess=0.1)
+    settings = DeskSettings(1, in_time=0.6, too_late=1.5, first_guess=0.1)
     desk, go, waited = Desk(settings, clock), threading.Event(), []
 
     def work(came: float) -> None:
@@ -126,7 +133,7 @@ def test_what_has_waited_too_long_is_refused_at_its_turn() -> None:
 
 
 def test_closing_finishes_what_was_taken_on() -> None:
-    desk = Desk(DeskSettings(1, longest_wait=60.0))
+    desk = Desk(DeskSettings(1, in_time=60.0))
     done: list[int] = []
     for k in range(20):
         desk.submit(lambda k=k: done.append(k))
@@ -135,6 +142,6 @@ def test_closing_finishes_what_was_taken_on() -> None:
 
 
 def test_without_workers_the_asker_works_and_nobody_is_refused() -> None:
-    desk = Desk(DeskSettings(0, longest_wait=0.0, first_guess=100.0))
+    desk = Desk(DeskSettings(0, in_time=0.1, first_guess=100.0))
     threads = [desk.submit(threading.current_thread).result() for _ in range(50)]
     assert set(threads) == {threading.current_thread()}

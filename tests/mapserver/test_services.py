@@ -45,7 +45,7 @@ class Served:
         self.room = room
         hub = MemoryHub()
         self.bus, self.asker = MemoryBus(hub), MemoryBus(hub)
-        desk = DeskSettings(workers=2, longest_wait=0.2, too_late=1e3, first_guess=0.1)
+        desk = DeskSettings(workers=2, in_time=0.31, too_late=1e3, first_guess=0.1)
         settings = ServerSettings(lockstep=lockstep, desk=desk)
         self.server = MapServer(self.bus, KEYS, room.path, "s0", settings)
         self.nodes = sorted(room.truth)
@@ -109,7 +109,7 @@ def test_slow_questions_hold_up_nobody_and_what_is_too_much_is_refused(
         for _ in range(2):
             assert gate.entered.acquire(timeout=10)
         served.quick_ones()
-        # Two are worked on, and four more fit into 0.2 s at 0.1 s each for two workers.
+        # Two are worked on; four more begin within 0.2 s, if each takes 0.1 s, and end within 0.31 s.
         while served.server.status()["busy"] != 6:
             time.sleep(0.01)
         gate.open.set()
