@@ -99,25 +99,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.fit_belief", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[100, 101], help="that are learned from")
-    parser.add_argument("--check", type=int, nargs="+", default=[102], help="on which it is shown")
-    parser.add_argument("--nodes", type=int, default=300)
-    parser.add_argument("--queries", type=int, default=60, help="of each kind")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[100], help="that are learned from")
+    parser.add_argument("--check", type=int, nargs="+", default=[0], help="on which it is shown")
+    parser.add_argument("--nodes", type=int, nargs=2, default=[300, 1000], help="to learn, and to check")
+    parser.add_argument("--queries", type=int, nargs=2, default=[60, 200], help="of each kind, likewise")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
     if set(arguments.seeds) & set(arguments.check):
         parser.error("--check needs seeds that are not in --seeds")
     console = Console(stderr=arguments.json)
+    (nodes, more_nodes), (queries, more_queries) = arguments.nodes, arguments.queries
     with Progress(console=console) as bar:
-        learned = [
-            one for seed in arguments.seeds for one in gather(seed, arguments.nodes, arguments.queries, bar)
-        ]
-        others = [
-            one for seed in arguments.check for one in gather(seed, arguments.nodes, arguments.queries, bar)
-        ]
-    weights, count = fit(learned), sum(len(right) for _, right in learned)
-    wrong = count - sum(sum(right) for _, right in learned)
-    console.print(f"{count} places, {wrong} wrong; weights", np.round(weights, 3).tolist())
+        learned = [one for seed in arguments.seeds for one in gather(seed, nodes, queries, bar)]
+        weights, count = fit(learned), sum(len(right) for _, right in learned)
+        wrong = count - sum(sum(right) for _, right in learned)
+        console.print(f"{count} places, {wrong} wrong; weights", np.round(weights, 3).tolist())
+        others = [one for seed in arguments.check for one in gather(seed, more_nodes, more_queries, bar)]
     shipped = np.array(COEFFICIENTS)
     rows = reliability(others, shipped)
     out = {

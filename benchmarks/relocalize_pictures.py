@@ -197,7 +197,7 @@ def taken(
     key = hashlib.sha256(f"{_sources()} {name} {list(wishes)}".encode()).hexdigest()[:32]
     path = FOLDER / f"{key}.npz"
     try:
-        with np.load(path) as kept:
+        with path.open("rb") as file, np.load(file) as kept:
             made = _unpack(wishes, kept)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         artist = photographer()

@@ -273,4 +273,4 @@ class PlaceIndex:
 
 def cells_for(landmarks: int) -> int:
     """How many cells serve best from so many landmarks to a few times as many."""
-    return int(2 ** round(np.log2(4.0 * np.sqrt(landmarks))))
+    return int(2 ** round(np.log2(8.0 * np.sqrt(landmarks))))

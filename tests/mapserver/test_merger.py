@@ -1,19 +1,21 @@
 """The merger: order of arrival, better knowledge, and answers that follow the maps."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
-from hybridmap.node import EdgeKind, MapId, NodeId
+from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
+from hybridmap.recognition import examine_matches
 from hybridmap.route import RouteSettings
 from hybridmap.synthetic import Sensing, World, room, take_map, take_view
 from mapserver.belief import Support, probabilities
 from mapserver.merger import Merger
-from mapserver.relocalization import Relocalizer
+from mapserver.relocalization import RelocalizationSettings, Relocalizer
 from mapserver.routes import Router, RouterSettings
 from mapserver.seenplaces import fuse
 from merge.merged import MergedMap
@@ -173,6 +175,37 @@ def test_lost_robots_are_found_with_honest_postures(scene: Scene, merger: Merger
         assert node.map in (A, B)
     assert found >= 11
     assert max(distances) < 20 and np.median(errors) < 0.06
+
+
+def test_nodes_that_cannot_change_the_answer_are_not_examined(
+    scene: Scene, merger: Merger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer is that of a relocalizer which examines all of them; most of the work is saved."""
+    examined: list[NodeId] = []
+
+    def counted(node: Node, *others: Any) -> Any:
+        examined.append(node.id)
+        return examine_matches(node, *others)
+
+    monkeypatch.setattr("mapserver.relocalization.examine_matches", counted)
+    # Nobody suffices alone and nothing is faint: then every node that looks alike is examined.
+    thorough = Relocalizer(
+        merger.index, merger.node, merger.merged(), RelocalizationSettings(alone=1000, faint=0.0)
+    )
+    quick, rng, counts = relocalizer(merger), np.random.default_rng(11), np.zeros(2, int)
+    for stop in list(scene.truth.values())[::4]:
+        view, _ = take_view(scene.world, stop @ Pose2(0.1, -0.1, 0.05), rng)
+        examined.clear()
+        one = quick.answer(view)
+        few = len(examined)
+        two = thorough.answer(view)
+        if one.certainty is Certainty.FOUND:
+            counts += few, len(examined) - few
+            assert one.candidates[0].node.map in (A, B)
+            ours, theirs = one.candidates[0], two.candidates[0] if two.candidates else None
+            if theirs is not None and ours.merged_from_robot and theirs.merged_from_robot:
+                assert ours.merged_from_robot.mean.distance(theirs.merged_from_robot.mean) < 0.15
+    assert counts[0] > 3 and counts[0] < 0.5 * counts[1]
 
 
 def test_elsewhere_is_unknown_with_a_reason(scene: Scene, merger: Merger) -> None:

@@ -1,0 +1,191 @@
+"""The parts of the relocalization benchmark against plain arithmetic and known truth."""
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import relocalize_pictures
+from benchmarks.fit_belief import fit, reliability
+from benchmarks.relocalize_distractors import Distractors
+from benchmarks.relocalize_exhaustive import Exhaustive
+from benchmarks.relocalize_peer import Vocabulary, WordIndex
+from benchmarks.relocalize_pictures import Disturbance, Photographer, Picture, Wish, taken
+from benchmarks.relocalize_places import Place, placed, spread_out, twin_lookouts
+from benchmarks.relocalize_queries import Query, beside
+from benchmarks.relocalize_score import figures, judged
+from hybridmap.descriptor import decode, root_sift
+from hybridmap.matching import MatchSettings, match_vectors
+from hybridmap.node import MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, Whereabouts
+from hybridmap.synthetic import CAMERA, room, take_map, take_view
+from mapserver.belief import Support
+from mapserver.placeindex import PlaceIndex
+from mapserver.relocalization import Relocalizer
+from merge.merged import MergedMap
+from sim.worlds.catalog import make_world
+
+
+def picture_of(sift: np.ndarray) -> Picture:
+    n = len(sift)
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0, 240, (n, 2)).astype(np.float32)
+    return Picture(Pose2(), CAMERA, pixels, sift, rng.uniform(1, 4, n).astype(np.float32))
+
+
+def nodes_of(seed: int, count: int) -> list[Node]:
+    rng = np.random.default_rng(seed)
+    tour = [Pose2(2.5, 2.0, 0.7 * k) for k in range(count)]
+    return take_map(room(0, 0, 5, 4, 400, rng), MapId("a", 1), tour, rng)[0]
+
+
+def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match() -> None:
+    rng = np.random.default_rng(1)
+    own = rng.integers(0, 255, (60, 128))
+    places = []
+    for k in range(6):
+        seen = np.clip(own[rng.permutation(60)[:40]] + rng.normal(0, 8 * (k + 1), (40, 128)), 0, 255)
+        places.append(placed(picture_of(seen.astype(np.uint8)), NodeId("m", 1, k + 1), 0, rng))
+    asked = picture_of(np.clip(own + rng.normal(0, 8, own.shape), 0, 255).astype(np.uint8))
+    ceiling = Exhaustive(places, Relocalizer(PlaceIndex(), lambda _: None, MergedMap.empty()))
+    counts = ceiling._may_match(root_sift(asked.sift))
+    matches = [len(match_vectors(root_sift(p.sift), root_sift(asked.sift), MatchSettings())) for p in places]
+    assert max(matches) > 20 and min(matches) < max(matches)
+    assert (counts >= matches).all()
+
+
+def test_the_bag_of_words_is_tf_idf_and_cosine() -> None:
+    nodes = nodes_of(2, 8)
+    vocabulary = Vocabulary(np.concatenate([decode(node.landmarks.codes) for node in nodes]), 3)
+    bags = [Counter(vocabulary.words(decode(node.landmarks.codes)).tolist()) for node in nodes]
+    idf = {word: math.log(len(nodes) / sum(word in bag for bag in bags)) for bag in bags for word in bag}
+    view, _ = take_view(
+        room(0, 0, 5, 4, 400, np.random.default_rng(2)), Pose2(2.5, 2, 0.7), np.random.default_rng(4)
+    )
+    asked = Counter(vocabulary.words(decode(view.codes)).tolist())
+    expected = {}
+    for node, bag in zip(nodes, bags, strict=True):
+        norm = math.sqrt(sum((n * idf[word]) ** 2 for word, n in bag.items()))
+        expected[node.id] = (
+            sum(n * idf.get(w, 0.0) * bag[w] * idf.get(w, 0.0) for w, n in asked.items()) / norm
+        )
+    found = WordIndex(nodes, vocabulary).query(view, 5)
+    best = sorted(expected.items(), key=lambda item: -item[1])[:5]
+    assert [node for node, _ in found] == [node for node, _ in best]
+    assert [score for _, score in found] == pytest.approx([score for _, score in best])
+
+
+def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
+    donors = nodes_of(5, 6)
+    made = Distractors(donors, np.zeros((1, 32), np.float32), 7)
+    one, again, other = made.node(3), made.node(3), made.node(4)
+    assert np.array_equal(one.landmarks.codes, again.landmarks.codes) and one.id == NodeId("d", 1, 3)
+    assert not np.array_equal(one.landmarks.codes, other.landmarks.codes)
+    owners = [
+        next(k for k, donor in enumerate(donors) if (donor.landmarks.codes == code).all(axis=1).any())
+        for code in one.landmarks.codes
+    ]
+    assert 1 <= len(set(owners)) <= 2
+
+
+def test_pictures_are_taken_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relocalize_pictures, "FOLDER", tmp_path)
+    world = make_world("arena", 3)
+    wishes = [Wish(Pose2(2.0, 2.0, heading)) for heading in (0.0, 1.0)]
+    first = taken("arena", lambda: Photographer(world, (1,)), wishes)
+
+    def nobody() -> Photographer:
+        raise AssertionError("they are there")
+
+    second = taken("arena", nobody, wishes)
+    for one, two in zip(first, second, strict=True):
+        assert len(one) > 10 and one.camera == two.camera and one.world_from_robot == two.world_from_robot
+        assert np.array_equal(one.sift, two.sift) and np.array_equal(one.pixels, two.pixels)
+        assert np.array_equal(one.depths, two.depths, equal_nan=True)
+    (kept,) = tmp_path.iterdir()
+    kept.write_bytes(kept.read_bytes()[:100])
+    third = taken("arena", lambda: Photographer(world, (1,)), wishes)
+    assert np.array_equal(first[1].sift, third[1].sift)
+
+
+def test_a_person_hides_about_a_third() -> None:
+    world = make_world("arena", 3)
+    shares = []
+    artist = Photographer(world, (1,))
+    for number in range(4):
+        plain = artist.image(Wish(Pose2(2.0, 2.0, 0.4), number=number)).astype(int)
+        hidden = artist.image(Wish(Pose2(2.0, 2.0, 0.4), Disturbance(person=True), number)).astype(int)
+        shares.append(float((np.abs(plain - hidden).mean(axis=0) > 12).mean()))
+    assert 0.2 < np.mean(shares) < 0.4
+
+
+def test_twins_are_looked_at_alike() -> None:
+    world = make_world("twins", 5)
+    east = world.plan.room("room 1").x - world.plan.room("room 0").x
+    poses = twin_lookouts(world, 12, np.random.default_rng(6))
+    for one, two in zip(poses[::2], poses[1::2], strict=True):
+        assert Pose2(one.x + east, one.y, one.heading).distance(two) < 0.3
+        assert abs(one.heading - two.heading) < 0.25
+
+
+def test_places_far_from_each_other() -> None:
+    grid = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2)
+    chosen = spread_out(grid, 5, np.random.default_rng(8))
+    apart = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + 99 * np.eye(5)
+    assert apart.min() > 4.0
+
+
+def test_far_is_exactly_half_a_metre_and_twenty_degrees() -> None:
+    world, rng = make_world("arena", 3), np.random.default_rng(9)
+    place = Pose2(2.0, 2.0, 0.5)
+    spots = [spot for _ in range(30) if (spot := beside(place, world, True, rng)) is not None]
+    assert len(spots) > 5
+    for spot in spots:
+        assert place.distance(spot) == pytest.approx(0.5)
+        assert abs(math.degrees((place.inverse() @ spot).heading)) == pytest.approx(20.0)
+
+
+def test_answers_are_judged_by_the_truth() -> None:
+    node = nodes_of(10, 1)[0]
+    place = Place(node, Pose2(1.0, 2.0, 0.3), 0, np.zeros((0, 128), np.uint8))
+    truth = {node.id: place}
+    here = place.world_from_node @ Pose2(0.2, 0.1, 0.1)
+    sift = np.zeros((0, 128), np.uint8)
+    picture = Picture(here, CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
+
+    def told(pose: Pose2, site: int, kind: str = "near") -> dict[str, float]:
+        believed = PoseGaussian.from_sigmas(pose, 0.1, 0.05)
+        answer = RelocalizeAnswer(
+            Certainty.FOUND, (Whereabouts(node.id, believed, None, -1, 20, 0.9),), "because"
+        )
+        return figures([judged(Query(kind, picture, site), answer, truth, 3.0)])
+
+    right = told(Pose2(0.3, 0.1, 0.1), 0)
+    assert right["recall_at_1"] == 1 and right["error_m_median"] == pytest.approx(0.1, abs=1e-3)
+    assert right["nees"] == pytest.approx(1.0, abs=0.01) and right["p50_ms"] == 3.0
+    assert told(Pose2(0.5, 0.1, 0.1), 0)["recall_at_1"] == 0
+    assert told(Pose2(0.2, 0.1, 0.3), 0)["wrong_place"] == 1
+    assert told(Pose2(0.2, 0.1, 0.1), 1)["recall_at_1"] == 0
+    assert told(Pose2(0.2, 0.1, 0.1), 0, "twins")["false_accept"] == 1
+
+
+def test_the_fit_finds_the_weights_that_made_the_data() -> None:
+    rng = np.random.default_rng(11)
+    weights = np.array([-2.0, 1.2, 1.0, 1.5, 0.4, -2.5])
+    supports = [
+        Support(
+            int(rng.integers(10, 90)), rng.random(), rng.random(), int(rng.integers(1, 4)), 2 * rng.random()
+        )
+        for _ in range(8_000)
+    ]
+    numbers = np.array([one.numbers for one in supports])
+    right = rng.random(len(numbers)) < 1 / (1 + np.exp(-numbers @ weights))
+    seen = [([one], [bool(there)]) for one, there in zip(supports, right, strict=True)]
+    found = fit(seen)
+    assert np.allclose(found, weights, atol=0.5)
+    for row in reliability(seen, found):
+        if row["places"] > 200:
+            assert row["right"] == pytest.approx(row["told"], abs=0.05)
