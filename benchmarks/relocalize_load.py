@@ -173,7 +173,7 @@ def measure(desk: str, options: argparse.Namespace, folder: Path, progress: Prog
     building = Building.make(options.nodes, folder / "s0.sqlite", rng)
     (folder / "server.toml").write_text(desk)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    step = progress.add_task(folder.name, total=options.seconds)
+    step = progress.add_task(f"{folder.name}: the server reads its store", total=options.seconds)
     queries = [[building.query(rng) for _ in range(10)] for _ in range(options.robots)]
     sessions: list[ZenohBus] = []
     with Children(folder / "logs") as children:
@@ -187,6 +187,7 @@ def measure(desk: str, options: argparse.Namespace, folder: Path, progress: Prog
             wait_until_merged(sessions[-1], options.nodes, children)
             if not all(bus.wait_connected(20.0) for bus in sessions):
                 raise SystemExit("not all robots found the server")
+            progress.update(step, description=f"{folder.name}: all ask")
             stop = threading.Event()
             with ThreadPoolExecutor(options.robots + 1) as pool:
                 routes = pool.submit(ask_routes, sessions[-1], building, stop)

@@ -1,0 +1,77 @@
+"""The load benchmark: its figures by hand, and a small run of the real thing."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import relocalize_load
+from benchmarks.relocalize_load import Building, Tally, figures, is_right
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, Whereabouts
+from wire.messages import encode_relocalize_answer
+
+
+def test_figures_by_hand() -> None:
+    total, other = Tally([0.1, 0.2], [0.1, 2.0], refused=3, right=1), Tally([0.3], [0.3], right=1, lost=1)
+    total.add(other)
+    told = figures(total, [0.01, 0.03], took=1.5)
+    assert (told["answered"], told["answers_per_s"], told["lost"]) == (3, 2.0, 1)
+    assert (told["p50_ms"], told["max_ms"]) == (200.0, 300.0)
+    assert told["refused_share"] == pytest.approx(3 / 7, abs=1e-3)
+    assert told["right_share"] == pytest.approx(2 / 3, abs=1e-3)
+    assert told["wait_p95_ms"] > 1000.0
+    assert math.isnan(figures(Tally(), [], 1.0)["p95_ms"])
+
+
+def test_an_answer_is_right_where_it_was_taken(tmp_path: Path) -> None:
+    building = Building.make(20, tmp_path / "s0.sqlite", np.random.default_rng(1))
+    assert len(building.truth) == 20
+    query = building.query(np.random.default_rng(2))
+    node = NodeId(*query[1], 1)
+
+    def answer(off: Pose2) -> bytes:
+        told = building.truth[node].inverse() @ (query[2] @ off)
+        place = Whereabouts(node, PoseGaussian.from_sigmas(told, 0.1, 0.1), None, 0, 20, 0.9)
+        return encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, (place,), ""))
+
+    assert is_right(building, query, answer(Pose2()))
+    assert is_right(building, query, answer(Pose2(0.2, 0.0, 0.05)))
+    assert not is_right(building, query, answer(Pose2(0.3, 0.0, 0.0)))
+    assert not is_right(building, query, answer(Pose2(0.0, 0.0, 0.1)))
+    nothing = encode_relocalize_answer(RelocalizeAnswer(Certainty.UNKNOWN, (), ""))
+    assert not is_right(building, query, nothing)
+
+
+def test_a_small_run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "relocalize_load",
+        "--robots",
+        "3",
+        "--seconds",
+        "1",
+        "--nodes",
+        "20",
+        "--seed",
+        "5",
+        "--json",
+    ]
+    monkeypatch.setattr(sys, "argv", arguments)
+    relocalize_load.main()
+    found = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+    assert (found["robots"], found["nodes"], found["seed"]) == (3, 20, 5)
+    for server in (found, found["in_turn"]):
+        assert server["answered"] >= 3
+        assert server["lost"] == 0
+        assert server["right_share"] > 0.8
+    assert found["in_turn"]["refused_share"] == 0.0
+    with pytest.raises(SystemExit) as ended:
+        monkeypatch.setattr(sys, "argv", ["relocalize_load", "--robots", "0"])
+        relocalize_load.main()
+    assert ended.value.code == 2
