@@ -44,9 +44,7 @@ class Ruling:
             raise InvalidValue("a ruling needs two different nodes or two different maps")
         for words in (self.who, self.because):
             if len(words) > MOST_WORDS or not words.isprintable():
-                raise InvalidValue(
-                    f"who and why must be one printable line, at most {MOST_WORDS} characters"
-                )
+                raise InvalidValue(f"who and why must be one printable line, at most {MOST_WORDS} characters")
         object.__setattr__(self, "ends", (first, second))
 
 

@@ -35,7 +35,7 @@ def logs() -> dict[MapId, list[ChangeBody]]:
     here, there = room(0, 0, 5, 4, 700, rng), room(0, 0, 5, 4, 700, rng)
     out: dict[MapId, list[ChangeBody]] = {}
     for map_id, world in ((R0, here), (R1, here), (R2, there)):
-        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(5)]
+        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
         nodes, edges = take_map(world, map_id, stops, rng)
         out[map_id] = [*map(NodePut, nodes), *map(EdgePut, edges)]
     return out
@@ -75,7 +75,7 @@ def links(path: Path) -> list[tuple[NodeId, NodeId]]:
 
 def test_merging_says_what_is_one_and_what_is_not(files: list[Path], said: Said, tmp_path: Path) -> None:
     out = said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave")
-    assert "15 nodes, 3 maps, 2 components" in out and "r0.1 and r1.1 are one map now, by " in out
+    assert "12 nodes, 3 maps, 2 components" in out and "r0.1 and r1.1 are one map now, by " in out
     assert "r0.1 and r2.1 are not one map: " in out
     told = json.loads(said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave", "--json"))
     assert told["maps"] == ["r0.1", "r1.1", "r2.1"] and told["components"] == 2 and len(told["apart"]) == 2
@@ -147,7 +147,7 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
         (["explain", "r0.1.1", "r1.1"], "are a node and a map"),
         (["explain", "here", "there"], "'here' is neither a node nor a map"),
         (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
-        (["explain", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; its 5 nodes are 1 to 9"),
+        (["explain", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; its 4 nodes are 1 to 7"),
         (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes"),
         (["explain", "--draw", "x.png"], "--draw needs two nodes"),
         (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo"),
@@ -188,7 +188,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
         children.start("server", ["server", "--fleet", "why", "--listen", endpoint, "--data", str(folder)])
         bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
         try:
-            end = time.monotonic() + 30
+            end = time.monotonic() + 90
             while not bus.connected():
                 children.check()
                 assert time.monotonic() < end
@@ -211,9 +211,9 @@ def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_
         store.apply(map_id, 7, entries, len(entries))
     store.close()
     port = free_port()
-    at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}"]
+    at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}", "--timeout", "60"]
     with serving(tmp_path, port):
-        end = time.monotonic() + 30
+        end = time.monotonic() + 90
         while "r0.1 and r1.1 are one map: " not in said("map", "explain", *at):
             assert time.monotonic() < end, "the server has not merged"
         pair = links(files[3])[0]
@@ -227,7 +227,7 @@ def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_
         out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", *at)
         assert "r0.1 and r1.1 are not one map: undone with all links" in out
     with serving(tmp_path, port):
-        end = time.monotonic() + 30
+        end = time.monotonic() + 90
         while "known are: none" in (out := said_or_refused(said, "map", "explain", "r0.1", "r1.1", *at)):
             assert time.monotonic() < end
         assert "r0.1 and r1.1 are not one map: undone with all links" in out and "two kitchens" in out
