@@ -27,7 +27,7 @@ def mirrored(posture: Pose2, points: NDArray[Any]) -> Pose2:
         points: (N, 2) m, seen from above, N > 1.
     """
     middle = points.mean(axis=0)
-    line = np.linalg.svd(points - middle)[2][0]
+    line = np.linalg.svd(points - middle, full_matrices=False)[2][0]
     away = np.array([posture.x, posture.y]) - middle
     there = away - 2.0 * float(away @ line) * line
     turned = math.atan2(there[1], there[0]) - math.atan2(away[1], away[0])
