@@ -31,6 +31,8 @@ from merge.posegraph import LEAST_SIGMAS, PoseGraph
 
 HUBER = 2.0
 """As in posegraph.solve_graph: normalised residual from which a link pulls no harder."""
+AT_ONCE = 64
+"""Links whose covariances are solved for together: all at once would take memory by the square."""
 LEAST_AREA = 4.0
 """What is mapped is never smaller than this, m^2: a single look around."""
 _S = ConsistencySettings()
@@ -82,8 +84,10 @@ def credences(merged: MergedMap) -> dict[tuple[NodeId, NodeId], float]:
     out: dict[tuple[NodeId, NodeId], float] = {}
     for graph in merged.graphs:
         inside = [link for link in merged.links if link.a in graph.rows]
-        for link, found in zip(inside, standpoints(inside, graph, kept=True), strict=True):
-            out[link.pair] = probability(found.log_factor, odds)
+        for k in range(0, len(inside), AT_ONCE):
+            some = inside[k : k + AT_ONCE]
+            for link, found in zip(some, standpoints(some, graph, kept=True), strict=True):
+                out[link.pair] = probability(found.log_factor, odds)
     return out
 
 

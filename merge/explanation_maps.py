@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter
 from collections.abc import Sequence
 from itertools import combinations
@@ -15,9 +16,11 @@ from hybridmap.node import MapId, NodeId
 from merge.explanation import node_of
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap
+from merge.parting import joined_maps
 from merge.undoing import reason_of
 from merge.verification import VerificationSettings, examine
 
+Pair = tuple[MapId, MapId]
 MOST_NEAR = 5
 """Pairs that are told of each two maps."""
 
@@ -67,15 +70,26 @@ def explain_maps(
 def explain_fleet(
     merged: MergedMap, most: int, verification: VerificationSettings | None = None
 ) -> tuple[MapsExplanation, ...]:
-    """Explain each two maps, those first that are not one.
+    """Explain each two maps: those first that are not one, of these those with the most refused links.
 
     Args:
         merged: the merged map.
         most: pairs at most.
         verification: as in the merge.
     """
-    pairs = sorted(combinations(sorted(merged.maps), 2), key=lambda pair: merged.joined(*pair))
-    return tuple(explain_maps(merged, *pair, verification) for pair in pairs[:most])
+    part_of = {one: number for number, part in enumerate(joined_maps(merged)) for one in part}
+    refused: Counter[Pair] = Counter()
+    alike: Counter[Pair] = Counter()
+    for r in merged.refused:
+        if r.a.map != r.b.map:
+            (alike if r.link is None else refused)[min(r.a.map, r.b.map), max(r.a.map, r.b.map)] += 1
+
+    def interest(pair: Pair) -> tuple[bool, int, int, Pair]:
+        first, second = (part_of.get(one) for one in pair)
+        return first is not None and first == second, -refused[pair], -alike[pair], pair
+
+    pairs = heapq.nsmallest(most, combinations(sorted(merged.maps), 2), key=interest)
+    return tuple(explain_maps(merged, *pair, verification) for pair in pairs)
 
 
 def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[Link]) -> str:

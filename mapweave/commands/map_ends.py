@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 
 from hybridmap.errors import InvalidValue, NotConnected
@@ -61,6 +62,9 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
     good = [reply for reply in replies if not reply.error]
     if not good:
         raise NotConnected(f"the map server refused: {replies[0].error}")
+    for reply in replies:
+        if reply.error:
+            print(f"mapweave: another map server refused: {reply.error}", file=sys.stderr)
     return good
 
 
