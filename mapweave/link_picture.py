@@ -52,7 +52,8 @@ def draw_link(told: PairExplanation, path: Path) -> None:
     axes.set_axis_off()
     title = f"{told.a.id} and {told.b.id}: {told.standing}"
     if told.probability is not None:
-        title += f", probability {min(told.probability, 0.9999):.4f}"
+        sure = told.probability > 0.9999
+        title += ", probability over 0.9999" if sure else f", probability {told.probability:.4f}"
     axes.set_title(title + "\n" + "\n".join(textwrap.wrap(told.reason, 110)), fontsize=10)
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)

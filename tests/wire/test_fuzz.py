@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 
 import msgpack
@@ -14,10 +15,23 @@ from hypothesis import strategies as st
 
 from hybridmap.change import NodePut
 from hybridmap.errors import InvalidMessage
-from hybridmap.node import EdgeKind, NodeId
+from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplanation, Standing, Witness
+from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from hybridmap.ruling import Ruling, Rulings
 from wire.codec import decode_body, decode_change, encode_body, encode_change
+from wire.explanation_messages import (
+    ExplainRequest,
+    decode_explain_request,
+    decode_maps,
+    decode_pair,
+    decode_ruling,
+    encode_explain_request,
+    encode_maps,
+    encode_pair,
+    encode_ruling,
+)
 from wire.log_messages import (
     Ack,
     Head,
@@ -45,6 +59,7 @@ from wire.messages import (
     encode_route_request,
     encode_view,
 )
+from wire.ruling_codec import decode_rulings, encode_rulings
 
 Decoder = Callable[[bytes], object]
 
@@ -75,7 +90,30 @@ def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
         (decode_known_request, encode_known_request(KnownRequest(some.map, 1.5, -2.5, 9.0))),
         (decode_known_answer, encode_known_answer(KnownAnswer(np.ones((2, 4)), "why"))),
         (unpack_map_file, pack_map_file(MapFile("merged", "t", (NodePut(node),), {node.id: (0, here)}))),
+        *explanations(some, node, here),
     ]  # fmt: skip
+
+
+def explanations(some: SimpleNamespace, a: Node, posture: PoseGaussian) -> list[tuple[Decoder, bytes]]:
+    """Of two nodes and two maps, with the questions and rulings."""
+    b, (one, two) = replace(a, id=NodeId("r1", 1, 1)), (a.id.map, MapId("r1", 1))
+    ruling = Ruling((a.id, b.id), True, "anna", 5, "two kitchens")
+    pairs = np.array([[1, 2], [3, 4]])
+    misfit = Misfit(posture, np.zeros(3), 1.5, False)
+    witness = Witness(a.id, b.id, 2.5, True, False)
+    pair = PairExplanation(
+        a, b, Standing.LINKED, "why", pairs, pairs[:1], np.array([0.5]), posture, {"inliers": 12.0}, 0.9,
+        misfit, (witness,), ("r0 says so",), (ruling,),
+    )  # fmt: skip
+    near = NearMiss(a.id, b.id, 5, 3, "too few")
+    maps = MapsExplanation(one, two, False, "why", 0, 0, 3, 4, (near,), (ruling,))
+    return [
+        (decode_pair, encode_pair(pair)),
+        (decode_maps, encode_maps((maps,))),
+        (decode_explain_request, encode_explain_request(ExplainRequest((one, two)))),
+        (decode_ruling, encode_ruling(ruling)),
+        (decode_rulings, encode_rulings(Rulings([ruling]))),
+    ]
 
 
 def refused_or_read(decode: Decoder, data: bytes) -> None:
