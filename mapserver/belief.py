@@ -14,7 +14,7 @@ import numpy as np
 
 from hybridmap.pose import Array
 
-COEFFICIENTS = (-1.0, 1.0, 2.0, 2.0, 0.5, -3.0)
+COEFFICIENTS = (1.078, 0.378, 1.095, -0.033, 0.082, -3.171)
 """Of `Support.numbers`, as the script printed them."""
 
 

@@ -233,7 +233,8 @@ def test_two_rooms_that_look_alike_are_ambiguous() -> None:
     answer = service.answer(view)
     assert answer.certainty is Certainty.AMBIGUOUS
     assert {nodes[1].id, nodes[9].id} <= {candidate.node for candidate in answer.candidates}
-    assert "may be" in answer.reason and all(c.probability < 0.7 for c in answer.candidates)
+    told = [candidate.probability for candidate in answer.candidates]
+    assert "may be" in answer.reason and max(told) < 0.9 and sum(told) < 1.0 + 1e-9
     # In the room between there is nothing to doubt.
     view, _ = take_view(world, stops[5] @ Pose2(0.1, 0.05, 0.05), rng)
     assert service.answer(view).certainty is Certainty.FOUND
