@@ -13,6 +13,11 @@ from typing import TypeVar
 
 from hybridmap.errors import Busy, SettingsError
 
+LATENESS = 0.5
+"""Who comes so much after or before the appointment still has it, s: the way there and back takes time."""
+MOST_BOOKED = 1024
+"""Appointments that are kept in mind; beyond, nobody has precedence."""
+
 _T = TypeVar("_T")
 
 
@@ -58,6 +63,7 @@ class Desk:
     """A pool of workers with a queue that is never longer than can be worked off in time.
 
     Those who are refused get appointments one after the other, so that a crowd does not come back as a crowd.
+    Who comes back with the same question has precedence over who comes for the first time.
     """
 
     def __init__(
@@ -77,11 +83,17 @@ class Desk:
         self._refused = 0
         self._seconds = self._settings.first_guess
         self._appointment = -math.inf
+        self._booked: dict[int, float] = {}
         workers = self._settings.workers
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="desk") if workers else None
 
-    def submit(self, work: Callable[[], _T]) -> Future[_T]:
+    def submit(self, work: Callable[[], _T], ticket: int | None = None) -> Future[_T]:
         """Have something done.
+
+        Args:
+            work: to be done.
+            ticket: the same when the same question comes again, and hardly ever that of another one; without
+                one it never has precedence.
 
         Returns:
             Its result, or what it raised, some time later; Busy if it has waited too long.
@@ -97,13 +109,14 @@ class Desk:
                 done.set_exception(error)
             return done
         with self._lock:
-            wait = self._wait()
-            if wait > 0.0 and wait + self._seconds > self._settings.in_time:
+            s, now, wait = self._settings, self._clock(), self._wait()
+            latest = s.too_late * s.in_time
+            allowed = latest if self._keeps_appointment(ticket, now) else s.in_time - self._expected(now)
+            if wait > 0.0 and wait + self._seconds > allowed:
                 self._refused += 1
-                raise Busy(self._next_appointment(wait))
+                raise Busy(self._next_appointment(wait, ticket))
             self._open += 1
-            latest = self._clock() + self._settings.too_late * self._settings.in_time
-        return self._pool.submit(self._unless_late, work, latest if wait > 0.0 else math.inf)
+        return self._pool.submit(self._unless_late, work, ticket, now + latest if wait > 0.0 else math.inf)
 
     def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
@@ -125,21 +138,38 @@ class Desk:
         workers = self._settings.workers
         return max(self._open - workers + 1, 0) * self._seconds / workers
 
-    def _next_appointment(self, wait: float) -> float:
+    def _keeps_appointment(self, ticket: int | None, now: float) -> bool:
+        """Whether somebody comes when told, give or take. Who does not come in time has lost the place."""
+        late = [one for one, due in self._booked.items() if due < now - LATENESS]
+        for one in late:
+            del self._booked[one]
+        if ticket is None or self._booked.get(ticket, math.inf) > now + LATENESS:
+            return False
+        del self._booked[ticket]
+        return True
+
+    def _expected(self, now: float) -> float:
+        """How long those will take who have an appointment as long as a new question would wait, s."""
+        soon = sum(due <= now + self._settings.in_time for due in self._booked.values())
+        return soon * self._seconds / self._settings.workers
+
+    def _next_appointment(self, wait: float, ticket: int | None) -> float:
         """In how many seconds somebody may come again: when the queue is half empty, behind all others."""
         s, now = self._settings, self._clock()
         first = now + max(wait - 0.5 * s.in_time, 0.0)
         self._appointment = max(self._appointment, first) + self._seconds / s.workers
         self._appointment = min(self._appointment, now + s.longest_pause)
+        if ticket is not None and len(self._booked) < MOST_BOOKED:
+            self._booked[ticket] = self._appointment
         return self._appointment - now
 
-    def _unless_late(self, work: Callable[[], _T], latest: float) -> _T:
+    def _unless_late(self, work: Callable[[], _T], ticket: int | None, latest: float) -> _T:
         """What a worker does with a question when its turn has come."""
         with self._lock:
             if self._clock() + self._seconds > latest:
                 self._open -= 1
                 self._refused += 1
-                raise Busy(self._next_appointment(self._wait()))
+                raise Busy(self._next_appointment(self._wait(), ticket))
         return self._timed(work)
 
     def _timed(self, work: Callable[[], _T]) -> _T:

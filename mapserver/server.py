@@ -138,16 +138,17 @@ class MapServer:
             **self._desk.counters(),
         }
 
-    def locate(self, look: Callable[[], View]) -> Future[RelocalizeAnswer]:
+    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         """Ask where a view was taken, from any thread; as long as robots ask, one waits one's turn.
 
         Args:
             look: makes the view; called by a worker.
+            ticket: the same if the same image comes again, see Desk.submit.
 
         Raises:
             Busy: too many ask.
         """
-        return self._desk.submit(lambda: self._in_step().relocalizer.answer(look()))
+        return self._desk.submit(lambda: self._in_step().relocalizer.answer(look()), ticket)
 
     def _in_step(self) -> Answers:
         if self._settings.lockstep and not self.settle(SETTLE_PATIENCE):

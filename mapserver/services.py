@@ -74,7 +74,7 @@ class Services:
             closing.close()
 
     def _relocalize_later(self, request: Request) -> None:
-        done = self._desk.submit(lambda: self._relocalize(request.payload))
+        done = self._desk.submit(lambda: self._relocalize(request.payload), hash(request.payload))
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _relocalize(self, payload: bytes) -> bytes:

@@ -43,7 +43,7 @@ MOST_AT_ONCE = 32
 POLL = 0.05
 """How soon the server notices that it is closed, s."""
 
-Locate = Callable[[Callable[[], View]], "Future[RelocalizeAnswer]"]
+Locate = Callable[[Callable[[], View], int], "Future[RelocalizeAnswer]"]
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -161,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
             query = dict(parse_qsl(address.query, keep_blank_values=True))
             photo = read_photo(self.headers.get("Content-Type", ""), body, query)
             photo.check()
-            answer = self._web.locate(photo.view).result(PATIENCE)
+            answer = self._web.locate(photo.view, hash(photo.data)).result(PATIENCE)
         except Busy as busy:
             self._busy(busy)
         except InvalidValue as error:

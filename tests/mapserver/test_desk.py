@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 
+import numpy as np
 import pytest
 
 from hybridmap.errors import Busy
@@ -28,12 +29,13 @@ class Counter:
         self.clock = Clock()
         self.desk = Desk(settings, self.clock)
         self.go = threading.Event()
-        self.taken = 0
+        self.taken = self.asked = 0
 
-    def ask(self) -> float:
+    def ask(self, ticket: int | None = None) -> float:
         """One more question: 0 if it is taken on, else the seconds after which to ask again."""
+        self.asked += 1
         try:
-            self.desk.submit(lambda: self.go.wait(10))
+            self.desk.submit(lambda: self.go.wait(10), self.asked if ticket is None else ticket)
         except Busy as busy:
             return busy.retry_after
         self.taken += 1
@@ -82,6 +84,86 @@ def test_a_crowd_that_was_refused_comes_back_one_after_the_other() -> None:
     counter.end()
 
 
+class Simulated:
+    """A desk whose time is simulated: each question takes as long, and every robot asks on and on.
+
+    Only the desk's own rules are used; who is at work and when it ends is told by hand.
+    """
+
+    def __init__(self, robots: int, seconds: float, keep: bool, rng: np.random.Generator) -> None:
+        self.clock = Clock()
+        self.desk = Desk(DeskSettings(1, in_time=0.7, first_guess=seconds), self.clock)
+        self.pool = self.desk._pool
+        queue: list[tuple[float, int]] = []  # when it came, and whose it is
+
+        class Waiting:
+            def submit(self, _work: object, _call: object, ticket: int, _latest: float) -> None:
+                queue.append((0.0, ticket))
+
+        self.desk._pool = Waiting()  # type: ignore[assignment]
+        begin = {robot: 100.0 + 0.01 * robot for robot in range(robots)}
+        due, number = dict(begin), dict.fromkeys(begin, 0)
+        self.waits: list[float] = []
+        self.refusals = 0
+        free = 100.0
+        while self.clock.now < 200.0:
+            robot = min(due, key=lambda one: due[one]) if due else None
+            if queue and (robot is None or free <= due[robot]):
+                self.clock.now = max(self.clock.now, free)
+                _, ticket = queue.pop(0)
+                done, asker = self.clock.now + seconds, ticket % robots
+                free = done
+                with self.desk._lock:
+                    self.desk._open -= 1
+                self.waits.append(done - begin[asker])
+                number[asker] += 1
+                begin[asker] = due[asker] = done + rng.uniform(0.0, 0.01)
+                continue
+            assert robot is not None
+            self.clock.now = max(self.clock.now, due[robot])
+            ticket = robot + robots * number[robot] if keep else int(rng.integers(1 << 40)) * robots + robot
+            try:
+                self.desk.submit(lambda: None, ticket)
+            except Busy as busy:
+                self.refusals += 1
+                due[robot] = self.clock.now + busy.retry_after
+                continue
+            if len(queue) == 1:
+                free = max(free, self.clock.now)
+            del due[robot]
+        self.longest = max(self.clock.now - since for since in begin.values())
+        self.pool.shutdown()
+
+
+def test_everybody_has_a_turn() -> None:
+    """Fifty robots ask on and on: with appointments, none waits much longer than a round takes."""
+    seconds, robots = 0.06, 50
+    fair = Simulated(robots, seconds, keep=True, rng=np.random.default_rng(1))
+    unfair = Simulated(robots, seconds, keep=False, rng=np.random.default_rng(1))
+    whole_round = robots * seconds
+    assert max(*fair.waits, fair.longest) < 1.5 * whole_round
+    assert unfair.longest > 3.0 * whole_round, "without them, who comes first goes on coming first"
+    # The worker is never without work for long, and nobody comes in vain more than about once.
+    assert len(fair.waits) > 0.95 * 100.0 / seconds
+    assert fair.refusals < 1.1 * len(fair.waits)
+
+
+def test_an_appointment_has_precedence_and_is_lost_by_who_does_not_come() -> None:
+    counter = Counter(DeskSettings(1, in_time=0.5, first_guess=0.1))
+    while not counter.ask():
+        pass
+    pause = counter.ask(ticket=77)
+    assert pause > 0.0
+    assert counter.ask(ticket=88) > pause
+    counter.clock.now += pause
+    # Nobody was served meanwhile: one more would be too late, but who was told to come is taken on.
+    assert counter.ask(ticket=99) > 0.0
+    assert counter.ask(ticket=77) == 0.0
+    counter.clock.now += 30.0
+    assert counter.ask(ticket=88) > 0.0
+    counter.end()
+
+
 def test_the_time_that_a_question_takes_is_learned() -> None:
     clock = Clock()
     desk = Desk(DeskSettings(1, first_guess=0.01, smoothing=0.5), clock)
@@ -90,7 +172,7 @@ def test_the_time_that_a_question_takes_is_learned() -> None:
         clock.now += 0.4
 
     for _ in range(12):
-        desk.submit(work).result(5)
+        desk.submit(work, 1).result(5)
     assert desk.counters() == {"answered": 12, "busy": 0, "open": 0, "answer_ms": pytest.approx(400, abs=1)}
     desk.close()
 
@@ -98,11 +180,11 @@ def test_the_time_that_a_question_takes_is_learned() -> None:
 def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
     for workers in (0, 1):
         desk = Desk(DeskSettings(workers))
-        assert desk.submit(lambda: 3 + 4).result(5) == 7
+        assert desk.submit(lambda: 3 + 4, 1).result(5) == 7
         for _ in range(3):
             with pytest.raises(ZeroDivisionError):
-                desk.submit(lambda: 1 / 0).result(5)
-        assert desk.submit(lambda: "still here").result(5) == "still here"
+                desk.submit(lambda: 1 / 0, 1).result(5)
+        assert desk.submit(lambda: "still here", 1).result(5) == "still here"
         assert desk.counters()["open"] == 0
         desk.close()
         desk.close()
@@ -119,7 +201,7 @@ def test_what_has_waited_too_long_is_refused_at_its_turn() -> None:
         waited.append(clock.now - came)
         clock.now += 0.4
 
-    futures = [desk.submit(lambda: work(100.0)) for _ in range(5)]
+    futures = [desk.submit(lambda: work(100.0), k) for k in range(5)]
     go.set()
     refusals = [future.exception(10) for future in futures]
     assert waited == pytest.approx([0.0, 0.4])
@@ -136,12 +218,12 @@ def test_closing_finishes_what_was_taken_on() -> None:
     desk = Desk(DeskSettings(1, in_time=60.0))
     done: list[int] = []
     for k in range(20):
-        desk.submit(lambda k=k: done.append(k))
+        desk.submit(lambda k=k: done.append(k), k)
     desk.close()
     assert done == list(range(20))
 
 
 def test_without_workers_the_asker_works_and_nobody_is_refused() -> None:
     desk = Desk(DeskSettings(0, in_time=0.1, first_guess=100.0))
-    threads = [desk.submit(threading.current_thread).result() for _ in range(50)]
+    threads = [desk.submit(threading.current_thread, k).result() for k in range(50)]
     assert set(threads) == {threading.current_thread()}

@@ -105,12 +105,13 @@ def test_slow_questions_hold_up_nobody_and_what_is_too_much_is_refused(
 ) -> None:
     gate = Gate(monkeypatch, Relocalizer, "answer")
     with ThreadPoolExecutor(12) as askers:
-        waiting = [askers.submit(served.where) for _ in range(12)]
+        waiting = [askers.submit(served.where, None, seed) for seed in range(12)]
         for _ in range(2):
             assert gate.entered.acquire(timeout=10)
         served.quick_ones()
         # Two are worked on; four more begin within 0.2 s, if each takes 0.1 s, and end within 0.31 s.
-        while served.server.status()["busy"] != 6:
+        end = time.monotonic() + 10.0
+        while served.server.status()["busy"] != 6 and time.monotonic() < end:
             time.sleep(0.01)
         gate.open.set()
         replies = [future.result(20) for future in waiting]

@@ -38,7 +38,7 @@ class Desk:
         self.views: list[View] = []
         self.refusal: Exception | None = None
 
-    def locate(self, look: Callable[[], View]) -> Future[RelocalizeAnswer]:
+    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()
         if isinstance(self.refusal, Busy):
             raise self.refusal
