@@ -37,6 +37,9 @@ class ConsistencySettings:
         overwhelming_share: ... and this share of its matches joins them alone.
         dominance: how many times the landmarks of a contradicting set the kept set must have.
         exact: up to as many links the best clique is searched exhaustively, beyond greedily.
+        least_evidence: natural logarithm of Bayes' factor (see merge.credence) from which a link that is too
+            little alone, or was contradicted, is believed where other maps join its two ends.
+        cliques: whether links must agree with each other at all; without, all are believed for now.
     """
 
     gate: float = 16.27
@@ -47,6 +50,8 @@ class ConsistencySettings:
     overwhelming_share: float = 0.7
     dominance: float = 1.5
     exact: int = 40
+    least_evidence: float = 7.0
+    cliques: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +119,8 @@ def sort_links(
     """
     s = settings or ConsistencySettings()
     links = sorted(links, key=lambda link: link.pair)
+    if not s.cliques:
+        return Sorted(tuple(links), ())
     refused: list[RefusedLink] = []
     if first is second:
         links, refused = _against_odometry(links, first, s)

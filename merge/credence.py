@@ -29,8 +29,6 @@ from merge.links import Link
 from merge.merged import MergedMap
 from merge.posegraph import LEAST_SIGMAS, PoseGraph
 
-HUBER = 2.0
-"""As in posegraph.solve_graph: normalised residual from which a link pulls no harder."""
 AT_ONCE = 64
 """Links whose covariances are solved for together: all at once would take memory by the square."""
 LEAST_AREA = 4.0
@@ -104,19 +102,21 @@ def standpoints(links: Sequence[Link], graph: PoseGraph, *, kept: bool) -> list[
     merged = graph.relative([link.a for link in links], [link.b for link in links])
     area = max(float(np.prod(np.ptp(graph.means[:, :2], axis=0))), LEAST_AREA)
     return [
-        _standpoint(link, PoseGaussian(Pose2.from_vector(mean), covariance), area, kept)
+        _standpoint(
+            link, PoseGaussian(Pose2.from_vector(mean), covariance), area, graph.huber if kept else None
+        )
         for link, mean, covariance in zip(links, merged.means, merged.covariances, strict=True)
     ]
 
 
-def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> Standpoint:
+def _standpoint(link: Link, merged: PoseGaussian, area: float, huber: float | None) -> Standpoint:
     off = (link.a_from_b.mean.inverse() @ merged.mean).vector
     own = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2)
     strain2 = float(off @ np.linalg.solve(own, off))
     rest, moved = merged.covariance, off
-    if kept:
+    if huber is not None:
         # The solver let a robust link pull less where it is far off.
-        weight = np.linalg.inv(own) * min(1.0, HUBER / max(math.sqrt(strain2), 1e-12))
+        weight = np.linalg.inv(own) * min(1.0, huber / max(math.sqrt(strain2), 1e-12))
         information = np.linalg.inv(merged.covariance) - weight
         scale = np.linalg.inv(np.linalg.cholesky(weight))
         if np.linalg.eigvalsh(scale @ information @ scale.T)[0] < NO_INFORMATION:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 
 import networkx as nx
 import numpy as np
@@ -12,8 +13,9 @@ from hybridmap.pose import Array
 from hybridmap.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 from merge.consistency import ConsistencySettings, Sorted
 from merge.fragments import Fragment, fragment_by_node
+from merge.graduated import wrong_measurements
 from merge.links import Link, RefusedLink, refuse
-from merge.posegraph import LEAST_SIGMAS, Measurement, PoseGraph, solve_graph
+from merge.posegraph import HUBER, LEAST_SIGMAS, Measurement, PoseGraph, solve_graph
 
 Groups = Mapping[tuple[NodeId, NodeId], Sorted]
 """Sorted links by the names of the two fragments between which they are."""
@@ -22,9 +24,15 @@ Groups = Mapping[tuple[NodeId, NodeId], Sorted]
 class Solver:
     """Optimises the components that links make of fragments, each set of links only once."""
 
-    def __init__(self, fragments: Sequence[Fragment]) -> None:
-        """Take the fragments."""
+    def __init__(self, fragments: Sequence[Fragment], huber: float = HUBER) -> None:
+        """Take the fragments.
+
+        Args:
+            fragments: pieces of map.
+            huber: see `solve_graph`.
+        """
         self.fragments = fragments
+        self._huber = huber
         self.by_node = fragment_by_node(fragments)
         self._by_name = {fragment.name: fragment for fragment in fragments}
         self._solved: dict[tuple[tuple[NodeId, NodeId], ...], PoseGraph] = {}
@@ -35,29 +43,50 @@ class Solver:
         Args:
             links: at most one between two nodes.
         """
+        solved = [
+            self._component(names, here) if here else self._by_name[names[0]].graph
+            for names, here in self._components(links)
+        ]
+        return sorted(solved, key=lambda graph: (-len(graph.nodes), graph.anchor))
+
+    def wrong(self, links: Sequence[Link], gate: float) -> set[tuple[NodeId, NodeId]]:
+        """Pairs of the links that are wrong by graduated non-convexity.
+
+        Args:
+            links: at most one between two nodes.
+            gate: chi-square with 3 degrees of freedom above which a link is wrong.
+        """
+        out: set[tuple[NodeId, NodeId]] = set()
+        for names, here in self._components(links):
+            if here:
+                start = self._by_name[names[0]].graph.pose(names[0])
+                wrong = wrong_measurements(names[0], start, self._measurements(names, here), gate)
+                out |= {(m.a, m.b) for m in wrong} & {link.pair for link in here}
+        return out
+
+    def _components(self, links: Sequence[Link]) -> list[tuple[list[NodeId], list[Link]]]:
+        """Names of the fragments of each component, ascending, and its links; in the order of the names."""
         joined: nx.Graph = nx.Graph()
         joined.add_nodes_from(self._by_name)
         joined.add_edges_from((self.by_node[link.a].name, self.by_node[link.b].name) for link in links)
-        anchors = {name: min(names) for names in nx.connected_components(joined) for name in names}
-        inside: dict[NodeId, list[Link]] = {}
+        components = sorted(sorted(names) for names in nx.connected_components(joined))
+        seats = {name: k for k, names in enumerate(components) for name in names}
+        inside: list[list[Link]] = [[] for _ in components]
         for link in links:
-            inside.setdefault(anchors[self.by_node[link.a].name], []).append(link)
-        solved = [
-            self._component([n for n in self._by_name if anchors[n] == anchor], inside[anchor])
-            if anchor in inside
-            else self._by_name[anchor].graph
-            for anchor in sorted(set(anchors.values()))
-        ]
-        return sorted(solved, key=lambda graph: (-len(graph.nodes), graph.anchor))
+            inside[seats[self.by_node[link.a].name]].append(link)
+        return list(zip(components, inside, strict=True))
+
+    def _measurements(self, names: Sequence[NodeId], links: Sequence[Link]) -> list[Measurement]:
+        own = [m for name in names for m in self._by_name[name].measurements]
+        return own + [Measurement(link.a, link.b, link.a_from_b, robust=True) for link in links]
 
     def _component(self, names: Sequence[NodeId], links: Sequence[Link]) -> PoseGraph:
         key = tuple(sorted(link.canonical().pair for link in links))
         if key not in self._solved:
-            anchor = min(names)
-            measurements = [m for name in names for m in self._by_name[name].measurements]
-            measurements += [Measurement(link.a, link.b, link.a_from_b, robust=True) for link in links]
+            anchor = names[0]
+            measurements = self._measurements(names, links)
             start = self._by_name[anchor].graph.pose(anchor)
-            self._solved[key] = solve_graph(anchor, start, measurements)
+            self._solved[key] = solve_graph(anchor, start, measurements, huber=self._huber)
         return self._solved[key]
 
 
@@ -75,7 +104,7 @@ def join(solver: Solver, groups: Groups, s: ConsistencySettings) -> tuple[list[L
     for (first, second), group in ranked:
         if not group.kept:
             continue
-        if first == second or not nx.has_path(joined, first, second):
+        if not s.cliques or first == second or not nx.has_path(joined, first, second):
             joined.add_edge(first, second)
             kept += group.kept
         else:
@@ -83,7 +112,7 @@ def join(solver: Solver, groups: Groups, s: ConsistencySettings) -> tuple[list[L
     refusals: list[RefusedLink] = []
     for group in closing:
         graph = next(g for g in solver.solve(kept) if group.kept[0].a in g.rows)
-        good = _misfits(group.kept, graph, s) < s.gate
+        good = misfits(group.kept, graph, s) < s.gate
         kept += [link for link, fits in zip(group.kept, good, strict=True) if fits]
         refusals += [
             refuse(link, "contradicts better supported links by way of other maps")
@@ -93,7 +122,7 @@ def join(solver: Solver, groups: Groups, s: ConsistencySettings) -> tuple[list[L
     return kept, refusals
 
 
-def _misfits(links: Sequence[Link], graph: PoseGraph, s: ConsistencySettings) -> Array:
+def misfits(links: Sequence[Link], graph: PoseGraph, s: ConsistencySettings) -> Array:
     """(N,) how far links that are not in the graph are from it, chi-square with 3 degrees of freedom."""
     floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
     measured = PoseGaussians(
@@ -104,23 +133,44 @@ def _misfits(links: Sequence[Link], graph: PoseGraph, s: ConsistencySettings) ->
     return (measured @ back).distances2()
 
 
-def optimise(
-    solver: Solver, links: Sequence[Link], strain: float
-) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
-    """Optimise; refuse the worst link as long as one strains too much.
+class Outliers(StrEnum):
+    """What becomes of links that the joined map does not bear out.
 
-    It never cuts a piece off: a link that is all that holds two pieces together has no strain.
+    All are believed (`none`, plain least squares). Or their pull is limited and the worst is refused, as long
+    as one strains too much (`worst_first`). Or those that graduated non-convexity leaves out are refused at
+    once (`graduated`).
+    """
+
+    NONE = "none"
+    WORST_FIRST = "worst_first"
+    GRADUATED = "graduated"
+
+
+def optimise(
+    solver: Solver, links: Sequence[Link], strain: float, outliers: Outliers = Outliers.WORST_FIRST
+) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
+    """Optimise; refuse links that strain too much.
+
+    Worst first, it never cuts a piece off: a link that is all that holds two pieces together has no strain.
 
     Args:
         solver: of the fragments.
         links: that join them.
         strain: chi-square with 3 degrees of freedom above which a link is refused.
+        outliers: how they are found.
 
     Returns:
         The components, the links that are kept, and those that were refused.
     """
     left = list(links)
+    if outliers is Outliers.NONE:
+        return solver.solve(left), left, []
     refusals: list[RefusedLink] = []
+    if outliers is Outliers.GRADUATED:
+        wrong = solver.wrong(left, strain)
+        reason = "strains the joined map: graduated non-convexity leaves it out"
+        refusals = [refuse(link, reason) for link in left if link.pair in wrong]
+        left = [link for link in left if link.pair not in wrong]
     while True:
         solved = solver.solve(left)
         strains = _strains(left, solved)

@@ -2,7 +2,8 @@
 
 1. Maps are cut into pieces that their own edges connect; a robot's own claims must agree with its way.
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
-3. Pieces are joined, best supported first. Links that would join what is joined already must agree with it.
+3. Pieces are joined, best supported first, and the links between what is larger now are sorted anew. Links
+   that would join what is joined already must agree with it.
 4. Each component is optimised; a link that then strains more than it should is refused, worst first.
 5. Where two robots would have been at the same place at the same time, the links that make them so are
    refuted, and it goes on at 2 with the rest.
@@ -11,19 +12,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
+from merge.agglomeration import agglomerate
 from merge.consistency import ConsistencySettings, group_links
 from merge.cutting import fragments_of
 from merge.drives import refuse_drives
 from merge.exclusion import ExclusionSettings
 from merge.groups import LinkGroup
-from merge.joining import Solver, join, optimise
+from merge.joining import Outliers, Solver, optimise
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap, Placement
+from merge.posegraph import HUBER
 from merge.refutation import Refutation
 
 
@@ -34,12 +38,22 @@ class MergeSettings:
     Attributes:
         consistency: when links are believed.
         exclusion: when two robots would have been in one place.
+        outliers: how links are found that the joined map does not bear out.
         strain: chi-square with 3 degrees of freedom above which an optimised link is refused.
     """
 
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     exclusion: ExclusionSettings = field(default_factory=ExclusionSettings)
+    outliers: Outliers = Outliers.WORST_FIRST
     strain: float = 25.0
+
+    @property
+    def huber(self) -> float:
+        """Normalised residual from which a link pulls no harder.
+
+        Where the wrong ones are found out before the solution counts, none has to be held back.
+        """
+        return HUBER if self.outliers is Outliers.WORST_FIRST else math.inf
 
 
 def merge_maps(
@@ -61,7 +75,7 @@ def merge_maps(
     """
     s = settings or MergeSettings()
     fragments = fragments_of(maps, s.consistency, s.strain)
-    solver = Solver(fragments)
+    solver = Solver(fragments, s.huber)
     by_node = solver.by_node
     refutation = Refutation(maps, solver, s.consistency, s.exclusion)
     present = [link for link in links if link.a in by_node and link.b in by_node]
@@ -75,16 +89,15 @@ def merge_maps(
     }
     # Each round refutes a link at least, so there is a last one.
     while True:
-        kept, unjoined = join(solver, {key: group.sorted for key, group in groups.items()}, s.consistency)
-        solved, kept, strained = optimise(solver, kept, s.strain)
+        kept, unjoined = agglomerate(solver, groups, s.consistency)
+        solved, kept, strained = optimise(solver, kept, s.strain, s.outliers)
         impossible = refutation.impossible(groups, solved, kept)
         if not impossible:
             break
         for key, reason in impossible.items():
-            groups[key] = groups[key].without(
-                groups[key].sorted.kept, reason, s.consistency, refutation.verdict
-            )
-    refusals += [r for group in groups.values() for r in group.refused] + unjoined + strained
+            story = [link for link in kept if refutation.key_of(link) == key]
+            groups[key] = groups[key].without(story, reason, s.consistency, refutation.verdict)
+    refusals += [r for group in groups.values() for r in group.refuted] + unjoined + strained
     refusals += refuse_drives(maps, solved, s.consistency)
     postures = {
         node: Placement(number, posture)

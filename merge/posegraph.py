@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,12 @@ LEAST_SIGMAS = np.array([1e-3, 1e-3, 2e-4])
 """No measurement is better than this, m, m, rad: it keeps the graph well conditioned."""
 
 ANCHOR_SIGMA = 1e-5
+
+HUBER = 2.0
+"""Normalised residual from which a measurement that may be wrong pulls no harder."""
+
+TOLERANCE = 1e-9
+"""The solver stops when a step makes the cost smaller by less than this, absolutely or as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +63,14 @@ class PoseGraph:
         nodes: in the order of ids.
         means: (N, 3) m, m, rad, postures of the nodes.
         information: (3N, 3N) sparse, of the right perturbations of all nodes, anchor held.
+        huber: normalised residual from which a robust measurement pulled no harder; inf: none did.
     """
 
     anchor: NodeId
     nodes: tuple[NodeId, ...]
     means: Array
     information: sparse.csc_matrix
+    huber: float = HUBER
 
     @cached_property
     def rows(self) -> dict[NodeId, int]:
@@ -118,7 +127,7 @@ def solve_graph(
     anchor_pose: Pose2,
     measurements: Iterable[Measurement],
     guesses: Mapping[NodeId, Pose2] | None = None,
-    huber: float = 2.0,
+    huber: float = HUBER,
 ) -> PoseGraph:
     """Optimise one connected component.
 
@@ -127,38 +136,79 @@ def solve_graph(
         anchor_pose: where.
         measurements: what is known; those that do not connect to the anchor are left out.
         guesses: where to start; else along a tree of the most certain measurements.
-        huber: normalised residual from which a robust measurement pulls no harder.
+        huber: normalised residual from which a robust measurement pulls no harder; inf: plain least squares.
 
     Returns:
         The solved graph. It depends on the set of measurements, not on their order.
     """
-    ordered = sorted(measurements, key=lambda m: (m.a, m.b, m.a_from_b.mean.vector.tolist()))
-    start = _along_tree(anchor, anchor_pose, ordered)
-    ordered = [m for m in ordered if m.a in start]
-    nodes = tuple(sorted(start))
-    row = {node: k for k, node in enumerate(nodes)}
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for node in nodes:
-        guess = (guesses or {}).get(node, start[node]) if node != anchor else anchor_pose
-        values.insert(row[node], gtsam.Pose2(guess.x, guess.y, guess.heading))
-    held = gtsam.noiseModel.Isotropic.Sigma(3, ANCHOR_SIGMA)
-    graph.add(
-        gtsam.PriorFactorPose2(
-            row[anchor], gtsam.Pose2(anchor_pose.x, anchor_pose.y, anchor_pose.heading), held
-        )
-    )
-    for m in ordered:
-        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(m.covariance)
-        if m.robust:
-            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(huber), noise)
-        mean = m.a_from_b.mean
-        between = gtsam.Pose2(mean.x, mean.y, mean.heading)
-        graph.add(gtsam.BetweenFactorPose2(row[m.a], row[m.b], between, noise))
-    if len(ordered) >= len(nodes):
+    problem = Problem.of(anchor, anchor_pose, measurements, guesses, huber)
+    values = problem.values
+    if len(problem.measurements) >= len(problem.nodes):
         # A tree is at its optimum already.
-        values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    means = np.array([[p.x(), p.y(), p.theta()] for p in (values.atPose2(k) for k in range(len(nodes)))])
-    return PoseGraph(anchor, nodes, means, _information(row, anchor, means, ordered, huber))
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setRelativeErrorTol(TOLERANCE)
+        parameters.setAbsoluteErrorTol(TOLERANCE)
+        values = gtsam.LevenbergMarquardtOptimizer(problem.graph, values, parameters).optimize()
+    return problem.solved(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What GTSAM is asked to solve.
+
+    Attributes:
+        anchor: the node that is held.
+        nodes: in the order of ids; a node's row is its key.
+        measurements: in the order of their factors, which come after that of the anchor.
+        graph: the factors.
+        values: where to start.
+        huber: of robust measurements.
+    """
+
+    anchor: NodeId
+    nodes: tuple[NodeId, ...]
+    measurements: tuple[Measurement, ...]
+    graph: Any
+    values: Any
+    huber: float
+
+    @staticmethod
+    def of(
+        anchor: NodeId,
+        anchor_pose: Pose2,
+        measurements: Iterable[Measurement],
+        guesses: Mapping[NodeId, Pose2] | None = None,
+        huber: float = HUBER,
+    ) -> Problem:
+        """See `solve_graph`."""
+        ordered = sorted(measurements, key=lambda m: (m.a, m.b, m.a_from_b.mean.vector.tolist()))
+        start = _along_tree(anchor, anchor_pose, ordered)
+        ordered = [m for m in ordered if m.a in start]
+        nodes = tuple(sorted(start))
+        row = {node: k for k, node in enumerate(nodes)}
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for node in nodes:
+            guess = (guesses or {}).get(node, start[node]) if node != anchor else anchor_pose
+            values.insert(row[node], gtsam.Pose2(guess.x, guess.y, guess.heading))
+        held = gtsam.noiseModel.Isotropic.Sigma(3, ANCHOR_SIGMA)
+        place = gtsam.Pose2(anchor_pose.x, anchor_pose.y, anchor_pose.heading)
+        graph.add(gtsam.PriorFactorPose2(row[anchor], place, held))
+        for m in ordered:
+            noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(m.covariance)
+            if m.robust and math.isfinite(huber):
+                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(huber), noise)
+            mean = m.a_from_b.mean
+            between = gtsam.Pose2(mean.x, mean.y, mean.heading)
+            graph.add(gtsam.BetweenFactorPose2(row[m.a], row[m.b], between, noise))
+        return Problem(anchor, nodes, tuple(ordered), graph, values, huber)
+
+    def solved(self, values: Any) -> PoseGraph:
+        """The graph at GTSAM's optimum."""
+        poses = (values.atPose2(k) for k in range(len(self.nodes)))
+        means = np.array([[p.x(), p.y(), p.theta()] for p in poses])
+        row = {node: k for k, node in enumerate(self.nodes)}
+        information = _information(row, self.anchor, means, self.measurements, self.huber)
+        return PoseGraph(self.anchor, self.nodes, means, information, self.huber)
 
 
 def _along_tree(
@@ -200,7 +250,8 @@ def _information(
     residuals = compose_poses(inverse_poses(measured), inverse_poses(b_from_a))
     size = np.sqrt(np.einsum("ni,nij,nj->n", residuals, weights, residuals))
     robust = np.array([m.robust for m in measurements])
-    weights *= np.where(robust & (size > huber), huber / np.maximum(size, huber), 1.0)[:, None, None]
+    held_back = robust & (size > huber)
+    weights[held_back] *= (huber / size[held_back])[:, None, None]
     transposed = by_a.transpose(0, 2, 1)
     blocks = np.concatenate([transposed @ weights @ by_a, transposed @ weights, weights @ by_a, weights])
     rows, columns = np.concatenate([a, a, b, b]), np.concatenate([a, b, a, b])

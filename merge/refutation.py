@@ -57,6 +57,11 @@ class Refutation:
         graph = next(g for g in self._solver.solve(story) if story[0].a in g.rows)
         return next((clash.reason for _, clash in self._clashes([graph])), "")
 
+    def key_of(self, link: Link) -> Key:
+        """Between which fragments a link is."""
+        first, second = sorted(self._solver.by_node[node].name for node in link.pair)
+        return first, second
+
     def impossible(
         self, groups: Mapping[Key, LinkGroup], solved: Sequence[PoseGraph], kept: Sequence[Link]
     ) -> dict[Key, str]:
@@ -76,8 +81,8 @@ class Refutation:
             return {}
         weights: dict[Key, int] = {}
         for link in kept:
-            first, second = sorted(self._solver.by_node[node].name for node in link.pair)
-            weights[first, second] = weights.get((first, second), 0) + link.weight
+            key = self.key_of(link)
+            weights[key] = weights.get(key, 0) + link.weight
         direct = {key: clash.reason for key, clash in clashes.items() if key in weights}
         if direct:
             return direct

@@ -1,0 +1,182 @@
+"""Synthetic fleets for `benchmarks.merge`: maps that drift, links that are true, and links that are false.
+
+Only postures are drawn, no landmarks: what is tried here begins where verification ends. False links come as
+they do in buildings: a place that looks like another gives one to four of them, which agree with each other
+and with as many landmarks as true ones have.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.change import EdgePut, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import CODE_BYTES, Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from merge.links import Link
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25, mount_forward=0.08)
+BARE = Landmarks(
+    pixels=np.zeros((0, 2), np.float32),
+    codes=np.zeros((0, CODE_BYTES), np.uint8),
+    depths=np.zeros(0, np.float32),
+    depth_sigmas=np.zeros(0, np.float32),
+)
+STEP_SIGMAS = np.array([0.03, 0.03, 0.015])
+"""Of a robot's own edges, m, m, rad."""
+LINK_SIGMAS = np.array([0.03, 0.03, 0.01])
+"""Of links, m, m, rad."""
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """What is drawn.
+
+    Attributes:
+        robots: how many.
+        nodes: of each robot.
+        side: of the square floor, m.
+        true_links: wanted; fewer if there are not as many pairs in sight of each other.
+        same: nodes at most so far apart, m, that look the same way within 30 degrees, show the same place.
+        apart: nodes of one map that are fewer steps apart are no loop.
+        most_alike: links at most that one place gives which looks like another.
+    """
+
+    robots: int = 4
+    nodes: int = 60
+    side: float = 12.0
+    true_links: int = 40
+    same: float = 1.0
+    apart: int = 10
+    most_alike: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticFleet:
+    """Maps, links, and the truth about them.
+
+    Attributes:
+        maps: by id.
+        links: all, shuffled.
+        true: pairs of those that are true.
+        truth: `world_from_robot` of each node.
+    """
+
+    maps: dict[MapId, HybridMap]
+    links: tuple[Link, ...]
+    true: frozenset[tuple[NodeId, NodeId]]
+    truth: dict[NodeId, Pose2]
+
+
+def draw_fleet(
+    false_share: float, rng: np.random.Generator, settings: FleetSettings | None = None
+) -> SyntheticFleet:
+    """Draw a fleet.
+
+    Args:
+        false_share: of all links, from 0 to below 1.
+        rng: source of all that is random.
+        settings: sizes.
+    """
+    s = settings or FleetSettings()
+    maps: dict[MapId, HybridMap] = {}
+    truth: dict[NodeId, Pose2] = {}
+    for k in range(s.robots):
+        map_id = MapId(f"r{k}", 1)
+        walk = _walk(s, rng)
+        maps[map_id] = map_of(map_id, walk, rng)
+        truth |= {NodeId(map_id.agent, 1, n): posture for n, posture in enumerate(walk)}
+    true = _true_links(truth, s, rng)
+    wanted = round(len(true) * false_share / (1.0 - false_share))
+    false = _false_links(truth, {link.pair for link in true}, wanted, s, rng)
+    links = [*true, *false]
+    order = rng.permutation(len(links))
+    return SyntheticFleet(maps, tuple(links[k] for k in order), frozenset(link.pair for link in true), truth)
+
+
+def map_of(map_id: MapId, walk: list[Pose2], rng: np.random.Generator) -> HybridMap:
+    """A robot's map of a walk, in its own frame, by edges that are off by about `STEP_SIGMAS`."""
+    one, covariance = HybridMap(), np.diag(STEP_SIGMAS**2)
+    here = PoseGaussian(Pose2(), np.zeros((3, 3)))
+    for k, posture in enumerate(walk):
+        node_id = NodeId(map_id.agent, map_id.epoch, k)
+        step = None
+        if k:
+            noise = Pose2.from_vector(rng.normal(0, STEP_SIGMAS))
+            step = PoseGaussian(walk[k - 1].inverse() @ posture @ noise, covariance)
+            here = here @ step
+        one.apply(NodePut(Node(node_id, k * 1_000_000_000, here, CAMERA, BARE)))
+        if step is not None:
+            before = NodeId(map_id.agent, map_id.epoch, k - 1)
+            edge_id = EdgeId(map_id.agent, map_id.epoch, len(walk) + k)
+            one.apply(EdgePut(Edge(edge_id, before, node_id, step, EdgeKind.MAPPED)))
+    return one
+
+
+def _walk(s: FleetSettings, rng: np.random.Generator) -> list[Pose2]:
+    """Steps of 0.7 m with turns, and turns about at the walls."""
+    here = Pose2.from_vector(rng.uniform([1.0, 1.0, -math.pi], [s.side - 1.0, s.side - 1.0, math.pi]))
+    walk = [here]
+    while len(walk) < s.nodes:
+        step = here @ Pose2(0.7, 0.0, rng.normal(0.0, 0.3))
+        inside = 0.0 < step.x < s.side and 0.0 < step.y < s.side
+        here = step if inside else here @ Pose2(0.0, 0.0, rng.uniform(0.5, 1.0))
+        walk.append(here)
+    return walk
+
+
+def _pairs(truth: dict[NodeId, Pose2], s: FleetSettings) -> tuple[list[NodeId], NDArray[np.bool_], Array]:
+    """Nodes; (N, N) upper triangle of those that could be linked; (N, N) m, how far they are apart."""
+    nodes = sorted(truth)
+    place = np.array([truth[node].vector for node in nodes])
+    robot = np.array([int(node.agent[1:]) for node in nodes])
+    number = np.array([node.number for node in nodes])
+    far = np.hypot(*(place[:, None, :2] - place[None, :, :2]).transpose(2, 0, 1))
+    other = (robot[:, None] != robot) | (np.abs(number[:, None] - number) >= s.apart)
+    return nodes, np.triu(other, 1), far
+
+
+def _link(a: NodeId, b: NodeId, a_from_b: Pose2, rng: np.random.Generator) -> Link:
+    measured = a_from_b @ Pose2.from_vector(rng.normal(0, LINK_SIGMAS))
+    evidence = {"inliers": float(rng.integers(15, 50)), "share": float(rng.uniform(0.4, 0.9))}
+    return Link(a, b, PoseGaussian(measured, np.diag(LINK_SIGMAS**2)), evidence=evidence)
+
+
+def _true_links(truth: dict[NodeId, Pose2], s: FleetSettings, rng: np.random.Generator) -> list[Link]:
+    nodes, other, far = _pairs(truth, s)
+    heading = np.array([truth[node].heading for node in nodes])
+    turn = np.abs((heading[:, None] - heading + math.pi) % math.tau - math.pi)
+    found = np.argwhere(other & (far < s.same) & (turn < math.radians(30.0)))
+    chosen = rng.permutation(found)[: s.true_links]
+    ends = [(nodes[i], nodes[j]) for i, j in chosen]
+    return [_link(a, b, truth[a].inverse() @ truth[b], rng) for a, b in ends]
+
+
+def _false_links(
+    truth: dict[NodeId, Pose2],
+    taken: set[tuple[NodeId, NodeId]],
+    wanted: int,
+    s: FleetSettings,
+    rng: np.random.Generator,
+) -> list[Link]:
+    """Of places that look alike: some nodes about the one seem to stand about the other."""
+    nodes, other, far = _pairs(truth, s)
+    candidates = np.argwhere(other & (far > 2.0 * s.same))
+    taken = set(taken)
+    links: list[Link] = []
+    while len(links) < wanted:
+        a, b = (nodes[k] for k in candidates[rng.integers(len(candidates))])
+        seeming = Pose2.from_vector(rng.uniform([-0.7, -0.7, -0.5], [0.7, 0.7, 0.5]))
+        moved = truth[a] @ seeming @ truth[b].inverse()
+        for k in range(int(rng.integers(1, s.most_alike + 1))):
+            one, two = (NodeId(node.agent, node.epoch, node.number + k) for node in (a, b))
+            fresh = one in truth and two in truth and (one, two) not in taken
+            if fresh and one < two and len(links) < wanted:
+                taken.add((one, two))
+                links.append(_link(one, two, truth[one].inverse() @ moved @ truth[two], rng))
+    return links

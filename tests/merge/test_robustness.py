@@ -1,0 +1,87 @@
+"""Wrong links: graduated non-convexity against brute force, cliques and both on synthetic fleets."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from benchmarks.merge_fleets import FleetSettings, draw_fleet
+from benchmarks.merge_rivals import RIVALS, error, oracle, precision_recall
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from merge.graduated import wrong_measurements
+from merge.merging import merge_maps
+from merge.posegraph import Measurement, solve_graph
+
+GATE = 16.27
+SMALL = FleetSettings(nodes=40, side=8.0)
+
+
+def chi2(measurement: Measurement, poses: dict[NodeId, Pose2]) -> float:
+    relative = poses[measurement.a].inverse() @ poses[measurement.b]
+    return replace(measurement.a_from_b, covariance=measurement.covariance).mahalanobis2(relative)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_graduation_finds_the_cheapest_set_of_all(seed: int) -> None:
+    """Truncated least squares by trying every set of links that may be left out."""
+    rng = np.random.default_rng(seed)
+    ids = [NodeId("a", 1, k) for k in range(10)]
+    true = [Pose2(0.5 * k, np.sin(k), 0.3 * k) for k in range(10)]
+    sigmas = np.array([0.03, 0.03, 0.01])
+
+    def measured(i: int, j: int, robust: bool, off: Pose2) -> Measurement:
+        mean = true[i].inverse() @ true[j] @ off @ Pose2.from_vector(rng.normal(0, sigmas))
+        return Measurement(ids[i], ids[j], PoseGaussian(mean, np.diag(sigmas**2)), robust)
+
+    way = [measured(k, k + 1, False, Pose2()) for k in range(9)]
+    good = [measured(i, j, True, Pose2()) for i, j in ((0, 9), (1, 7), (2, 8))]
+    bad = [measured(i, j, True, Pose2(*rng.uniform(0.6, 1.5, 2), 0.5)) for i, j in ((0, 5), (3, 9), (1, 8))]
+    links = good + bad
+
+    def cost(left_out: tuple[Measurement, ...]) -> float:
+        used = way + [m for m in links if m not in left_out]
+        graph = solve_graph(ids[0], true[0], used, huber=np.inf)
+        poses = {node: graph.pose(node) for node in graph.nodes}
+        return sum(chi2(m, poses) for m in used) + GATE * len(left_out)
+
+    sets = (some for size in range(7) for some in combinations(links, size))
+    cheapest = min(sets, key=cost)
+    found = wrong_measurements(ids[0], true[0], [*way, *links], GATE)
+    assert {(m.a, m.b) for m in found} == {(m.a, m.b) for m in cheapest}
+
+
+def test_half_of_the_links_may_be_false() -> None:
+    """Least squares alone is ruined; each of the others withstands, and together. Not in every fleet."""
+    names = ("least_squares", "gnc", "pcm", "pcm_gnc")
+    ratios: dict[str, list[float]] = {name: [] for name in names}
+    precisions: dict[str, list[float]] = {name: [] for name in names}
+    for seed in range(3):
+        fleet = draw_fleet(0.5, np.random.default_rng([seed, 1]), SMALL)
+        best = error(oracle(fleet), fleet.truth)
+        for name in names:
+            merged = merge_maps(fleet.maps, fleet.links, settings=RIVALS[name])
+            assert len(merged.links) + len(merged.refused) == len(fleet.links)
+            ratios[name].append(error(merged, fleet.truth) / best)
+            precisions[name].append(precision_recall(merged.links, fleet)[0])
+    assert np.median(ratios["least_squares"]) > 3.0 and np.median(precisions["least_squares"]) == 0.5
+    for name in names[1:]:
+        assert np.median(ratios[name]) < 1.1 and np.median(precisions[name]) == 1.0
+
+
+def test_links_that_are_too_few_between_two_maps_join_what_others_join() -> None:
+    """One link from c to a and one to b: neither is enough alone, together and through a-b they are."""
+    rng = np.random.default_rng(5)
+    fleet = draw_fleet(0.0, rng, FleetSettings(robots=3, nodes=30, side=6.0, true_links=60))
+    names = [tuple(sorted((link.a.agent, link.b.agent))) for link in fleet.links]
+    between = {
+        pair: [link for link, n in zip(fleet.links, names, strict=True) if n == pair] for pair in names
+    }
+    few = [*between["r0", "r1"], between["r0", "r2"][0], between["r1", "r2"][-1]]
+    assert not set(few[-1].pair) & set(few[-2].pair)
+    merged = merge_maps(fleet.maps, few)
+    assert len(merged.components) == 1 and len(merged.links) == len(few)
+    assert len(merge_maps(fleet.maps, few[:-1]).components) == 2
+    again = merge_maps(dict(reversed(fleet.maps.items())), few[::-1])
+    assert [link.pair for link in again.links] == [link.pair for link in merged.links]
