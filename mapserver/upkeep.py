@@ -39,6 +39,8 @@ class Upkeep:
         self._answers = Answers.of(self._merger, MergedMap.empty())
         self._dirty = False
         self._event = ""
+        self._counting = threading.Lock()
+        self._came = self._applied = self._done = 0
         self._thread = threading.Thread(target=self._work, name="merge", daemon=True)
 
     @property
@@ -53,8 +55,8 @@ class Upkeep:
 
     @property
     def settled(self) -> bool:
-        """Whether everything that has come is merged."""
-        return not self._dirty and self._changes.empty()
+        """Whether everything that has come is merged, or could not be."""
+        return self._done == self._came
 
     def start(self) -> None:
         """Begin to merge."""
@@ -62,11 +64,11 @@ class Upkeep:
 
     def take(self, change: Change) -> None:
         """Take note of a change, in the order of its log. Returns at once."""
-        self._changes.put(change)
+        self._put(change)
 
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others. Returns at once."""
-        self._changes.put(rulings)
+        self._put(rulings)
 
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
@@ -78,6 +80,11 @@ class Upkeep:
         """Stop after what has come."""
         self._changes.put(None)
         self._thread.join(30.0)
+
+    def _put(self, news: Change | Rulings) -> None:
+        with self._counting:
+            self._came += 1
+        self._changes.put(news)
 
     def _work(self) -> None:
         rest_until = 0.0
@@ -103,6 +110,7 @@ class Upkeep:
                 self._merger.rule(change)
             else:
                 self._apply(change)
+            self._applied += 1
             self._dirty = True
             if time.monotonic() > rest_until + 2.0:
                 rest_until = time.monotonic()
@@ -125,6 +133,8 @@ class Upkeep:
             log.exception("the merged map could not be made anew")
             self._event = "the merged map could not be made anew: see the server's log"
             return
+        finally:
+            self._done = self._applied
         for words in joinings(before, merged):
             log.info("%s", words)
             self._event = words
