@@ -111,10 +111,11 @@ class Desk:
         with self._lock:
             s, now, wait = self._settings, self._clock(), self._wait()
             latest = s.too_late * s.in_time
-            allowed = latest if self._keeps_appointment(ticket, now) else s.in_time - self._expected(now)
+            kept = self._keeps_appointment(ticket, now)
+            allowed = latest if kept else s.in_time - self._expected(now)
             if wait > 0.0 and wait + self._seconds > allowed:
                 self._refused += 1
-                raise Busy(self._next_appointment(wait, ticket))
+                raise Busy(self._next_appointment(wait, ticket, kept))
             self._open += 1
         return self._pool.submit(self._unless_late, work, ticket, now + latest if wait > 0.0 else math.inf)
 
@@ -153,15 +154,20 @@ class Desk:
         soon = sum(due <= now + self._settings.in_time for due in self._booked.values())
         return soon * self._seconds / self._settings.workers
 
-    def _next_appointment(self, wait: float, ticket: int | None) -> float:
-        """In how many seconds somebody may come again: when the queue is half empty, behind all others."""
+    def _next_appointment(self, wait: float, ticket: int | None, again: bool) -> float:
+        """In how many seconds somebody may come again: when the queue is half empty, behind all others.
+
+        Who has come in vain when told, or was taken on in vain, need not go to the end once more.
+        """
         s, now = self._settings, self._clock()
-        first = now + max(wait - 0.5 * s.in_time, 0.0)
-        self._appointment = max(self._appointment, first) + self._seconds / s.workers
+        due = now + max(wait - 0.5 * s.in_time, 0.0) + self._seconds / s.workers
+        if not again:
+            due = self._appointment = max(due, self._appointment + self._seconds / s.workers)
+        due = min(due, now + s.longest_pause)
         self._appointment = min(self._appointment, now + s.longest_pause)
         if ticket is not None and len(self._booked) < MOST_BOOKED:
-            self._booked[ticket] = self._appointment
-        return self._appointment - now
+            self._booked[ticket] = due
+        return due - now
 
     def _unless_late(self, work: Callable[[], _T], ticket: int | None, latest: float) -> _T:
         """What a worker does with a question when its turn has come."""
@@ -169,7 +175,7 @@ class Desk:
             if self._clock() + self._seconds > latest:
                 self._open -= 1
                 self._refused += 1
-                raise Busy(self._next_appointment(self._wait(), ticket))
+                raise Busy(self._next_appointment(self._wait(), ticket, True))
         return self._timed(work)
 
     def _timed(self, work: Callable[[], _T]) -> _T:
