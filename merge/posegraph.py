@@ -27,6 +27,9 @@ ANCHOR_SIGMA = 1e-5
 HUBER = 2.0
 """Normalised residual from which a measurement that may be wrong pulls no harder."""
 
+AT_ONCE = 256
+"""Nodes whose marginal covariances are solved for together: all at once would take memory by the square."""
+
 TOLERANCE = 1e-9
 """The solver stops when a step makes the cost smaller by less than this, absolutely or as a share of it."""
 
@@ -102,11 +105,13 @@ class PoseGraph:
 
     def postures(self) -> dict[NodeId, PoseGaussian]:
         """Each node's posture with its marginal covariance."""
-        joint = self.covariance(self.nodes)
-        return {
-            node: PoseGaussian(Pose2.from_vector(self.means[k]), joint[k, :, k, :])
-            for k, node in enumerate(self.nodes)
-        }
+        out: dict[NodeId, PoseGaussian] = {}
+        for first in range(0, len(self.nodes), AT_ONCE):
+            some = self.nodes[first : first + AT_ONCE]
+            joint = self.covariance(some)
+            for k, node in enumerate(some):
+                out[node] = PoseGaussian(Pose2.from_vector(self.means[first + k]), joint[k, :, k, :])
+        return out
 
     def relative(self, starts: Sequence[NodeId], ends: Sequence[NodeId]) -> PoseGaussians:
         """Postures `start_from_end` of K pairs, with covariances that know what the two have in common."""

@@ -1,10 +1,12 @@
 """The pose graph against an independent least squares."""
 
 import numpy as np
+import pytest
 import scipy.optimize
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+from merge import posegraph
 from merge.posegraph import LEAST_SIGMAS, Measurement, PoseGraph, solve_graph
 
 IDS = [NodeId("a", 1, k) for k in range(8)]
@@ -129,3 +131,15 @@ def test_order_does_not_matter_and_what_is_not_connected_is_left_out() -> None:
     alone = solve_graph(IDS[3], true[3], [])
     assert alone.nodes == (IDS[3],)
     assert np.allclose(alone.means[0], true[3].vector)
+
+
+def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    true, measurements = random_graph(9)
+    graph = solve_graph(IDS[0], true[0], measurements)
+    joint = graph.covariance(graph.nodes)
+    monkeypatch.setattr(posegraph, "AT_ONCE", 3)
+    found = graph.postures()
+    assert list(found) == IDS
+    for k, node in enumerate(IDS):
+        assert np.allclose(found[node].covariance, joint[k, :, k, :], rtol=1e-9, atol=1e-14)
+        assert np.array_equal(found[node].mean.vector, graph.means[k])

@@ -1,0 +1,142 @@
+"""Merging with false links, by every way there is: who keeps the true ones, and how far off the map then is.
+
+    python -m benchmarks.merge [--seed N] [--runs N] [--g2o FILE ...] [--robots N] [--json]
+
+Synthetic fleets of four robots (see `benchmarks.merge_fleets`) with 0, 50, 80 and 90 % false links, `--runs`
+of each. `ate_ratio`: error of all nodes after one alignment of the whole fleet over that of plain least
+squares which knows the true links, median; a robot that is left apart counts with where its own map is.
+`link_precision` and `link_recall` are means, `whole` is the share of the fleets that became one map. Side by
+side: plain least squares, graduated non-convexity alone (GNC), pairwise consistency alone (PCM), the two
+together, PCM with limited pull, and Mapweave as it is by default.
+
+With `--g2o FILE` the graph is also split among `--robots` and merged: `cost_ratio` is the chi-square of all
+its edges, refused ones too, over that of GTSAM's batch optimum.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.merge_fleets import draw_fleet
+from benchmarks.merge_g2o import batch_optimum, chi2_of, factors_of, split
+from benchmarks.merge_rivals import MAPWEAVE, RIVALS, error, oracle, precision_recall
+from hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.g2o import read_g2o
+from merge.merging import merge_maps
+
+SHARES = (0, 50, 80, 90)
+"""Of false links, per cent."""
+Figures = dict[str, dict[str, float | None]]
+"""By figure, then by the share of false links or the file."""
+
+
+def main() -> None:
+    """Merge, compare and print."""
+    arguments = _arguments()
+    console = Console(stderr=arguments.json)
+    try:
+        if arguments.runs < 1 or arguments.seed < 0 or arguments.robots < 2:
+            raise InvalidValue("--runs is at least 1, --seed at least 0, --robots at least 2")
+        with Progress(console=console) as progress:
+            found = with_false_links(arguments.seed, arguments.runs, progress)
+            for path in arguments.g2o:
+                for name, figures in standard_set(path, arguments.robots, progress).items():
+                    for figure, value in figures.items():
+                        found[name].setdefault(figure, {})[path.stem] = value
+    except (MapweaveError, OSError) as problem:
+        print(f"merge: {problem}", file=sys.stderr)
+        raise SystemExit(1) from None
+    for figure in found[MAPWEAVE]:
+        console.print(_table(figure, found))
+    if arguments.json:
+        rivals = {name: figures for name, figures in found.items() if name != MAPWEAVE}
+        print(json.dumps({"seed": arguments.seed, **found[MAPWEAVE], "rivals": rivals}))
+
+
+def with_false_links(seed: int, runs: int, progress: Progress) -> dict[str, Figures]:
+    """The figures of each rival by the share of false links."""
+    task = progress.add_task("false links", total=len(SHARES) * runs * len(RIVALS))
+    found: dict[str, Figures] = {name: {} for name in RIVALS}
+    for share in SHARES:
+        rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in RIVALS}
+        for run in range(runs):
+            fleet = draw_fleet(share / 100.0, np.random.default_rng([seed, run, share]))
+            best = error(oracle(fleet), fleet.truth)
+            for name, settings in RIVALS.items():
+                began = time.perf_counter()
+                merged = merge_maps(fleet.maps, fleet.links, settings=settings)
+                took = 1e3 * (time.perf_counter() - began)
+                ratio = error(merged, fleet.truth) / best
+                whole = float(len(merged.components) == 1)
+                rows[name].append((ratio, *precision_recall(merged.links, fleet), whole, took))
+                progress.advance(task)
+        for name, values in rows.items():
+            ratios, precisions, recalls, wholes, times = zip(*values, strict=True)
+            for figure, value in (
+                ("ate_ratio", statistics.median(ratios)),
+                ("link_precision", statistics.mean(precisions)),
+                ("link_recall", statistics.mean(recalls)),
+                ("whole", statistics.mean(wholes)),
+                ("merge_ms", statistics.median(times)),
+            ):
+                found[name].setdefault(figure, {})[str(share)] = round(value, 4)
+    return found
+
+
+def standard_set(path: Path, robots: int, progress: Progress) -> dict[str, dict[str, float | None]]:
+    """How much more than GTSAM's batch optimum each rival's merge of a split graph costs."""
+    graph = read_g2o(path)
+    factors = factors_of(graph)
+    best = batch_optimum(graph)
+    maps, links, nodes = split(graph, robots)
+    task = progress.add_task(path.name, total=len(RIVALS))
+    found: dict[str, dict[str, float | None]] = {}
+    for name, settings in RIVALS.items():
+        merged = merge_maps(maps, links, settings=settings)
+        chi2 = chi2_of(factors, merged, nodes)
+        found[name] = {
+            "cost_ratio": None if chi2 is None else round(chi2 / best, 6),
+            "links_kept": round(len(merged.links) / len(links), 4),
+            "optimum": round(best, 4),
+        }
+        progress.advance(task)
+    return found
+
+
+def _table(figure: str, found: dict[str, Figures]) -> Table:
+    columns: Sequence[str] = list(found[MAPWEAVE][figure])
+    table = Table("", *(f"{c} %" if c.isdigit() else c for c in columns), title=figure)
+    for name, figures in found.items():
+        values = [figures[figure][column] for column in columns]
+        table.add_row(name, *("in pieces" if value is None else f"{value:.4g}" for value in values))
+    return table
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.merge", description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=0, help="of the fleets (default 0)")
+    parser.add_argument("--runs", type=int, default=5, help="fleets of each share (default 5)")
+    parser.add_argument(
+        "--g2o", type=Path, nargs="*", default=[], help="planar pose graphs to split and merge"
+    )
+    parser.add_argument("--robots", type=int, default=4, help="among which they are split (default 4)")
+    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
