@@ -1,6 +1,7 @@
 """Merging with false links, by every way there is: who keeps the true ones, and how far off the map then is.
 
-    python -m benchmarks.merge [--seed N] [--runs N] [--g2o FILE ...] [--robots N] [--json]
+    python -m benchmarks.merge [--seed N] [--runs N] [--g2o FILE ...] [--split N]
+        [--robots FOLDER ...] [--json]
 
 Synthetic fleets of four robots (see `benchmarks.merge_fleets`) with 0, 50, 80 and 90 % false links, `--runs`
 of each. `ate_ratio`: error of all nodes after one alignment of the whole fleet over that of plain least
@@ -9,8 +10,10 @@ squares which knows the true links, median; a robot that is left apart counts wi
 side: plain least squares, graduated non-convexity alone (GNC), pairwise consistency alone (PCM), the two
 together, PCM with limited pull, and Mapweave as it is by default.
 
-With `--g2o FILE` the graph is also split among `--robots` and merged: `cost_ratio` is the chi-square of all
-its edges, refused ones too, over that of GTSAM's batch optimum.
+With `--g2o FILE` the graph is also split among `--split` robots and merged: `cost_ratio` is the chi-square of
+all its edges, refused ones too, over that of GTSAM's batch optimum. With `--robots FOLDER`, which holds one
+g2o file of a graph in space for each robot: how many links between robots there are, and which of them
+pairwise consistency keeps, as pairs of keys.
 """
 
 from __future__ import annotations
@@ -34,8 +37,9 @@ from rich.table import Table
 from benchmarks.merge_fleets import draw_fleet
 from benchmarks.merge_g2o import batch_optimum, chi2_of, factors_of, split
 from benchmarks.merge_rivals import MAPWEAVE, RIVALS, error, oracle, precision_recall
+from benchmarks.merge_robots import kept_links
 from hybridmap.errors import InvalidValue, MapweaveError
-from mapweave.g2o import read_g2o
+from mapweave.g2o import G2oGraph, read_g2o
 from merge.merging import merge_maps
 
 SHARES = (0, 50, 80, 90)
@@ -49,22 +53,33 @@ def main() -> None:
     arguments = _arguments()
     console = Console(stderr=arguments.json)
     try:
-        if arguments.runs < 1 or arguments.seed < 0 or arguments.robots < 2:
-            raise InvalidValue("--runs is at least 1, --seed at least 0, --robots at least 2")
+        if arguments.runs < 1 or arguments.seed < 0 or arguments.split < 2:
+            raise InvalidValue("--runs is at least 1, --seed at least 0, --split at least 2")
+        # What cannot be read shall be told before the long work.
+        folders = {str(folder): kept_links(folder) for folder in arguments.robots}
+        graphs = {path.stem: read_g2o(path) for path in arguments.g2o}
         with Progress(console=console) as progress:
             found = with_false_links(arguments.seed, arguments.runs, progress)
-            for path in arguments.g2o:
-                for name, figures in standard_set(path, arguments.robots, progress).items():
+            for title, graph in graphs.items():
+                for name, figures in standard_set(title, graph, arguments.split, progress).items():
                     for figure, value in figures.items():
-                        found[name].setdefault(figure, {})[path.stem] = value
+                        found[name].setdefault(figure, {})[title] = value
     except (MapweaveError, OSError) as problem:
         print(f"merge: {problem}", file=sys.stderr)
         raise SystemExit(1) from None
     for figure in found[MAPWEAVE]:
         console.print(_table(figure, found))
+    for folder, (links, kept) in folders.items():
+        console.print(f"{folder}: {len(kept)} of {len(links)} links between robots are kept")
     if arguments.json:
+        spatial = {
+            "robots": {
+                folder: {"links": len(links), "kept": len(kept), "kept_links": kept}
+                for folder, (links, kept) in folders.items()
+            }
+        }
         rivals = {name: figures for name, figures in found.items() if name != MAPWEAVE}
-        print(json.dumps({"seed": arguments.seed, **found[MAPWEAVE], "rivals": rivals}))
+        print(json.dumps({"seed": arguments.seed, **found[MAPWEAVE], **spatial, "rivals": rivals}))
 
 
 def with_false_links(seed: int, runs: int, progress: Progress) -> dict[str, Figures]:
@@ -97,13 +112,14 @@ def with_false_links(seed: int, runs: int, progress: Progress) -> dict[str, Figu
     return found
 
 
-def standard_set(path: Path, robots: int, progress: Progress) -> dict[str, dict[str, float | None]]:
+def standard_set(
+    title: str, graph: G2oGraph, robots: int, progress: Progress
+) -> dict[str, dict[str, float | None]]:
     """How much more than GTSAM's batch optimum each rival's merge of a split graph costs."""
-    graph = read_g2o(path)
     factors = factors_of(graph)
     best = batch_optimum(graph)
     maps, links, nodes = split(graph, robots)
-    task = progress.add_task(path.name, total=len(RIVALS))
+    task = progress.add_task(title, total=len(RIVALS))
     found: dict[str, dict[str, float | None]] = {}
     for name, settings in RIVALS.items():
         merged = merge_maps(maps, links, settings=settings)
@@ -133,7 +149,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--g2o", type=Path, nargs="*", default=[], help="planar pose graphs to split and merge"
     )
-    parser.add_argument("--robots", type=int, default=4, help="among which they are split (default 4)")
+    parser.add_argument("--split", type=int, default=4, help="robots among which they are split (default 4)")
+    parser.add_argument("--robots", type=Path, nargs="*", default=[], help="folders of one g2o file a robot")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     return parser.parse_args()
 
