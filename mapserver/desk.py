@@ -50,13 +50,13 @@ class DeskSettings:
             SettingsError: a number out of range.
         """
         if not 0 <= self.workers <= 64:
-            raise SettingsError(f"desk: {self.workers} workers; use 0 to 64")
+            raise SettingsError(f"{self.workers} workers; use 0 to 64")
         if not (self.in_time > 0.0 and self.first_guess > 0.0 and self.longest_pause > 0.0):
-            raise SettingsError("desk: in_time, first_guess and longest_pause must be positive")
+            raise SettingsError("in_time, first_guess and longest_pause must be positive")
         if not self.too_late >= 1.0:
-            raise SettingsError(f"desk: too_late {self.too_late:g} must be 1 or more")
+            raise SettingsError(f"too_late {self.too_late:g} must be 1 or more")
         if not 0.0 < self.smoothing <= 1.0:
-            raise SettingsError(f"desk: smoothing {self.smoothing:g} must be above 0 and at most 1")
+            raise SettingsError(f"smoothing {self.smoothing:g} must be above 0 and at most 1")
 
 
 class Desk:

@@ -58,7 +58,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
             raise SettingsError(f"{where}: {one.name} is missing")
     try:
         return cls(**given)
-    except ValueError as error:
+    except (ValueError, SettingsError) as error:
         raise SettingsError(f"{where}: {error}") from None
 
 

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from hybridmap.errors import Busy
+from hybridmap.errors import Busy, SettingsError
 from mapserver.desk import Desk, DeskSettings
 
 
@@ -212,6 +212,16 @@ def test_what_has_waited_too_long_is_refused_at_its_turn() -> None:
     assert desk.counters()["busy"] == 3
     assert desk.counters()["open"] == 0
     desk.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("workers", -1), ("workers", 65), ("in_time", 0.0), ("in_time", float("nan")), ("too_late", 0.5),
+     ("first_guess", 0.0), ("longest_pause", -1.0), ("smoothing", 0.0), ("smoothing", 1.5)],
+)  # fmt: skip
+def test_settings_that_cannot_work(name: str, value: float) -> None:
+    with pytest.raises(SettingsError, match=f"{value:g}|{name}"):
+        DeskSettings(**{name: value})
 
 
 def test_closing_finishes_what_was_taken_on() -> None:
