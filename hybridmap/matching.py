@@ -8,12 +8,15 @@ in both directions, and distinctly better than the second best in both.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.descriptor import decode, rounding_noise
+from hybridmap.descriptor import rounding_noise
+from hybridmap.errors import InvalidValue
+from hybridmap.kernels import kernels
+from hybridmap.landmark_tables import landmark_tables
+from hybridmap.node import CODE_BYTES
 
 
 @dataclass(frozen=True)
@@ -69,31 +72,23 @@ def match_vectors(
         noise: what rounding has added to every squared distance on average; taken off again, so that the
             ratio is that of the distances before rounding.
     """
-    s = settings or MatchSettings()
-    if len(a) == 0 or len(b) == 0:
+    return _mutual(squared_distances(a, b) - np.float32(noise), settings or MatchSettings())
+
+
+def _mutual(squared: NDArray[np.float32], s: MatchSettings) -> Matches:
+    """Pairs that are each other's nearest and distinctly so, of (N, M) squared distances."""
+    if squared.size == 0:
         return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-    squared = squared_distances(a, b) - np.float32(noise)
-    best_in_b = squared.argmin(axis=1)
-    rows = np.arange(len(a))
-    best = squared[rows, best_in_b]
-    mutual = squared.argmin(axis=0)[best_in_b] == rows
-    distinct = (best < s.ratio**2 * _second(squared, axis=1)) & (
-        best < s.ratio**2 * _second(squared, axis=0)[best_in_b]
-    )
+    rows, columns = kernels().two_nearest(np.ascontiguousarray(squared))
+    (best_in_b, best, second), (best_in_a, _, second_in_a) = rows, columns
+    mutual = best_in_a[best_in_b] == np.arange(len(best))
+    distinct = best < s.ratio**2 * np.minimum(second, second_in_a[best_in_b])
     kept = np.flatnonzero(mutual & distinct & (best <= s.most_distance**2))
     kept = kept[np.argsort(best[kept], kind="stable")]
     return Matches(
         np.stack([kept, best_in_b[kept]], axis=1).astype(np.int64),
         np.sqrt(np.maximum(best[kept], 0)).astype(np.float32),
     )
-
-
-def _second(squared: NDArray[np.float32], axis: int) -> NDArray[Any]:
-    """Second smallest along an axis; infinite where there is only one."""
-    if squared.shape[axis] < 2:
-        return np.full(squared.shape[1 - axis], np.inf, np.float32)
-    second: NDArray[Any] = np.take(np.partition(squared, 1, axis=axis), 1, axis=axis)
-    return second
 
 
 def match(
@@ -108,5 +103,13 @@ def match(
 
     Returns:
         (K, 2) int64, indices in a and in b, best first; `match_vectors` gives the distances as well.
+
+    Raises:
+        InvalidValue: the input is not (N, 32) bytes.
     """
-    return match_vectors(decode(codes_a), decode(codes_b), settings, rounding_noise()).pairs
+    for codes in (codes_a, codes_b):
+        if codes.ndim != 2 or codes.shape[1] != CODE_BYTES or codes.dtype != np.uint8:
+            raise InvalidValue(f"codes must be (N, {CODE_BYTES}) uint8, not {codes.shape} {codes.dtype}")
+    steps = kernels().squared_steps(np.ascontiguousarray(codes_a), np.ascontiguousarray(codes_b))
+    squared = steps.astype(np.float32) * np.float32(landmark_tables().step ** 2)
+    return _mutual(squared - np.float32(rounding_noise()), settings or MatchSettings()).pairs

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.kernels import kernels
 from hybridmap.pose import Array
 from hybridmap.pose_arrays import inverse_poses
 from hybridmap.sightings import Sightings
@@ -37,21 +38,11 @@ def hypotheses(sightings: Sightings, count: int, rng: np.random.Generator) -> Ar
 
 def _from_three_bearings(sightings: Sightings, chosen: NDArray[np.int64]) -> Array:
     """(H, 3) postures from (H, 3) chosen sightings, by their horizontal bearings alone."""
-    px, py = sightings.points[chosen, 0], sightings.points[chosen, 1]
-    a = sightings.slopes[chosen, 0]
-    rows = np.stack([py - a * px, -px - a * py, a], axis=-1)
-    solution = np.cross(rows[:, 0] - rows[:, 1], rows[:, 0] - rows[:, 2])
-    b = (rows[:, 0] * solution).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1.0 / np.hypot(solution[:, 0], solution[:, 1])
-        c, s, big_a, big_b = solution[:, 0] * scale, solution[:, 1] * scale, solution[:, 2] * scale, b * scale
-        # The null vector's sign is open: the points are in front of the camera.
-        sign = np.sign((c[:, None] * px + s[:, None] * py - big_a[:, None]).sum(axis=1))
-    c, s, big_a, big_b = c * sign, s * sign, big_a * sign, big_b * sign
-    mount = sightings.camera.mount_forward
-    return np.stack(
-        [c * (big_a - mount) - s * big_b, s * (big_a - mount) + c * big_b, np.arctan2(s, c)], axis=1
-    )
+    sets = np.empty((*chosen.shape, 3))
+    sets[..., :2] = sightings.points[chosen, :2]
+    sets[..., 2] = sightings.slopes[chosen, 0]
+    poses: Array = kernels().from_three_bearings(sets, sightings.camera.mount_forward)
+    return poses
 
 
 def _depths(sightings: Sightings) -> tuple[Array, Array]:
@@ -76,14 +67,10 @@ def _depths(sightings: Sightings) -> tuple[Array, Array]:
 
 def _from_two_depths(sightings: Sightings, chosen: NDArray[np.int64], depths: Array) -> Array:
     """(H, 3) postures that carry two points of the robot's plane onto two points of the frame's."""
-    p = sightings.points[chosen][..., :2]
-    d = depths[chosen]
-    q = np.stack([d + sightings.camera.mount_forward, d * sightings.slopes[chosen, 0]], axis=-1)
-    dp, dq = p[:, 1] - p[:, 0], q[:, 1] - q[:, 0]
-    heading = np.arctan2(dp[:, 1], dp[:, 0]) - np.arctan2(dq[:, 1], dq[:, 0])
-    cos, sin = np.cos(heading), np.sin(heading)
-    p, q = p.mean(axis=1), q.mean(axis=1)
-    x, y = p[:, 0] - cos * q[:, 0] + sin * q[:, 1], p[:, 1] - sin * q[:, 0] - cos * q[:, 1]
-    poses = np.stack([x, y, heading], axis=1)
+    ahead = depths[chosen]
+    here = np.empty((*chosen.shape, 2))
+    here[..., 0] = ahead + sightings.camera.mount_forward
+    here[..., 1] = ahead * sightings.slopes[chosen, 0]
+    poses: Array = kernels().from_two_points(np.ascontiguousarray(sightings.points[chosen, :2]), here)
     poses[chosen[:, 0] == chosen[:, 1]] = np.nan
     return poses

@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.kernels import kernels
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.sightings import DEPTH_DECADES, GATES, NEAREST, NO_DEPTH_SIGMA, Sightings
 
@@ -92,7 +94,7 @@ class Stack:
             np.where(measured, GATES[1], GATES[0]),
             log_area + np.where(measured, log_depth, math.log(NO_DEPTH_SIGMA)),
             np.repeat([part.inverted for part in parts], counts),
-            np.repeat(np.array(optics).T, counts, axis=1),
+            np.ascontiguousarray(np.repeat(np.array(optics, dtype=np.float64).T, counts, axis=1)),
         )
 
     def predict(self, wanted: Pose2, points: Array) -> tuple[Array, Array, Array]:
@@ -106,34 +108,18 @@ class Stack:
             predicted (N, 3): u px, v px, depth m. By the posture (N, 3, 3), perturbed on the right as in
             PoseGaussian. By the point (N, 3, 3). Points behind the camera give NaN.
         """
-        fx, fy, cx, cy, mount_height, mount_forward = self.optics
-        back = wanted.inverse()
-        x, y = np.where(self.inverted, back.x, wanted.x), np.where(self.inverted, back.y, wanted.y)
-        cos = math.cos(wanted.heading)
-        sin = np.where(self.inverted, -math.sin(wanted.heading), math.sin(wanted.heading))
-        dx, dy = points[:, 0] - x, points[:, 1] - y
-        forward, left = cos * dx + sin * dy, cos * dy - sin * dx
-        ahead = forward - mount_forward
-        inverse = 1.0 / np.where(ahead > NEAREST, ahead, np.nan)
-        a, b = left * inverse, (points[:, 2] - mount_height) * inverse
-        predicted = np.stack([cx - fx * a, cy - fy * b, ahead], axis=-1)
-
-        # By the point in robot axes, columns forward and left (up is the same in both frames).
-        u_forward, u_left, v_forward, v_up = fx * inverse * a, -fx * inverse, fy * inverse * b, -fy * inverse
-        by_point = np.zeros((len(points), 3, 3))
-        by_point[:, 0, 0], by_point[:, 0, 1] = u_forward * cos - u_left * sin, u_forward * sin + u_left * cos
-        by_point[:, 1, 0], by_point[:, 1, 1], by_point[:, 1, 2] = v_forward * cos, v_forward * sin, v_up
-        by_point[:, 2, 0], by_point[:, 2, 1] = cos, sin
-        # A posture step (dx, dy, dh) moves the point in robot axes by (-dx + dh left, -dy - dh forward).
-        by_pose = np.zeros((len(points), 3, 3))
-        by_pose[:, 0, 0], by_pose[:, 0, 1] = -u_forward, -u_left
-        by_pose[:, 0, 2] = u_forward * left - u_left * forward
-        by_pose[:, 1, 0], by_pose[:, 1, 2] = -v_forward, v_forward * left
-        by_pose[:, 2, 0], by_pose[:, 2, 2] = -1.0, left
-        if self.inverted.any():
-            # inverse(wanted @ d) = inverse(wanted) @ (-Ad(wanted) d) to first order.
-            by_pose[self.inverted] = by_pose[self.inverted] @ -wanted.adjoint
+        predicted, by_pose, by_point = kernels().predict(
+            np.ascontiguousarray(points, dtype=np.float64), self.inverted, self.optics, wanted.vector, NEAREST
+        )
         return predicted, by_pose, by_point
+
+    @property
+    def columns(self) -> tuple[NDArray[Any], ...]:
+        """As machine code takes them."""
+        return (
+            self.points, self.covariances, self.observed, self.noise, self.measured, self.gates,
+            self.log_wrong, self.inverted, self.optics,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +135,7 @@ class _Linear:
         distance2: (N,) squared normalised residuals.
         log_ratios: (N,) nats against a wrong match, not cut.
         inliers: (N,).
-        weighted: (3, 3N) derivative times information times the probability that a sighting is right.
+        weights: (N,) probability that a sighting is right, 0 of those that are no inliers.
     """
 
     residuals: Array
@@ -160,31 +146,16 @@ class _Linear:
     distance2: Array
     log_ratios: Array
     inliers: NDArray[np.bool_]
-    weighted: Array
+    weights: Array
+
+    @property
+    def weighted(self) -> Array:
+        """(3, 3N) derivative times information times weight."""
+        return (self.information @ self.by_pose * self.weights[:, None, None]).reshape(-1, 3).T
 
 
 def _linearise(stack: Stack, wanted: Pose2, points: Array) -> _Linear:
-    predicted, by_pose, by_point = stack.predict(wanted, points)
-    off = stack.observed - predicted
-    off[~stack.measured, 2] = 0.0
-    back = (by_point @ (stack.points - points)[:, :, None])[:, :, 0]
-    back[~stack.measured, 2] = 0.0
-    residuals = off - back
-    visible = np.isfinite(residuals).all(axis=1)
-    if not visible.all():
-        for part in (residuals, by_pose, by_point):
-            part[~visible] = 0.0
-    spread = by_point @ stack.covariances @ by_point.transpose(0, 2, 1)
-    spread[:, [0, 1, 2], [0, 1, 2]] += stack.noise
-    information = np.linalg.inv(spread).astype(np.float64, copy=False)
-    distance2 = (residuals * (information @ residuals[:, :, None])[:, :, 0]).sum(axis=1)
-    log_ratios = stack.log_wrong - 0.5 * (np.log(np.linalg.det(spread)) + distance2)
-    inliers = visible & (distance2 < stack.gates) & (log_ratios > 0)
-    weights = np.where(inliers, 1.0 / (1.0 + np.exp(-np.clip(log_ratios, -30, 30))), 0.0)
-    weighted = (information @ by_pose * weights[:, None, None]).reshape(-1, 3).T
-    return _Linear(
-        residuals, off[:, :2], by_pose, by_point, information, distance2, log_ratios, inliers, weighted
-    )
+    return _Linear(*kernels().linearise(*stack.columns, wanted.vector, points, NEAREST))
 
 
 def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) -> tuple[Pose2, Array] | None:
@@ -200,18 +171,11 @@ def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) 
         The posture and the points (N, 3) m at their best for it; None if the inliers do not determine a
         posture.
     """
-    moved = stack.points
-    for _ in range(rounds):
-        linear = _linearise(stack, pose, moved)
-        information, gradient = _normal_equations(linear, pose, prior)
-        step = _solve(information, gradient)
-        if step is None:
-            return None
-        pose = pose @ Pose2.from_vector(step)
-        moved = _move(stack, linear, step)
-        if np.abs(step).max() < SMALL_STEP:
-            break
-    return pose, moved
+    mean, information = _told(prior)
+    determined, vector, moved = kernels().improve(
+        *stack.columns, pose.vector, mean, information, rounds, NEAREST, SMALL_STEP
+    )
+    return (Pose2.from_vector(vector), moved) if determined else None
 
 
 def refine(
@@ -238,11 +202,14 @@ def refine(
         return None
     pose, moved = improved
     linear = _linearise(stack, pose, moved)
-    information, _ = _normal_equations(linear, pose, prior)
-    covariance = _solve(information, np.eye(3))
+    information, _ = kernels().normal_equations(
+        linear.residuals, linear.by_pose, linear.information, linear.weights
+    )
+    information += _told(prior)[1]
     inliers = linear.inliers
-    if covariance is None or not inliers.any():
+    if not inliers.any() or not kernels().determined(information):
         return None
+    covariance = np.linalg.inv(information)
     freedom = max(int(np.where(stack.measured, 3, 2)[inliers].sum()) - 3, 1)
     mean_square = float(linear.distance2[inliers].sum()) / freedom
     covariance = covariance * max(1.0, mean_square)
@@ -271,27 +238,9 @@ def _common_scales(stack: Stack, linear: _Linear, points: Array) -> list[Array]:
     return [np.where(inverted, by_depths, by_points), np.where(inverted, by_points, by_depths)]
 
 
-def _normal_equations(linear: _Linear, pose: Pose2, prior: PoseGaussian | None) -> tuple[Array, Array]:
-    """Information (3, 3) and gradient (3,)."""
-    information = linear.weighted @ linear.by_pose.reshape(-1, 3)
-    gradient = linear.weighted @ linear.residuals.ravel()
-    if prior is not None:
-        weight = np.linalg.inv(prior.covariance + 1e-12 * np.eye(3))
-        information = information + weight
-        gradient = gradient + weight @ (pose.inverse() @ prior.mean).vector
-    return information, gradient
-
-
-def _move(stack: Stack, linear: _Linear, step: Array) -> Array:
-    """(N, 3) m, the inliers' points at their best for this round; the others where they were given."""
-    left = (linear.residuals - linear.by_pose @ step)[:, :, None]
-    gain = stack.covariances @ linear.by_point.transpose(0, 2, 1) @ linear.information
-    return np.where(linear.inliers[:, None], stack.points + (gain @ left)[:, :, 0], stack.points)
-
-
-def _solve(information: Array, right: Array) -> Array | None:
-    """Solve unless the information is next to singular; lengths and angles count alike at about 1 m."""
-    values = np.linalg.eigvalsh(information)
-    if not np.isfinite(values).all() or values[0] <= 1e-9 * max(values[-1], 1e-300):
-        return None
-    return np.linalg.solve(information, right).astype(np.float64, copy=False)
+def _told(prior: PoseGaussian | None) -> tuple[Array, Array]:
+    """(3,) mean and (3, 3) information of what else is known."""
+    if prior is None:
+        return np.zeros(3), np.zeros((3, 3))
+    information = np.linalg.inv(prior.covariance + 1e-12 * np.eye(3)).astype(np.float64, copy=False)
+    return prior.mean.vector, information

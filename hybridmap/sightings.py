@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
+from hybridmap.kernels import kernels
 from hybridmap.pose import Array
 from hybridmap.pose_arrays import inverse_poses
 
@@ -26,6 +27,8 @@ NO_DEPTH_SIGMA = 1e3
 
 DEPTH_DECADES = math.log(100.0)
 """A wrong match's depth may be anything over two decades, evenly in its logarithm."""
+
+LOG_DECADES = math.log(DEPTH_DECADES)
 
 GATES = (9.21, 11.34)
 """Chi-square 99 % points for 2 and 3 degrees of freedom."""
@@ -90,11 +93,11 @@ class Sightings:
         """Some of them."""
         return replace(
             self,
-            points=self.points[index],
-            covariances=self.covariances[index],
-            pixels=self.pixels[index],
-            depths=self.depths[index],
-            depth_sigmas=self.depth_sigmas[index],
+            points=np.ascontiguousarray(self.points[index]),
+            covariances=np.ascontiguousarray(self.covariances[index]),
+            pixels=np.ascontiguousarray(self.pixels[index]),
+            depths=np.ascontiguousarray(self.depths[index]),
+            depth_sigmas=np.ascontiguousarray(self.depth_sigmas[index]),
         )
 
     @property
@@ -125,44 +128,16 @@ class Sightings:
         camera = self.camera
         if self.inverted:
             poses = inverse_poses(poses)
-        cos, sin = np.cos(poses[:, 2:3]), np.sin(poses[:, 2:3])
-        dx, dy = self.points[:, 0] - poses[:, 0:1], self.points[:, 1] - poses[:, 1:2]
-        ahead = cos * dx + sin * dy - camera.mount_forward
-        left = cos * dy - sin * dx
-        visible = ahead > NEAREST
-        inverse = 1.0 / np.where(visible, ahead, 1.0)
-        a, b = left * inverse, (self.points[:, 2] - camera.mount_height) * inverse
-        slopes = self.slopes
-        ru, rv = camera.fx * (a - slopes[:, 0]), camera.fy * (b - slopes[:, 1])
-
-        # The points' covariances in the axes of each hypothetical robot, one matrix product an entry.
-        p = self.covariances
-        plan = np.stack([p[:, 0, 0], p[:, 0, 1], p[:, 1, 1]])
-        tilt = np.stack([p[:, 0, 2], p[:, 1, 2]])
-        cc, ss, cs = cos * cos, sin * sin, cos * sin
-        pxx = np.hstack([cc, 2 * cs, ss]) @ plan
-        pyy = np.hstack([ss, -2 * cs, cc]) @ plan
-        pxy = np.hstack([-cs, cc - ss, cs]) @ plan
-        pxz, pyz = np.hstack([cos, sin]) @ tilt, np.hstack([-sin, cos]) @ tilt
-        noise = self.pixel_sigma**2
-        fu, fv = camera.fx * inverse, camera.fy * inverse
-        suu = fu * fu * (a * (a * pxx - 2 * pxy) + pyy) + noise
-        svv = fv * fv * (b * (b * pxx - 2 * pxz) + p[:, 2, 2]) + noise
-        suv = fu * fv * (b * (a * pxx - pxy) - a * pxz + pyz)
-        determinant = suu * svv - suv * suv
-        distance2 = (svv * ru * ru - 2 * suv * ru * rv + suu * rv * rv) / determinant
-
-        area = float(camera.width * camera.height)
-        ratios = math.log(area / (2 * math.pi)) - 0.5 * np.log(determinant) - 0.5 * distance2
-        kept = visible & (distance2 < GATES[0])
-        measured = self.depth_measured
-        if measured.any():
-            # The depth is treated as independent of the pixel here; the refinement does not.
-            depths, sigmas = self.depths[measured], self.depth_sigmas[measured]
-            variance = pxx[:, measured] + sigmas**2
-            depth2 = (ahead[:, measured] - depths) ** 2 / variance
-            ratios[:, measured] += np.log(DEPTH_DECADES * depths) - 0.5 * np.log(2 * math.pi * variance)
-            ratios[:, measured] -= 0.5 * depth2
-            kept[:, measured] &= depth2 < GATES[0]
-        out: Array = np.where(kept, np.maximum(ratios, 0.0), 0.0)
+        optics = (
+            camera.fx,
+            camera.fy,
+            camera.mount_height,
+            camera.mount_forward,
+            camera.width * camera.height,
+        )
+        out: Array = kernels().log_ratios(
+            self.points, self.covariances, self.slopes, self.pixel_sigma**2, self.depths, self.depth_sigmas,
+            self.depth_measured, np.array(optics, np.float64), np.ascontiguousarray(poses),
+            GATES[0], NEAREST, LOG_DECADES,
+        )  # fmt: skip
         return out

@@ -153,10 +153,11 @@ class Relocalizer:
         least = max(s.recognition.least_inliers, s.slight * best.recognition.inliers)
         if len(pairs) < least:
             return False
-        relative = self._merged.relative(node.id, best.node)
-        if relative is None:
+        here, there = (self._merged.postures.get(one) for one in (node.id, best.node))
+        if here is None or there is None or here.component != there.component:
             return True
-        robot_from_node = (relative @ best.recognition.node_from_robot).mean.inverse()
+        node_from_best = here.merged_from_robot.mean.inverse() @ there.merged_from_robot.mean
+        robot_from_node = (node_from_best @ best.recognition.node_from_robot.mean).inverse()
         points = node.landmarks.take(pairs[:, 0]).points_in_robot(node.camera)
         off = view.camera.project(robot_from_node.apply(points)) - view.pixels[pairs[:, 1]]
         explained = np.hypot(off[:, 0], off[:, 1]) < s.explained_px

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agent.ekf.compiled_motion import ahead, mirror, propagate, transition
 from agent.ekf.landmarks import Ids
-from agent.ekf.machine_code import MATRIX, SLOTS, VECTOR, machine_code
+from hybridmap.machine_code import MATRIX, SLOTS, VECTOR, machine_code
 from hybridmap.pose import Array
 
 __all__ = [

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.machine_code import CUBE, MATRIX, VECTOR, machine_code
+from hybridmap.machine_code import CUBE, MATRIX, VECTOR, machine_code
 from hybridmap.pose import Array
 
 _INPUT = "UniTuple(float64, 2)"
