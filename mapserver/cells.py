@@ -1,61 +1,49 @@
 """Compact descriptors of a large fleet in cells of the descriptors' space, of which a few are searched.
 
 FAISS's inverted file, a byte a coordinate: whole steps are kept as they are in the nodes, so distances are
-exact, and only cells that are not searched can hide something. The cells' middles are means of means (k-means
-twice), which sorts a landmark in with two small matrix products instead of one large one.
+exact, and only cells that are not searched can hide something.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import faiss
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.landmark_tables import DIMENSIONS, landmark_tables
+from mapserver.means import BLOCK, Codes, Ids, Means, Vectors, probing
 
-SEED = 1234
-"""Of the means' starts: the same landmarks make the same cells."""
-SAMPLE = 40
-"""Landmarks a cell from which the cells are learned."""
-ROUNDS = 8
-"""Of k-means."""
-BLOCK = 1 << 15
-"""Landmarks that are sorted in at once."""
+STEP2 = np.float32(landmark_tables().step ** 2)
+"""What a squared distance of codes is worth."""
 
-Codes = NDArray[np.uint8]
-Ids = NDArray[np.int64]
-Vectors = NDArray[np.float32]
+
+class Block(NamedTuple):
+    """Landmarks as they lie in the cells.
+
+    Attributes:
+        codes: (N, 32).
+        ids: (N,).
+        cells: (N,) where each lies, in rising order.
+    """
+
+    codes: Codes
+    ids: Ids
+    cells: Ids
 
 
 class Cells:
-    """Codes with ids, by cells that were learned once."""
+    """Codes with ids, in cells about means that were learned once."""
 
-    def __init__(self, codes: Codes, ids: Ids, count: int) -> None:
-        """Learn cells from landmarks, and sort these in.
-
-        Args:
-            codes: (N, 32) of all landmarks that there are.
-            ids: (N,).
-            count: of cells, about.
-        """
-        sample = codes[:: max(len(codes) // (SAMPLE * count), 1)].astype(np.float32)
-        above = 1 << round(math.log2(count) / 2)
-        self._above = _means(sample, above)
-        nearest = _nearest(sample, self._above)
-        below = [_means(sample[nearest == k], max(count // above, 1)) for k in range(len(self._above))]
-        self._starts = np.concatenate([[0], np.cumsum([len(one) for one in below])])
-        self._below = below
-        quantiser = faiss.IndexFlatL2(DIMENSIONS)
-        quantiser.add(np.concatenate(below))
-        self._index = faiss.IndexIVFScalarQuantizer(
-            quantiser, DIMENSIONS, quantiser.ntotal, faiss.ScalarQuantizer.QT_8bit_direct,
+    def __init__(self, means: Means) -> None:
+        """Begin with nothing in them."""
+        self.means = means
+        self._index: Any = faiss.IndexIVFScalarQuantizer(
+            means.searched, DIMENSIONS, len(means), faiss.ScalarQuantizer.QT_8bit_direct,
             faiss.METRIC_L2, False,
         )  # fmt: skip
-        self._index.train(sample[:1])
-        self.add(codes, ids)
+        self._index.train(np.zeros((1, DIMENSIONS), np.float32))
 
     def __len__(self) -> int:
         """How many landmarks."""
@@ -64,12 +52,15 @@ class Cells:
     def add(self, codes: Codes, ids: Ids) -> None:
         """Sort (N, 32) codes in."""
         for start in range(0, len(codes), BLOCK):
-            vectors = codes[start : start + BLOCK].astype(np.float32)
-            numbers = np.ascontiguousarray(ids[start : start + BLOCK])
-            cells = self._cells(vectors)
-            self._index.add_core(
-                len(vectors), faiss.swig_ptr(vectors), faiss.swig_ptr(numbers), faiss.swig_ptr(cells), None
-            )
+            part = slice(start, start + BLOCK)
+            vectors = codes[part].astype(np.float32)
+            self._put(vectors, ids[part], self.means.nearest(vectors))
+
+    def put(self, block: Block) -> None:
+        """Take in landmarks of which it is known where they lie."""
+        for start in range(0, len(block.ids), BLOCK):
+            part = slice(start, start + BLOCK)
+            self._put(block.codes[part].astype(np.float32), block.ids[part], block.cells[part])
 
     def remove(self, first: int, last: int) -> None:
         """Forget the ids from first to last, that one left out."""
@@ -86,9 +77,8 @@ class Cells:
         Returns:
             (N, k) squared distances of decoded descriptors, and ids; -1 where there are fewer.
         """
-        self._index.nprobe = min(probes, self._index.nlist)
-        squared, ids = self._index.search(codes.astype(np.float32), k)
-        return squared * _step2(), ids
+        squared, ids = self._index.search(codes.astype(np.float32), k, params=self._searching(probes))
+        return squared * STEP2, ids
 
     def within(self, codes: Codes, reach: float, probes: int) -> tuple[Ids, Vectors, Ids]:
         """All landmarks in the nearest cells within a distance of decoded descriptors.
@@ -96,51 +86,35 @@ class Cells:
         Returns:
             (M,) row of the code, squared distance, id.
         """
-        self._index.nprobe = min(probes, self._index.nlist)
-        limits, squared, ids = self._index.range_search(codes.astype(np.float32), reach**2 / _step2())
+        limits, squared, ids = self._index.range_search(
+            codes.astype(np.float32), reach**2 / STEP2, params=self._searching(probes)
+        )
         rows = np.repeat(np.arange(len(codes)), np.diff(limits.astype(np.int64)))
-        return rows, squared * _step2(), ids
+        return rows, squared * STEP2, ids
 
-    def contents(self) -> tuple[Codes, Ids]:
-        """All codes (N, 32) and ids (N,), in the order of their ids."""
+    def blocks(self, size: int) -> Iterator[Block]:
+        """All landmarks, cell by cell, about `size` at once: a copy of all would take the memory twice."""
         lists: Any = self._index.invlists
-        codes, ids = [np.zeros((0, DIMENSIONS), np.uint8)], [np.zeros(0, np.int64)]
-        for k in range(self._index.nlist):
-            n = lists.list_size(k)
-            if n:
-                codes.append(faiss.rev_swig_ptr(lists.get_codes(k), n * DIMENSIONS).reshape(n, -1).copy())
-                ids.append(faiss.rev_swig_ptr(lists.get_ids(k), n).copy())
-        numbers = np.concatenate(ids)
-        order = np.argsort(numbers, kind="stable")
-        return np.concatenate(codes)[order], numbers[order]
+        cell = 0
+        while cell < self._index.nlist:
+            codes, ids = [np.zeros((0, DIMENSIONS), np.uint8)], [np.zeros(0, np.int64)]
+            counts: list[int] = []
+            first, some = cell, 0
+            while cell < self._index.nlist and some < size:
+                n = lists.list_size(cell)
+                if n:
+                    codes.append(faiss.rev_swig_ptr(lists.get_codes(cell), n * DIMENSIONS).reshape(n, -1))
+                    ids.append(faiss.rev_swig_ptr(lists.get_ids(cell), n))
+                counts.append(n)
+                cell, some = cell + 1, some + n
+            # What is concatenated is copied.
+            yield Block(np.concatenate(codes), np.concatenate(ids), np.repeat(np.arange(first, cell), counts))
 
-    def _cells(self, vectors: Vectors) -> Ids:
-        """(N,) the cell of each: the nearest below the nearest above."""
-        above = _nearest(vectors, self._above)
-        order = np.argsort(above, kind="stable")
-        out = np.empty(len(vectors), np.int64)
-        for rows in np.split(order, np.flatnonzero(np.diff(above[order])) + 1):
-            if len(rows):
-                k = int(above[rows[0]])
-                out[rows] = self._starts[k] + _nearest(vectors[rows], self._below[k])
-        return out
+    def _put(self, vectors: Vectors, ids: Ids, cells: Ids) -> None:
+        ids, cells = np.ascontiguousarray(ids), np.ascontiguousarray(cells)
+        self._index.add_core(
+            len(vectors), faiss.swig_ptr(vectors), faiss.swig_ptr(ids), faiss.swig_ptr(cells), None
+        )
 
-
-def _means(sample: Vectors, count: int) -> Vectors:
-    """(at most count, 32) means of a sample."""
-    if len(sample) <= count:
-        return sample.copy() if len(sample) else np.full((1, DIMENSIONS), 1e6, np.float32)
-    means = faiss.Kmeans(DIMENSIONS, count, niter=ROUNDS, seed=SEED, min_points_per_centroid=1)
-    means.train(np.ascontiguousarray(sample))
-    return np.asarray(means.centroids, np.float32).reshape(-1, DIMENSIONS)
-
-
-def _nearest(vectors: Vectors, means: Vectors) -> Ids:
-    """(N,) which mean is nearest to each vector."""
-    out: Ids = ((means * means).sum(axis=1) - 2 * (vectors @ means.T)).argmin(axis=1)
-    return out
-
-
-def _step2() -> Any:
-    """What a squared distance of codes is worth."""
-    return np.float32(landmark_tables().step ** 2)
+    def _searching(self, probes: int) -> Any:
+        return probing(min(probes, self._index.nlist))

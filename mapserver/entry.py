@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from hybridmap.change import Change
 from hybridmap.errors import InvalidMessage
@@ -51,6 +52,18 @@ class Applied:
 
     changes: tuple[Change, ...]
     refusals: tuple[Refusal, ...]
+    watermark: int
+
+
+class Position(NamedTuple):
+    """Of a log.
+
+    Attributes:
+        log_id: which log it is.
+        watermark: every change up to this one is settled.
+    """
+
+    log_id: int
     watermark: int
 
 

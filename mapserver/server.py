@@ -21,6 +21,7 @@ from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.desk import Desk, DeskSettings
 from mapserver.explainer import Explainer, RulingBook
 from mapserver.ingest import Ingest
+from mapserver.placekeeper import PlaceKeeper
 from mapserver.services import Services
 from mapserver.store import Store
 from mapserver.upkeep import Upkeep
@@ -75,7 +76,10 @@ class MapServer:
         self._settings = s = settings or ServerSettings()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = Store(path)
-        self._upkeep = Upkeep(s.merge_share, by_itself=not s.lockstep)
+        # In lock-step all must come about again as it did, the cells of the index too.
+        self._keeper = None if s.lockstep else PlaceKeeper(self._store, path)
+        index = self._keeper.index if self._keeper else None
+        self._upkeep = Upkeep(s.merge_share, by_itself=not s.lockstep, index=index)
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
         self._desk = Desk(replace(s.desk, workers=0) if s.lockstep else s.desk)
@@ -95,6 +99,8 @@ class MapServer:
             self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule
         )
         self._teller.start()
+        if self._keeper:
+            self._keeper.start()
         return self
 
     def __exit__(
@@ -107,6 +113,8 @@ class MapServer:
         self._ingest.close()
         self._stop.set()
         self._upkeep.close()
+        if self._keeper:
+            self._keeper.close()
         self._teller.join(5.0)
         self._store.close()
 

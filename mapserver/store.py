@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from hybridmap.change import Change, EdgePut, NodePut
+from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import Edge, EdgeId, MapId, NodeId
-from mapserver.entry import Applied, Entry, Traffic
+from mapserver.entry import Applied, Entry, Position, Traffic
 from wire.codec import decode_body, element_of, encode_body, unwrap_body
 from wire.database import Database
 from wire.log_messages import Refusal
@@ -63,6 +63,22 @@ class Store:
     def maps(self) -> list[MapId]:
         """All maps of which something is known."""
         return [MapId(*row) for row in self._read("SELECT agent, epoch FROM log ORDER BY agent, epoch")]
+
+    def positions(self) -> dict[MapId, Position]:
+        """Which log is kept of each map, and how far it is settled."""
+        rows = self._read("SELECT agent, epoch, log_id, watermark FROM log")
+        return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in rows}
+
+    def present(self) -> set[NodeId]:
+        """All nodes that are not retired, without a look at what is in them."""
+        query = (
+            "SELECT agent, epoch, number, kind FROM change WHERE kind IN (?, ?) "
+            "ORDER BY agent, epoch, sequence"
+        )
+        nodes: set[NodeId] = set()
+        for *element, kind in self._read(query, (NodePut.__name__, NodeRetired.__name__)):
+            (nodes.add if kind == NodePut.__name__ else nodes.discard)(NodeId(*element))
+        return nodes
 
     def watermark(self, map_id: MapId) -> int:
         """Up to which change the log is settled, 0 if nothing is known."""

@@ -12,7 +12,7 @@ from hybridmap.errors import MapweaveError
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
 from mapserver.merger import Merger
-from mapserver.shared_index import SharedPlaceIndex
+from mapserver.placeindex import PlaceIndex
 from merge.merged import MergedMap
 from merge.parting import joinings, partings
 
@@ -25,16 +25,17 @@ MOST_WORDS = 1000
 class Upkeep:
     """Merges beside the questions. Only its thread touches the merger; done answers replace those before."""
 
-    def __init__(self, share: float, by_itself: bool = True) -> None:
+    def __init__(self, share: float, by_itself: bool = True, index: PlaceIndex | None = None) -> None:
         """Begin with nothing.
 
         Args:
             share: at most this share of the time is spent making the merged map anew.
             by_itself: merge whenever there is something new; else only when somebody waits for it.
+            index: is filled with the nodes that come; may have them already.
         """
         self._share = share
         self._by_itself = by_itself
-        self._merger = Merger(SharedPlaceIndex())
+        self._merger = Merger(index)
         self._changes: queue.SimpleQueue[Change | Rulings | threading.Event | None] = queue.SimpleQueue()
         self._answers = Answers.of(self._merger, MergedMap.empty())
         self._dirty = False

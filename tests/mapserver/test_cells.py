@@ -8,6 +8,7 @@ from hybridmap.descriptor import decode, quantise
 from hybridmap.matching import squared_distances
 from hybridmap.synthetic import random_vectors
 from mapserver.cells import Cells
+from mapserver.means import Means
 
 Codes = NDArray[np.uint8]
 Ids = NDArray[np.int64]
@@ -22,6 +23,21 @@ def landmarks() -> tuple[Codes, Ids]:
     return codes, rng.permutation(50_000)[: len(codes)].astype(np.int64)
 
 
+def filled(codes: Codes, ids: Ids, count: int) -> Cells:
+    cells = Cells(Means.learn(codes, count))
+    cells.add(codes, ids)
+    return cells
+
+
+def contents(cells: Cells) -> tuple[Codes, Ids]:
+    """In the order of the ids, read in several blocks."""
+    blocks = list(cells.blocks(500))
+    assert len(blocks) > 1
+    codes, ids, _ = (np.concatenate(column) for column in zip(*blocks, strict=True))
+    order = np.argsort(ids)
+    return codes[order], ids[order]
+
+
 def asked(codes: Codes, n: int, seed: int) -> Codes:
     rng = np.random.default_rng(seed)
     vectors = decode(codes[rng.integers(0, len(codes), n)])
@@ -30,7 +46,7 @@ def asked(codes: Codes, n: int, seed: int) -> Codes:
 
 def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
-    cells, questions = Cells(codes, ids, 64), asked(codes, 50, 2)
+    cells, questions = filled(codes, ids, 64), asked(codes, 50, 2)
     every = squared_distances(decode(questions), decode(codes))
     squared, found = cells.nearest(questions, 10, probes=1000)
     assert np.allclose(squared, np.sort(every, axis=1)[:, :10], atol=1e-4)
@@ -45,7 +61,7 @@ def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
 
 def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
-    cells, questions = Cells(codes, ids, 64), asked(codes, 300, 3)
+    cells, questions = filled(codes, ids, 64), asked(codes, 300, 3)
     every = squared_distances(decode(questions), decode(codes))
     squared, _ = cells.nearest(questions, 1, probes=8)
     assert np.mean(squared[:, 0] < every.min(axis=1) + 1e-4) > 0.9
@@ -53,11 +69,11 @@ def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes
 
 def test_what_is_removed_is_gone_and_the_rest_is_kept(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
-    cells = Cells(codes[:2000], ids[:2000], 64)
+    cells = filled(codes[:2000], ids[:2000], 64)
     cells.add(codes[2000:], ids[2000:])
     cells.remove(10_000, 20_000)
     left = (ids < 10_000) | (ids >= 20_000)
-    kept_codes, kept_ids = cells.contents()
+    kept_codes, kept_ids = contents(cells)
     order = np.argsort(ids[left])
     assert np.array_equal(kept_ids, ids[left][order]) and np.array_equal(kept_codes, codes[left][order])
     assert len(cells) == left.sum()
@@ -66,12 +82,12 @@ def test_what_is_removed_is_gone_and_the_rest_is_kept(landmarks: tuple[Codes, Id
 def test_the_same_landmarks_make_the_same_cells(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
     questions = asked(codes, 100, 4)
-    one, two = (Cells(codes, ids, 64).nearest(questions, 5, probes=2) for _ in range(2))
+    one, two = (filled(codes, ids, 64).nearest(questions, 5, probes=2) for _ in range(2))
     assert np.array_equal(one[1], two[1]) and np.array_equal(one[0], two[0])
 
 
 def test_fewer_landmarks_than_cells() -> None:
     codes = quantise(random_vectors(3, np.random.default_rng(5)))
-    cells = Cells(codes, np.arange(3), 64)
+    cells = filled(codes, np.arange(3), 64)
     squared, ids = cells.nearest(codes, 4, probes=64)
     assert ids[:, 0].tolist() == [0, 1, 2] and np.allclose(squared[:, 0], 0.0) and (ids[:, 3] == -1).all()

@@ -8,6 +8,7 @@ from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
 from hybridmap.synthetic import CAMERA, World, room, take_map, take_view
+from mapserver.landmarkindex import LandmarkIndexSettings
 from mapserver.placeindex import PlaceIndex, PlaceIndexSettings
 from merge.candidates import overlaps
 
@@ -96,21 +97,21 @@ def test_added_is_found_at_once_and_removed_never(building: tuple[World, list[No
     index.remove(last.id)
     index.remove(last.id)
     assert last.id not in dict(index.query(view, 99)) and last.id not in index
-    assert index.landmarks == sum(len(node.landmarks) for node in nodes[:-1])
+    assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes[:-1])
 
 
 def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) -> None:
     _, nodes, _ = building
     index = filled(nodes)
-    before = index.landmarks
+    before = len(index.landmarks)
     index.add(nodes[3])
-    assert index.landmarks == before and len(index) == len(nodes)
+    assert len(index.landmarks) == before and len(index) == len(nodes)
 
 
 def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[Node], list[Pose2]]) -> None:
     world, nodes, tour = building
-    index = filled(nodes, PlaceIndexSettings(small=500, exact=1500))
-    assert index._flat is None
+    index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=500, exact=1500)))
+    assert index.landmarks._flat is None
     rng = np.random.default_rng(5)
     hits = 0
     for node, stop in zip(nodes, tour, strict=True):
@@ -119,7 +120,7 @@ def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[N
     assert hits >= 23
     index.remove(nodes[0].id)
     index.add(nodes[0])
-    assert index.landmarks == sum(len(node.landmarks) for node in nodes)
+    assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes)
 
 
 def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pose2]]) -> None:
@@ -136,7 +137,8 @@ def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pos
 
 def everywhere() -> PlaceIndexSettings:
     """Cells, of which all are searched: then nothing may be missing."""
-    return PlaceIndexSettings(small=300, growth=2.0, probes=10_000, overlap_probes=10_000)
+    landmarks = LandmarkIndexSettings(small=300, growth=2.0, probes=10_000, within_probes=10_000)
+    return PlaceIndexSettings(landmarks=landmarks)
 
 
 def test_cells_of_which_all_are_searched_answer_like_no_cells(
@@ -147,7 +149,7 @@ def test_cells_of_which_all_are_searched_answer_like_no_cells(
     for index in (plain, cells):
         index.remove(nodes[4].id)
         index.add(nodes[7])
-    assert cells._cells is not None and cells.landmarks == plain.landmarks
+    assert cells.landmarks.means is not None and len(cells.landmarks) == len(plain.landmarks)
     for stop in tour[::5]:
         view, _ = take_view(world, stop, np.random.default_rng(7))
         one, two = plain.query(view, 6), cells.query(view, 6)
@@ -160,14 +162,14 @@ def test_many_at_once_are_the_same_as_one_by_one(building: tuple[World, list[Nod
     one, many = filled(nodes), PlaceIndex()
     many.extend([*nodes, nodes[2]])
     view, _ = take_view(world, tour[3], np.random.default_rng(8))
-    assert one.query(view, 9) == many.query(view, 9) and many.landmarks == one.landmarks
+    assert one.query(view, 9) == many.query(view, 9) and len(many.landmarks) == len(one.landmarks)
 
 
 def test_cells_are_learned_beside_the_questions(building: tuple[World, list[Node], list[Pose2]]) -> None:
     """What comes and goes while new cells are learned is in them."""
     world, nodes, tour = building
-    settings = PlaceIndexSettings(small=300, exact=600, growth=2.0, patience=500, probes=10_000)
-    index = PlaceIndex(settings)
+    landmarks = LandmarkIndexSettings(small=300, exact=600, growth=2.0, patience=500, probes=10_000)
+    index = PlaceIndex(PlaceIndexSettings(landmarks=landmarks))
     index.extend(nodes[:8])
     index.add(nodes[8])
     index.remove(nodes[0].id)
@@ -177,7 +179,7 @@ def test_cells_are_learned_beside_the_questions(building: tuple[World, list[Node
         assert node.id in dict(index.query(view, 3)), "searchable at once"
     index.settle()
     plain = filled(nodes[1:])
-    assert index.landmarks == plain.landmarks
+    assert len(index.landmarks) == len(plain.landmarks)
     view, _ = take_view(world, tour[5], np.random.default_rng(10))
     ours, theirs = dict(index.query(view, 5)), dict(plain.query(view, 5))
     assert set(ours) == set(theirs)
@@ -189,8 +191,10 @@ def test_an_index_that_cannot_learn_says_so_and_goes_on(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     world, nodes, tour = building
-    monkeypatch.setattr("mapserver.placeindex.Cells", None)
-    index = PlaceIndex(PlaceIndexSettings(small=300, growth=2.0, patience=300))
+    monkeypatch.setattr("mapserver.landmarkindex.Cells", None)
+    index = PlaceIndex(
+        PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=300, growth=2.0, patience=300))
+    )
     index.extend(nodes)
     index.settle()
     view, _ = take_view(world, tour[1], np.random.default_rng(11))

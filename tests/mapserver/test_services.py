@@ -17,9 +17,9 @@ from hybridmap.query import Certainty, RelocalizeAnswer, View
 from hybridmap.synthetic import take_node
 from mapserver.desk import DeskSettings
 from mapserver.merger import Merger
+from mapserver.placeindex import PlaceIndex
 from mapserver.relocalization import Relocalizer
 from mapserver.server import MapServer, ServerSettings
-from mapserver.shared_index import SharedPlaceIndex
 from merge.merged import MergedMap
 from wire.bus import Reply
 from wire.keys import Keys
@@ -204,7 +204,7 @@ def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
     rng = np.random.default_rng(9)
     posture = room.truth[min(room.truth)]
     template = take_node(room.world, NodeId("x", 1, 0), posture, PoseGaussian(Pose2(), np.zeros((3, 3))), rng)
-    index = SharedPlaceIndex()
+    index = PlaceIndex()
     stop = threading.Event()
     view = room.view(min(room.truth))
 
@@ -221,7 +221,7 @@ def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
         stop.set()
         for one in searches:
             one.result(20)
-    alone = SharedPlaceIndex()
+    alone = PlaceIndex()
     for number in range(120):
         if number % 3 != 1:
             alone.add(replace(template, id=NodeId("x", 1, number)))
