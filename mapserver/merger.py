@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
@@ -9,11 +10,12 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.placeindex import PlaceIndex
-from merge.candidates import CandidateSettings, Pair, choose_pairs
-from merge.links import Link, RefusedLink
+from merge.candidates import CandidateSettings, Pair
+from merge.incremental import Islands, Verdict, Verdicts
+from merge.incremental_pairs import PairTable
+from merge.links import Link
 from merge.merged import MergedMap
-from merge.merging import MergeSettings, merge_maps
-from merge.undoing import undo
+from merge.merging import MergeSettings
 from merge.verification import VerificationSettings, verify
 
 
@@ -50,11 +52,11 @@ class MergerCounters:
 
 
 class Merger:
-    """Holds every robot's map, the table of overlaps and the verdicts on pairs of nodes.
+    """Holds every robot's map, the overlaps of their nodes and the verdicts on pairs of them.
 
     Work is done where it is cheapest: a new node is compared with its best candidates when it comes; the
-    merged map is made when it is asked for and something has changed. The outcome depends on what the maps
-    hold, not on the order in which it came.
+    merged map is made when it is asked for and something has changed, and then only where it has. The
+    outcome depends on what the maps hold, not on the order in which it came.
     """
 
     def __init__(self, index: PlaceIndex | None = None, settings: MergerSettings | None = None) -> None:
@@ -68,8 +70,12 @@ class Merger:
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
         self._settings = settings or MergerSettings()
-        self._overlaps: dict[Pair, float] = {}
-        self._verdicts: dict[Pair, Link | RefusedLink] = {}
+        self._pairs = PairTable(self._settings.candidates)
+        self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
+        self._verdicts = Verdicts()
+        self._islands = Islands(self._settings.merging)
+        self._kept: dict[MapId, HybridMap] = {}
+        self._touched: set[MapId] = set()
         self._rulings = Rulings()
         self._merged = MergedMap.empty()
         self._dirty = False
@@ -84,23 +90,42 @@ class Merger:
         self.counters.changes += 1
         self.apply(change.map, change.body)
         if isinstance(change.body, NodePut):
-            self._verify(self._chosen(change.body.node.id))
+            # Which nodes of its own map are no neighbours its edges tell, and they come after it.
+            self._verify(pair for pair in self._pairs.of(change.body.node.id) if pair[0].map != pair[1].map)
 
     def apply(self, map_id: MapId, body: ChangeBody) -> None:
-        """Take in a change without comparing nodes yet: for reading a whole store at the start."""
-        self.maps.setdefault(map_id, HybridMap()).apply(body)
-        self._dirty = True
-        match body:
-            case NodePut(node):
-                self._forget(node.id)
-                self.index.add(node)
-                for other, value in self.index.overlaps(node).items():
-                    self._overlaps[min(node.id, other), max(node.id, other)] = value
-            case NodeRetired(node_id):
-                self._forget(node_id)
-                self.index.remove(node_id)
-            case EdgePut() | EdgeRetired():
-                pass
+        """Take in a change without comparing nodes yet."""
+        self._replay(map_id, body)
+        if isinstance(body, NodePut):
+            self.index.add(body.node)
+            self._pairs.put(body.node.id, self.index.overlaps(body.node))
+
+    def read(
+        self,
+        log: Iterable[tuple[MapId, ChangeBody]],
+        overlaps: Mapping[Pair, float] | None = None,
+        links: Mapping[Pair, Link] | None = None,
+    ) -> None:
+        """Take in many changes at once: a whole store at the start. Nodes are compared when they are merged.
+
+        Args:
+            log: what each map tells, in its order.
+            overlaps: if they are known already, of all pairs of these nodes; else they are looked for.
+            links: what is known already of pairs of these nodes.
+        """
+        for map_id, body in log:
+            self._replay(map_id, body)
+        fresh = [
+            node for one in self.maps.values() for node in one.nodes.values() if node.id not in self.index
+        ]
+        self.index.extend(fresh)
+        if overlaps is None:
+            for node in fresh:
+                self._pairs.put(node.id, self.index.overlaps(node))
+        for (a, b), value in (overlaps or {}).items():
+            self._pairs.put(a, {b: value})
+        for pair, link in (links or {}).items():
+            self._judge(pair, link)
 
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others."""
@@ -108,23 +133,22 @@ class Merger:
         self._dirty = True
 
     def merged(self) -> MergedMap:
-        """The merged map of all that has come; made anew only if something has changed."""
+        """The merged map of all that has come; made anew only if something has changed, and where it has."""
         if self._dirty:
-            chosen = choose_pairs(self._overlaps, self._edges(), self._settings.candidates)
-            self._verify(chosen)
-            verdicts = [self._verdicts[pair] for pair in chosen]
-            undone = undo(
+            changed = self._pairs.changed()
+            self._verify(pair for pair in changed if pair in self._pairs)
+            for pair in changed:
+                self._touched |= {pair[0].map, pair[1].map}
+                if pair in self._pairs and pair[1] in self._known.get(pair[0], {}):
+                    self._verdicts.put(pair, self._known[pair[0]][pair[1]])
+                else:
+                    self._verdicts.drop(pair)
+            for map_id in self._touched & self.maps.keys():
                 # Copies: a merged map stays as it was when later changes come.
-                {map_id: HybridMap(one.contents()) for map_id, one in self.maps.items()},
-                [verdict for verdict in verdicts if isinstance(verdict, Link)],
-                self._rulings,
-            )
-            refused = [verdict for verdict in verdicts if isinstance(verdict, RefusedLink)]
-            merged = merge_maps(
-                undone.maps, undone.links, [*refused, *undone.refused], self._settings.merging
-            )
-            self._merged = undone.completed(merged)
+                self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+            self._merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
             self.counters.merges += 1
+            self._touched = set()
             self._dirty = False
         return self._merged
 
@@ -132,31 +156,56 @@ class Merger:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
         return self.merged().summary()
 
-    def _edges(self) -> list[Edge]:
-        """Edges that say which nodes lie so near to each other on a robot's way that to compare them tells
-        nothing new. A later drive says nothing of that; it may lead from map to map.
-        """
-        edges = (edge for one in self.maps.values() for edge in one.edges.values())
-        return [edge for edge in edges if edge.kind is not EdgeKind.DRIVEN]
+    def _replay(self, map_id: MapId, body: ChangeBody) -> None:
+        """Take a change into its map, and forget what no longer holds."""
+        one = self.maps.setdefault(map_id, HybridMap())
+        self._touched.add(map_id)
+        self._dirty = True
+        for edge in _dropped(one, body):
+            if edge.kind is not EdgeKind.DRIVEN:
+                self._pairs.disconnect(edge.a, edge.b)
+        one.apply(body)
+        match body:
+            case NodePut(node):
+                self._forget(node.id)
+            case NodeRetired(node_id):
+                self._forget(node_id)
+            case EdgePut(edge):
+                # Nodes so near to each other on a robot's way are not compared: it tells nothing new. A
+                # later drive says nothing of that; it may lead from map to map.
+                if edge.kind is not EdgeKind.DRIVEN:
+                    self._pairs.connect(edge.a, edge.b)
 
-    def _chosen(self, node_id: NodeId) -> list[Pair]:
-        """The pairs of one node that would be chosen now; the edges of a new node come after it."""
-        near = {pair: value for pair, value in self._overlaps.items() if node_id in pair}
-        between = {pair: value for pair, value in near.items() if pair[0].map != pair[1].map}
-        return choose_pairs(between, (), self._settings.candidates)
-
-    def _verify(self, pairs: list[Pair]) -> None:
+    def _verify(self, pairs: Iterable[Pair]) -> None:
         for pair in pairs:
             a, b = self.node(pair[0]), self.node(pair[1])
-            if pair in self._verdicts or a is None or b is None:
+            if pair[1] in self._known.get(pair[0], {}) or a is None or b is None:
                 continue
             verdict = verify(a, b, self._settings.verification)
-            self._verdicts[pair] = verdict
+            self._judge(pair, verdict)
             self.counters.verified += 1
             self.counters.recognised += isinstance(verdict, Link)
 
+    def _judge(self, pair: Pair, verdict: Verdict) -> None:
+        for one, other in (pair, pair[::-1]):
+            self._known.setdefault(one, {})[other] = verdict
+
     def _forget(self, node_id: NodeId) -> None:
         """Drop what was found out about a node: it is gone, or is known better."""
-        for known in (self._overlaps, self._verdicts):
-            for pair in [pair for pair in known if node_id in pair]:
-                del known[pair]
+        if node_id in self.index:
+            self.index.remove(node_id)
+        self._pairs.forget(node_id)
+        for other in self._known.pop(node_id, {}):
+            del self._known[other][node_id]
+
+
+def _dropped(one: HybridMap, body: ChangeBody) -> Iterator[Edge]:
+    """Edges of a map that a change takes away or replaces."""
+    match body:
+        case NodeRetired(node_id) if node_id in one.graph:
+            for _, _, edge_id in one.graph.edges(node_id, keys=True):
+                yield one.edges[edge_id]
+        case EdgePut(edge) if edge.id in one.edges:
+            yield one.edges[edge.id]
+        case EdgeRetired(edge_id) if edge_id in one.edges:
+            yield one.edges[edge_id]

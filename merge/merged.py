@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -26,6 +26,52 @@ class Placement(NamedTuple):
 
     component: int
     merged_from_robot: PoseGaussian
+
+
+class Postures(Mapping[NodeId, Placement]):
+    """The postures of all nodes of some solved components, worked out when they are asked for."""
+
+    def __init__(self, graphs: Sequence[PoseGraph]) -> None:
+        """Take the components, largest first."""
+        self._graphs = tuple(graphs)
+        self._numbers: dict[MapId, list[int]] = {}
+        for number, graph in enumerate(self._graphs):
+            for map_id in graph.maps:
+                self._numbers.setdefault(map_id, []).append(number)
+
+    def number(self, node: NodeId) -> int | None:
+        """Of the node's component; None if it is not there."""
+        return next((k for k in self._numbers.get(node.map, ()) if node in self._graphs[k].rows), None)
+
+    def pose(self, node: NodeId) -> Pose2:
+        """Where a node is, without covariance, which costs more than all the rest.
+
+        Raises:
+            KeyError: it is not there.
+        """
+        number = self.number(node)
+        if number is None:
+            raise KeyError(node)
+        return self._graphs[number].pose(node)
+
+    def __getitem__(self, node: NodeId) -> Placement:
+        """Component and posture of a node."""
+        number = self.number(node)
+        if number is None:
+            raise KeyError(node)
+        return Placement(number, self._graphs[number].posture(node))
+
+    def __contains__(self, node: object) -> bool:
+        """Whether a node is there."""
+        return isinstance(node, NodeId) and self.number(node) is not None
+
+    def __iter__(self) -> Iterator[NodeId]:
+        """All nodes, component by component."""
+        return (node for graph in self._graphs for node in graph.nodes)
+
+    def __len__(self) -> int:
+        """How many nodes."""
+        return sum(len(graph.nodes) for graph in self._graphs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +101,16 @@ class MergedMap:
         """No maps."""
         return MergedMap({}, (), (), (), {})
 
+    def pose(self, node: NodeId) -> Pose2:
+        """Where a node is in its component's frame, without covariance: quick also in a large map."""
+        if isinstance(self.postures, Postures):
+            return self.postures.pose(node)
+        return self.postures[node].merged_from_robot.mean
+
     def component_of(self, node: NodeId) -> int | None:
         """Number of the node's component."""
+        if isinstance(self.postures, Postures):
+            return self.postures.number(node)
         placement = self.postures.get(node)
         return None if placement is None else placement.component
 

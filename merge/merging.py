@@ -20,13 +20,12 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from merge.agglomeration import agglomerate
 from merge.consistency import ConsistencySettings, group_links
-from merge.cutting import fragments_of
 from merge.drives import refuse_drives
 from merge.exclusion import ExclusionSettings
-from merge.groups import LinkGroup
+from merge.incremental_memory import Memory
 from merge.joining import Outliers, Solver, optimise
 from merge.links import Link, RefusedLink
-from merge.merged import MergedMap, Placement
+from merge.merged import MergedMap, Postures
 from merge.posegraph import HUBER
 from merge.refutation import Refutation
 
@@ -61,6 +60,7 @@ def merge_maps(
     links: Iterable[Link],
     refused: Iterable[RefusedLink] = (),
     settings: MergeSettings | None = None,
+    memory: Memory | None = None,
 ) -> MergedMap:
     """Merge.
 
@@ -69,21 +69,29 @@ def merge_maps(
         links: verified, at most one a pair of nodes; those at nodes that are not there are left out.
         refused: pairs that were refused before, to be kept with their reasons.
         settings: how.
+        memory: of merges before with the same settings; what they have found out is not found out again.
 
     Returns:
         The merged map. It does not depend on the order of maps, links or nodes.
     """
     s = settings or MergeSettings()
-    fragments = fragments_of(maps, s.consistency, s.strain)
+    memory = memory or Memory()
+    fragments = memory.fragments(maps, s.consistency, s.strain)
     solver = Solver(fragments, s.huber)
     by_node = solver.by_node
     refutation = Refutation(maps, solver, s.consistency, s.exclusion)
     present = [link for link in links if link.a in by_node and link.b in by_node]
     refusals = [r for r in refused if r.a in by_node and r.b in by_node]
     refusals += [r for fragment in fragments for r in fragment.refused]
+    given = {link.canonical().pair: link for link in present}
     groups = {
-        (first, second): LinkGroup.of(
-            group, by_node[first], by_node[second], s.consistency, refutation.verdict
+        (first, second): memory.group(
+            group,
+            [given[link.canonical().pair] for link in group],
+            by_node[first],
+            by_node[second],
+            s.consistency,
+            refutation.verdict,
         )
         for (first, second), group in group_links(present, by_node).items()
     }
@@ -99,16 +107,11 @@ def merge_maps(
             groups[key] = groups[key].without(story, reason, s.consistency, refutation.verdict)
     refusals += [r for group in groups.values() for r in group.refuted] + unjoined + strained
     refusals += refuse_drives(maps, solved, s.consistency)
-    postures = {
-        node: Placement(number, posture)
-        for number, graph in enumerate(solved)
-        for node, posture in graph.postures().items()
-    }
     return MergedMap(
         dict(sorted(maps.items())),
         tuple(sorted((link.canonical() for link in kept), key=lambda link: link.pair)),
         tuple(sorted(refusals, key=lambda r: r.pair)),
         tuple(frozenset(graph.nodes) for graph in solved),
-        postures,
+        Postures(solved),
         tuple(solved),
     )

@@ -15,7 +15,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
-from hybridmap.node import NodeId
+from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
@@ -29,6 +29,9 @@ HUBER = 2.0
 
 AT_ONCE = 256
 """Nodes whose marginal covariances are solved for together: all at once would take memory by the square."""
+
+FEW = 2048
+"""Up to as many nodes have their marginal covariances worked out all at once when one is asked for."""
 
 TOLERANCE = 1e-9
 """The solver stops when a step makes the cost smaller by less than this, absolutely or as a share of it."""
@@ -102,6 +105,23 @@ class PoseGraph:
         joint = 0.5 * (joint + joint.T)
         blocks: Array = joint.reshape(len(nodes), 3, len(nodes), 3)
         return blocks
+
+    @cached_property
+    def maps(self) -> frozenset[MapId]:
+        """Of which maps there are nodes."""
+        return frozenset(MapId(agent, epoch) for agent, epoch in {node[:2] for node in self.nodes})
+
+    @cached_property
+    def _known(self) -> dict[NodeId, PoseGaussian]:
+        """Postures that were asked for: all at once where they are few, else one by one."""
+        return self.postures() if len(self.nodes) <= FEW else {}
+
+    def posture(self, node: NodeId) -> PoseGaussian:
+        """A node's posture with its marginal covariance."""
+        known = self._known
+        if node not in known:
+            known[node] = PoseGaussian(self.pose(node), self.covariance([node])[0, :, 0, :])
+        return known[node]
 
     def postures(self) -> dict[NodeId, PoseGaussian]:
         """Each node's posture with its marginal covariance."""
