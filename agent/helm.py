@@ -22,12 +22,13 @@ class Helm:
         now: simulated or real time since then, s.
     """
 
-    def __init__(self, description: RobotDescription, patience: int) -> None:
+    def __init__(self, description: RobotDescription, patience: int = 0) -> None:
         """Take the body.
 
         Args:
             description: of the robot.
-            patience: ticks that an answer may take before the question counts as lost.
+            patience: ticks that an answer may take before the question counts as lost; a robot that asks
+                nobody needs none.
         """
         self.odom_from_robot = Pose2()
         self.now = 0.0
@@ -119,7 +120,7 @@ class Helm:
         """How far the robot may move in a direction (rad, 0 ahead), m; 0 where no ranger looks."""
         return room(self._description, self.observation.proximity, direction, 0.0)
 
-    def freest(self) -> tuple[float, float]:
-        """Room and direction (m, rad) where there is most."""
-        ways = [(self.room(bearing), bearing) for bearing in self._description.ranger_bearings]
+    def freest(self, most: float = math.inf) -> tuple[float, float]:
+        """Room and direction (m, rad) where there is most; from `most` m on, one is as good as another."""
+        ways = [(min(self.room(bearing), most), bearing) for bearing in self._description.ranger_bearings]
         return max(ways, key=lambda one: one[0], default=(0.0, 0.0))

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.ekf.localization import LocalizationFilter, LocalizationSettings
+from agent.node_tracks import NodeTracks
 from agent.observation import Observation, RobotDescription
 from agent.vision.lens import Lens
 from agent.vision.sift import Features
-from agent.vision.tracker import Tracker, TrackerSettings
+from agent.vision.tracker import TrackerSettings
 from hybridmap.node import Node
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.recognition import Recognition
@@ -53,16 +54,12 @@ class Localizer:
     ) -> None:
         """Start from a recognition of the node in an image's features."""
         self.node = node
-        self._settings = settings or LocalizerSettings()
+        self._settings = s = settings or LocalizerSettings()
         self._description = description
-        self._tracker = Tracker(lens, self._settings.tracker)
-        self._tracker.track(image)
-        landmarks, seen = recognition.pairs[:, 0], recognition.pairs[:, 1]
-        self._tracker.add(landmarks.astype(np.int64), features.raw[seen])
-        self._strikes = np.zeros(len(node.landmarks), np.int64)
+        self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, s.strikes)
         self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
         self._teaches = True
-        self._filter = self._filter_at(recognition.node_from_robot, landmarks.astype(np.int64))
+        self._filter = self._filter_at(recognition.node_from_robot, self._tracks.ids)
 
     @property
     def pose(self) -> PoseGaussian:
@@ -72,17 +69,17 @@ class Localizer:
     @property
     def visible(self) -> NDArray[np.int64]:
         """Indices of the node's landmarks that are tracked now."""
-        return self._tracker.ids
+        return self._tracks.ids
 
     @property
     def pixels(self) -> Array:
         """(N, 2) px, where they are seen."""
-        return self._tracker.pixels
+        return self._tracks.pixels
 
     @property
     def in_sight(self) -> bool:
         """Whether enough landmarks are tracked and the filter trusts itself."""
-        return len(self._tracker.ids) >= self._settings.least and self._filter.healthy
+        return len(self._tracks.ids) >= self._settings.least and self._filter.healthy
 
     def restart(self, pose: PoseGaussian) -> None:
         """Believe a posture that is known better than by what was tracked so far.
@@ -91,7 +88,7 @@ class Localizer:
         """
         self._note(np.ones(len(self._filter.ids), np.bool_))
         self._teaches = False
-        self._filter = self._filter_at(pose, self._tracker.ids)
+        self._filter = self._filter_at(pose, self._tracks.ids)
 
     def depths(self) -> tuple[Array, Array]:
         """What the filter knows of the depths of all landmarks that were followed until they left the view.
@@ -115,20 +112,17 @@ class Localizer:
         self._filter.predict(observation.odometry)
         if observation.image is None:
             return
-        self._tracker.track(observation.image, self._expected())
-        gone = ~np.isin(self._filter.ids, self._tracker.ids)
+        self._tracks.follow(observation.image, self._expected())
+        gone = ~np.isin(self._filter.ids, self._tracks.ids)
         if gone.any():
             self._note(gone)
             self._filter.remove(self._filter.ids[gone])
-        ids = self._tracker.ids
-        if len(ids):
-            report = self._filter.update(ids, self._tracker.pixels)
-            self._strikes[ids] = np.where(report.accepted, 0, self._strikes[ids] + 1)
-            bad = self._strikes[ids] >= self._settings.strikes
-            if bad.any():
-                self._filter.remove(ids[bad])
-                self._depths[ids[bad]] = self._depth_sigmas[ids[bad]] = np.nan
-                self._tracker.keep(~bad)
+        if len(self._tracks.ids):
+            report = self._filter.update(self._tracks.ids, self._tracks.pixels)
+            bad = self._tracks.judge(report.accepted)
+            if len(bad):
+                self._filter.remove(bad)
+                self._depths[bad] = self._depth_sigmas[bad] = np.nan
 
     def _filter_at(self, pose: PoseGaussian, landmarks: NDArray[np.int64]) -> LocalizationFilter:
         node, description = self.node, self._description
@@ -148,10 +142,10 @@ class Localizer:
         predicted = self._filter.predict_pixels()
         order = np.argsort(self._filter.ids)
         ids = self._filter.ids[order]
-        expected = np.full((len(self._tracker.ids), 2), np.nan)
+        expected = np.full((len(self._tracks.ids), 2), np.nan)
         if len(ids):
-            place = np.clip(np.searchsorted(ids, self._tracker.ids), 0, len(ids) - 1)
-            hit = ids[place] == self._tracker.ids
+            place = np.clip(np.searchsorted(ids, self._tracks.ids), 0, len(ids) - 1)
+            hit = ids[place] == self._tracks.ids
             expected[hit] = predicted[order[place[hit]]]
             expected[~self._description.camera.contains(expected)] = np.nan
         return expected

@@ -74,6 +74,27 @@ def recall_all(
     return sorted(recalled, key=lambda pair: -pair[1].inliers)
 
 
+def lookalikes(
+    recalled: list[tuple[Node, Recognition]], rival: float, apart: float
+) -> tuple[Node, Node] | None:
+    """The node that a view shows best, and another one, elsewhere, that it shows about as well; or None.
+
+    Args:
+        recalled: most inliers first, as `recall_all` returns them.
+        rival: another node has a say too with this share of the best one's inliers;
+        apart: it is elsewhere if it puts the robot further away than this, m.
+    """
+    if not recalled:
+        return None
+    node, best = recalled[0]
+    here = node.map_from_robot.mean @ best.node_from_robot.mean
+    for other, also in recalled[1:]:
+        there = other.map_from_robot.mean @ also.node_from_robot.mean
+        if also.inliers >= rival * best.inliers and here.distance(there) > apart:
+            return node, other
+    return None
+
+
 def exact_enough(posture: PoseGaussian, sure: tuple[float, float], leniency: float = 1.0) -> bool:
     """Whether a recognition is exact enough to go on from; else another look, elsewhere, costs little.
 

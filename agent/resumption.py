@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agent.agreement import AgreementSettings, Sighting, agree
+from agent.helm import Behaviour, Helm
 from agent.observation import Command, Observation, RobotDescription
-from agent.recall import exact_enough, recall_all
-from agent.room import room
+from agent.recall import exact_enough, lookalikes, recall_all
 from agent.vision.sift import Features, Sift
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node
@@ -127,8 +127,7 @@ class Resumption:
         self._map = own_map
         self._settings = settings or ResumptionSettings()
         self._rng = np.random.default_rng(seed)
-        self._observation: Observation | None = None
-        self._odom_from_robot = Pose2()
+        self._helm = Helm(description)
         self._way = self._turned = 0.0
         self._sightings: list[Sighting] = []
         self._hint: tuple[int, Pose2] | None = None
@@ -139,20 +138,19 @@ class Resumption:
     @property
     def odom_from_robot(self) -> Pose2:
         """Where the wheels have brought the robot since it began to look."""
-        return self._odom_from_robot
+        return self._helm.odom_from_robot
 
     def step(self, observation: Observation) -> Command:
         """One tick: returns what the wheels shall do. Once `found` is set there is nothing more to do."""
-        self._observation = observation
+        self._helm.take_in(observation, ())
         odometry = observation.odometry
-        self._odom_from_robot = self._odom_from_robot @ odometry.motion()
         self._way, self._turned = self._way + abs(odometry.forward), self._turned + abs(odometry.turn)
-        self.seen.append((self._odom_from_robot, observation.proximity))
+        self.seen.append((self.odom_from_robot, observation.proximity))
         return next(self._behaviour)
 
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 
-    def _search(self) -> Generator[Command, None, None]:
+    def _search(self) -> Behaviour:
         s = self._settings
         place = 1
         while self.found is None and not self.lost:
@@ -170,61 +168,52 @@ class Resumption:
         while True:
             yield Command()
 
-    def _look_around(self, turns: int) -> Generator[Command, None, None]:
-        start = self._turned
-        for _ in range(math.ceil(turns * math.tau / self._settings.look_turn)):
-            yield from self._wait(self._settings.still)
+    def _look_around(self, turns: int) -> Behaviour:
+        s, start = self._settings, self._turned
+        for _ in range(math.ceil(turns * math.tau / s.look_turn)):
+            yield from self._helm.stand(s.still)
             whole = (self._turned - start) / math.tau
             if self._look() or whole >= (turns if self._hint is None else 1):
                 return
             again, self._look_again = self._look_again, None
-            if again is None:
-                yield from self._turn(self._settings.look_turn)
-            else:
-                yield from self._turn(wrap_angle(again.heading - self._odom_from_robot.heading))
+            turn = s.look_turn
+            if again is not None:
+                turn = wrap_angle(again.heading - self.odom_from_robot.heading)
+            yield from self._helm.turn(turn, s.turn_rate)
 
-    def _wait_to_be_carried(self) -> Generator[Command, None, None]:
+    def _wait_to_be_carried(self) -> Behaviour:
         while not self._look():
             if self._views >= self._settings.carried_looks:
                 self.lost, self.detail = True, self._verdict(f"in {self._views} images")
                 break
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
-            yield from self._wait(self._settings.carried_pause)
+            yield from self._helm.stand(self._settings.carried_pause)
         while True:
             yield Command()
 
     def _move(self) -> Generator[Command, None, bool]:
         """Drive a little to look from elsewhere; returns whether there was room."""
         s = self._settings
-        ways = [
-            (min(room(self._description, self._now.proximity, bearing, 0.0), s.move), bearing)
-            for bearing in self._description.ranger_bearings
-        ]
-        way, direction = max(ways, key=lambda one: one[0], default=(0.0, 0.0))
+        way, direction = self._helm.freest(s.move)
         if self._hint is not None:
             _, odom_from_node = self._hint
-            node = self._odom_from_robot.inverse() @ odom_from_node
+            node = self.odom_from_robot.inverse() @ odom_from_node
             toward = math.atan2(node.y, node.x)
-            near = min(room(self._description, self._now.proximity, toward, 0.0), math.hypot(node.x, node.y))
+            near = min(self._helm.room(toward), math.hypot(node.x, node.y))
             if near >= s.least_move:
                 way, direction = min(near, s.move), toward
         if way < s.least_move:
             return False
         self.detail = "moving on to look from elsewhere"
-        yield from self._turn(math.remainder(direction, math.tau))
-        start = self._odom_from_robot
-        for _ in range(math.ceil(2.0 * way / s.speed / self._description.tick)):
-            left = way - start.distance(self._odom_from_robot)
-            if left < 0.02 or room(self._description, self._now.proximity, 0.0, 0.0) < 0.02:
-                break
-            yield Command(s.speed, 0.0)
+        yield from self._helm.turn(math.remainder(direction, math.tau), s.turn_rate)
+        yield from self._helm.drive_on(way, s.speed)
         return True
 
     # Small things
 
     def _look(self) -> bool:
         """Try to recognise the current image; sets `found`."""
-        s, image = self._settings, self._now.image
+        s, image = self._settings, self._helm.observation.image
         self._looks += 1
         if image is None:
             self.detail = "no image from the camera"
@@ -240,20 +229,19 @@ class Resumption:
             return False
         node, recognition = recalled[0]
         if self._hint is None or recognition.inliers > self._hint[0]:
-            odom_from_node = self._odom_from_robot @ recognition.node_from_robot.mean.inverse()
+            odom_from_node = self.odom_from_robot @ recognition.node_from_robot.mean.inverse()
             self._hint = recognition.inliers, odom_from_node
-        here = node.map_from_robot.mean @ recognition.node_from_robot.mean
-        for other, also in recalled[1:]:
-            there = other.map_from_robot.mean @ also.node_from_robot.mean
-            if also.inliers >= s.rival * recognition.inliers and here.distance(there) > s.apart:
-                self.detail = f"nodes {node.id} and {other.id} look the same"
-                return False
+        alike = lookalikes(recalled, s.rival, s.apart)
+        if alike is not None:
+            self.detail = f"nodes {alike[0].id} and {alike[1].id} look the same"
+            return False
         exact = exact_enough(recognition.node_from_robot, s.sure)
         if not exact_enough(recognition.node_from_robot, s.sure, s.vague):
             self.detail = f"node {node.id} is in view, but too far off"
             return False
         self.detail = f"node {node.id}: {recognition.inliers} landmarks agree; another view must, too"
-        sighting = Sighting(here, self._odom_from_robot, self._way, self._turned, exact)
+        here = node.map_from_robot.mean @ recognition.node_from_robot.mean
+        sighting = Sighting(here, self.odom_from_robot, self._way, self._turned, exact)
         agreeing = [earlier for earlier in self._sightings if agree(earlier, sighting, s.agreement)]
         self._sightings.append(sighting)
         if exact and agreeing:
@@ -266,21 +254,3 @@ class Resumption:
         """Why it is lost, in words."""
         what = "no two views agreed" if self._sightings else "nothing was recognised"
         return f"cannot find itself on its own map of {len(self._map.nodes)} nodes: {what} {where}"
-
-    def _wait(self, seconds: float) -> Generator[Command, None, None]:
-        for _ in range(max(1, round(seconds / self._description.tick))):
-            yield Command()
-
-    def _turn(self, angle: float) -> Generator[Command, None, None]:
-        """Turn by the wheels; a robot that cannot turn gives up after three times the time it takes."""
-        turned, rate = 0.0, math.copysign(self._settings.turn_rate, angle)
-        for _ in range(math.ceil(3.0 * abs(angle / rate) / self._description.tick) + 1):
-            if abs(turned) >= abs(angle):
-                break
-            yield Command(0.0, rate)
-            turned += self._now.odometry.turn
-
-    @property
-    def _now(self) -> Observation:
-        assert self._observation is not None
-        return self._observation

@@ -13,7 +13,7 @@ from agent.helm import NO_ANSWER, Behaviour, Helm
 from agent.localizer import Localizer, LocalizerSettings
 from agent.mission import Answer, WhereAmI
 from agent.observation import Command, RobotDescription
-from agent.recall import exact_enough, recall_all
+from agent.recall import exact_enough, lookalikes, recall_all
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
@@ -192,17 +192,11 @@ class Search:
 
     def _known(self, recalled: list[tuple[Node, Recognition]]) -> tuple[Node, Recognition] | None:
         """The own node that is seen best, unless another one, elsewhere, is seen about as well."""
-        s = self._settings
-        if not recalled:
+        alike = lookalikes(recalled, self._settings.rival, self._settings.apart)
+        if alike is not None:
+            self._ambiguous = f"nodes {alike[0].id} and {alike[1].id} look the same"
             return None
-        node, best = recalled[0]
-        here = node.map_from_robot.mean @ best.node_from_robot.mean
-        for other, also in recalled[1:]:
-            there = other.map_from_robot.mean @ also.node_from_robot.mean
-            if also.inliers >= s.rival * best.inliers and here.distance(there) > s.apart:
-                self._ambiguous = f"nodes {node.id} and {other.id} look the same"
-                return None
-        return node, best
+        return next(iter(recalled), None)
 
     def _exact(self, posture: PoseGaussian, leniency: float) -> bool:
         """Whether a recognition is exact enough to drive by; else another look, elsewhere, costs little."""

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from agent.homing.guesses import Guesses
 from agent.homing.trail import TrailSettings
+from agent.node_tracks import NodeTracks
 from agent.observation import Observation, RobotDescription
-from agent.strikes import Strikes
 from agent.vision.lens import Lens
 from agent.vision.sift import Features
-from agent.vision.tracker import Tracker, TrackerSettings
+from agent.vision.tracker import TrackerSettings
 from hybridmap.bearing_recognition import BearingRecognition
 from hybridmap.node import Landmarks, Node
 from hybridmap.pose import Array, PoseGaussian
@@ -69,15 +69,11 @@ class BearingLocalizer:
         self._settings = s = settings or BearingLocalizerSettings()
         self._node = node
         self._camera = description.camera
-        self._tracker = Tracker(lens, s.tracker)
-        self._tracker.track(image)
-        landmarks, seen = recognition.pairs[:, 0].astype(np.int64), recognition.pairs[:, 1]
-        self._tracker.add(landmarks, features.raw[seen])
-        self._strikes = Strikes(s.strikes)
+        self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, s.strikes)
         pixels = node.landmarks.pixels
         fixes = list(recognition.fixes)
         self._guesses = Guesses(description, node.camera, pixels, fixes, prior, s.trail)
-        self._guesses.see(landmarks, features.pixels[seen])
+        self._guesses.see(self._tracks.ids, features.pixels[recognition.pairs[:, 1]])
 
     @property
     def node(self) -> Node:
@@ -106,17 +102,17 @@ class BearingLocalizer:
     @property
     def visible(self) -> NDArray[np.int64]:
         """Indices of the node's landmarks that are tracked now."""
-        return self._tracker.ids
+        return self._tracks.ids
 
     @property
     def pixels(self) -> Array:
         """(N, 2) px, where they are seen."""
-        return self._tracker.pixels
+        return self._tracks.pixels
 
     @property
     def in_sight(self) -> bool:
         """Whether enough landmarks are tracked."""
-        return len(self._tracker.ids) >= self._settings.least
+        return len(self._tracks.ids) >= self._settings.least
 
     def renew(self, features: Features, recognition: BearingRecognition) -> None:
         """Track from where a fresh look finds the landmarks in the last image; the way so far still counts.
@@ -125,30 +121,26 @@ class BearingLocalizer:
             features: of the last image that `step` was given.
             recognition: of the node in them.
         """
-        self._tracker.clear()
-        landmarks, seen = recognition.pairs[:, 0].astype(np.int64), recognition.pairs[:, 1]
-        self._tracker.add(landmarks, features.raw[seen])
-        self._strikes.forget()
+        self._tracks.renew(features, recognition.pairs)
 
     def step(self, observation: Observation) -> None:
         """One tick: move by the wheels, follow the landmarks, join what they show to the trail."""
         self._guesses.move(observation.odometry)
         if observation.image is None:
             return
-        self._tracker.track(observation.image, self._expected())
-        ids = self._tracker.ids
+        self._tracks.follow(observation.image, self._expected())
+        ids = self._tracks.ids
         if len(ids):
-            self._guesses.see(ids, self._tracker.pixels)
+            self._guesses.see(ids, self._tracks.pixels)
             misses = self._guesses.trail.misses()[ids]
-            refused = self._strikes.judge(ids, ~(misses > self._settings.most_miss))
+            refused = self._tracks.judge(~(misses > self._settings.most_miss))
             if len(refused):
                 self._guesses.forget(refused)
-                self._tracker.keep(~np.isin(ids, refused))
 
     def _expected(self) -> Array:
         """(N, 2) px where the tracks should be now, in the tracks' order."""
         trail = self._guesses.trail
-        points = trail.points()[self._tracker.ids]
+        points = trail.points()[self._tracks.ids]
         expected = self._camera.project(trail.pose.mean.inverse().apply(points))
         expected[~self._camera.contains(expected)] = np.nan
         return expected

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import skimage.data
 
+from agent.mapper import Mapper
 from agent.observation import Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
+from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
@@ -57,11 +59,30 @@ class PhotoWalls:
         forward = float(np.hypot(moved.x, moved.y)) * (1.0 if moved.x >= 0 else -1.0)
         return Observation(tick * 100_000_000, Odometry(forward, moved.heading), self.render(now))
 
+    def mapped(self, mapper: Mapper, reach: float = 0.6) -> Node:
+        """The view from the origin, mapped by driving `reach` m forth and back."""
+        before, there = Pose2(), np.arange(0.0, reach, 0.025)
+        for tick, x in enumerate([*there, *there[::-1]], 1):
+            observation = self.observe(before, Pose2(x), tick)
+            mapper.step(observation)
+            if not mapper.started:
+                mapper.begin(observation)
+            before = Pose2(x)
+        mapper.finish(observation)
+        (node,) = mapper.map.nodes.values()
+        return node
+
 
 @pytest.fixture(scope="session")
 def walls() -> PhotoWalls:
     """The world."""
     return PhotoWalls()
+
+
+@pytest.fixture(scope="session")
+def node(walls) -> Node:
+    """The view from its origin."""
+    return walls.mapped(Mapper(MapId("r0", 1), DESCRIPTION))
 
 
 @pytest.fixture

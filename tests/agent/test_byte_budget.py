@@ -9,7 +9,6 @@ from agent.mapper import Mapper, MapperSettings
 from hybridmap.change import Change, NodePut
 from hybridmap.errors import InvalidValue, SettingsError
 from hybridmap.node import MapId, Node
-from hybridmap.pose import Pose2
 from wire.codec import decode_body, encode_body, encode_change
 from wire.tables import build
 
@@ -21,16 +20,7 @@ def mapped(walls, description, most_bytes: int) -> Node:
     """A node of the walls, made under a budget as a settings file gives it."""
     table = {"cartographer": {"selection": {"most_bytes": most_bytes}}}
     mapper = Mapper(MapId("r0", 1), description, build(MapperSettings, table, "robot.toml"))
-    there, before = np.arange(0.0, 0.4, 0.025), Pose2()
-    for tick, x in enumerate([*there, *there[::-1]], 1):
-        observation = walls.observe(before, Pose2(x), tick)
-        mapper.step(observation)
-        if not mapper.started:
-            mapper.begin(observation)
-        before = Pose2(x)
-    mapper.finish(observation)
-    (node,) = mapper.map.nodes.values()
-    return node
+    return walls.mapped(mapper, reach=0.4)
 
 
 def cost(node: Node) -> int:

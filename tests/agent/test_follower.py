@@ -11,14 +11,13 @@ from agent.follower import Follower, Progress
 from agent.follower_settings import FollowerSettings
 from agent.headway import Headway
 from agent.lookout import Expected, Lookout, LookoutSettings
-from agent.mapper import Mapper
 from agent.node_servo import NodeServo
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.servo.step import ServoStep
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.camera import Camera
-from hybridmap.node import MapId, Node
+from hybridmap.node import Node
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteLeg
 from hybridmap.recognition import recognise
@@ -28,23 +27,6 @@ HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 ROBOT = RobotDescription(camera=CAMERA)
-
-
-@pytest.fixture(scope="module")
-def node(walls) -> Node:
-    """The view from the origin, mapped by driving back and forth."""
-    mapper = Mapper(MapId("r0", 1), ROBOT)
-    there = np.arange(0.0, 0.6, 0.025)
-    before = Pose2()
-    for tick, x in enumerate([*there, *there[::-1]]):
-        observation = walls.observe(before, Pose2(x), tick)
-        mapper.step(observation)
-        if not mapper.started:
-            mapper.begin(observation)
-        before = Pose2(x)
-    mapper.finish(observation)
-    (made,) = mapper.map.nodes.values()
-    return made
 
 
 class Deluded:

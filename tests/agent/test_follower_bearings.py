@@ -10,12 +10,11 @@ from agent.fix import Fix
 from agent.follower import Follower, FollowerSettings, Progress
 from agent.homing.localizer import BearingLocalizer
 from agent.lookout import Expected, Lookout, LookoutSettings
-from agent.mapper import Mapper
 from agent.observation import Observation, Odometry, RobotDescription
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.camera import Camera
-from hybridmap.node import Landmarks, MapId, Node
+from hybridmap.node import Landmarks, Node
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteLeg
 
@@ -25,27 +24,11 @@ ROBOT = RobotDescription(camera=CAMERA)
 
 
 @pytest.fixture(scope="module")
-def mapped(walls) -> Node:
-    """The view from the origin, mapped by driving back and forth."""
-    mapper, before = Mapper(MapId("r0", 1), ROBOT), Pose2()
-    there = np.arange(0.0, 0.6, 0.025)
-    for tick, x in enumerate([*there, *there[::-1]]):
-        observation = walls.observe(before, Pose2(x), tick)
-        mapper.step(observation)
-        if not mapper.started:
-            mapper.begin(observation)
-        before = Pose2(x)
-    mapper.finish(observation)
-    (made,) = mapper.map.nodes.values()
-    return made
-
-
-@pytest.fixture(scope="module")
-def bare(mapped) -> Node:
-    """The same without a single depth."""
-    known = mapped.landmarks
+def bare(node) -> Node:
+    """The view from the origin without a single depth."""
+    known = node.landmarks
     nothing = np.full(len(known), np.nan, np.float32)
-    return replace(mapped, landmarks=Landmarks(known.pixels, known.codes, nothing, nothing))
+    return replace(node, landmarks=Landmarks(known.pixels, known.codes, nothing, nothing))
 
 
 def lookout() -> Lookout:
@@ -142,11 +125,11 @@ def test_a_blind_image_shows_no_node(bare):
     assert lookout().find(dark, [Expected(0, bare, Pose2())]) is None
 
 
-def test_depths_that_say_nothing_are_no_depths(walls, mapped):
+def test_depths_that_say_nothing_are_no_depths(walls, node):
     """Sigmas as large as the depths: recognition by depth would refuse it, bearings do not."""
-    known = mapped.landmarks
+    known = node.landmarks
     vague = replace(known, depth_sigmas=known.depths.copy())
     pose = Pose2(-0.5, 0.2, -0.1)
-    found = lookout().find(walls.render(pose), [Expected(0, replace(mapped, landmarks=vague), pose)])
+    found = lookout().find(walls.render(pose), [Expected(0, replace(node, landmarks=vague), pose)])
     assert found is not None
     assert isinstance(found[1], BearingLocalizer)

@@ -1,9 +1,11 @@
-"""Asking: a busy server is asked again when it said, and a robot's patience has an end."""
+"""Asking: a busy server is asked again when it said, and a robot's patience has an end. And moving."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from agent.helm import NO_ANSWER, Helm
@@ -62,3 +64,35 @@ def test_another_refusal_is_final_and_silence_is_waited_for() -> None:
     assert (answer.error, len(asked)) == ("no such node", 1)
     answer, asked = ask(lambda *_: None, patience=7)
     assert (answer.error, len(asked)) == (NO_ANSWER, 1)
+
+
+BEARINGS = tuple(np.linspace(-math.pi, math.pi, 8, endpoint=False).tolist())
+
+
+@pytest.mark.parametrize(
+    ("readings", "most", "freest"),
+    [
+        ([1, 1, 1, 1, 1, 2, 3, 2], math.inf, 6),
+        ([1, 1, 1, 1, 1, 2, 3, 2], 0.5, 0),
+        ([0.3, 0.3, 2, 2, 2, 2.5, 3, 2], 0.5, 2),
+    ],
+)
+def test_it_goes_where_there_is_most_room_or_enough(readings, most, freest) -> None:
+    helm = Helm(RobotDescription(BODY.camera, ranger_bearings=BEARINGS, ranger_reach=3.0))
+    helm.take_in(Observation(0, Odometry(0.0, 0.0), None, np.array(readings, dtype=float)), ())
+    way, direction = helm.freest(most)
+    assert direction == BEARINGS[freest]
+    assert way == min(helm.room(direction), most)
+    assert all(min(helm.room(bearing), most) <= way for bearing in BEARINGS)
+
+
+def test_without_rangers_there_is_no_room() -> None:
+    helm = Helm(BODY)
+    helm.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
+    assert helm.freest() == (0.0, 0.0)
+
+
+def test_a_robot_that_cannot_turn_gives_up() -> None:
+    helm = Helm(BODY)
+    helm.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
+    assert len(list(helm.turn(0.6, 0.6))) <= 32

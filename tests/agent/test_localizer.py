@@ -10,34 +10,13 @@ import numpy as np
 import pytest
 
 from agent.localizer import Localizer
-from agent.mapper import Mapper
-from agent.observation import Observation, Odometry, RobotDescription
+from agent.observation import Observation, Odometry
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
-from hybridmap.camera import Camera
-from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
 from hybridmap.recognition import recognise
 
-CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 CENTIMETRES_3, DEGREE = 0.03, math.radians(1.0)
-
-
-@pytest.fixture(scope="module")
-def node(walls) -> Node:
-    """The view from the origin, mapped by driving back and forth."""
-    mapper = Mapper(MapId("r0", 1), RobotDescription(camera=CAMERA))
-    there = np.arange(0.0, 0.6, 0.025)
-    before = Pose2()
-    for tick, x in enumerate([*there, *there[::-1]]):
-        observation = walls.observe(before, Pose2(x), tick)
-        mapper.step(observation)
-        if not mapper.started:
-            mapper.begin(observation)
-        before = Pose2(x)
-    mapper.finish(observation)
-    (made,) = mapper.map.nodes.values()
-    return made
 
 
 def located(walls, description, node, world_from_robot, seed=0) -> Localizer:

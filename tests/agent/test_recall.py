@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agent.recall import RecallSettings, recall
+from agent.recall import RecallSettings, lookalikes, recall, recall_all
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Landmarks, MapId, NodeId
@@ -105,3 +105,29 @@ def test_the_same_chance_gives_the_same_answer(world, own_map):
     assert one[0].id == two[0].id
     assert np.array_equal(one[1].pairs, two[1].pairs)
     assert one[1].node_from_robot.mean == two[1].node_from_robot.mean
+
+
+def test_two_places_that_look_alike_are_told_and_neighbours_are_not(world, own_map):
+    """One node knows two landmarks of three, the other, a little aside or in another room, the third."""
+    view, _ = take_view(world, Pose2(2.5, 2.0), np.random.default_rng(0))
+    whole = next(iter(own_map.nodes.values()))
+    third = np.arange(len(whole.landmarks)) % 3 == 0
+    node, rest = replace(whole, landmarks=whole.landmarks.take(~third)), whole.landmarks.take(third)
+
+    def recalled(aside: float):
+        posture = replace(node.map_from_robot, mean=node.map_from_robot.mean @ Pose2(0.0, aside))
+        other = replace(node, id=node.id._replace(number=99), map_from_robot=posture, landmarks=rest)
+        found = recall_all(HybridMap([NodePut(node), NodePut(other)]), view, np.random.default_rng(0))
+        assert [one.id.number for one, _ in found] == [node.id.number, 99]
+        return found
+
+    far, near = recalled(3.0), recalled(0.2)
+    share = far[1][1].inliers / far[0][1].inliers
+    assert 0.3 < share < 0.7
+    told = lookalikes(far, 0.9 * share, 0.5)
+    assert told is not None
+    assert [one.id.number for one in told] == [node.id.number, 99]
+    assert lookalikes(far, 1.1 * share, 0.5) is None, "it is not seen about as well"
+    assert lookalikes(near, 0.9 * share, 0.5) is None, "it is not elsewhere"
+    assert lookalikes(far[:1], 0.1, 0.5) is None
+    assert lookalikes([], 0.1, 0.5) is None
