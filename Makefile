@@ -20,8 +20,10 @@ $(STAMP): pyproject.toml constraints.txt
 demo: setup
 	$(BIN)/mapweave demo
 
+# One worker a core, four at the most: each takes up to 1 GB. `make test WORKERS=0` is one process.
+WORKERS ?= auto
 test: setup
-	$(BIN)/python -m pytest -m "not slow and not scenario"
+	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
 
 slow: setup
 	$(BIN)/python -m pytest -m slow
@@ -37,7 +39,7 @@ check: setup
 	$(BIN)/lint-imports
 
 bench: setup
-	@for b in $(wildcard benchmarks/[a-z]*.py); do \
+	@for b in $$(grep -l '^if __name__ == "__main__"' benchmarks/*.py); do \
 	  echo "== $$(basename $$b .py)"; $(BIN)/python -m benchmarks.$$(basename $$b .py); done
 
 clean:
