@@ -8,7 +8,11 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
+import pytest
 from hypothesis import settings
+
+# What these modules assert is told in full, as in tests.
+pytest.register_assert_rewrite("tests.waiting", "tests.mapweave.command_line", "tests.sim.measured_world")
 
 # How long an example takes says nothing on a machine that does other things as well.
 settings.register_profile("patient", deadline=None)

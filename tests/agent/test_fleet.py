@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import msgpack
 import numpy as np
@@ -33,6 +33,7 @@ from hybridmap.errors import InvalidMessage
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, View
+from tests.waiting import eventually
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
 from wire.messages import (
@@ -143,13 +144,6 @@ def test_whatever_was_said_can_be_told(text: str, times: int) -> None:
 
 
 # The link
-
-
-def eventually(condition: Callable[[], object], seconds: float = 5.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.003)
 
 
 @pytest.fixture
@@ -313,14 +307,14 @@ def test_a_robot_never_waits(link: FleetLink, other: MemoryBus) -> None:
     release = threading.Event()
 
     def slow(request) -> None:
-        release.wait(5)
+        release.wait(60)
         request.reply(encode_route_answer(RouteAnswer((), "at last")))
 
     other.serve(KEYS.route("s0"), slow)
     begin = time.monotonic()
     link.ask(WhichWay(1, HERE, THERE))
     assert link.answers() == ()
-    assert time.monotonic() - begin < 0.2
+    assert time.monotonic() - begin < 20
     release.set()
     got: list[Answer] = []
     eventually(lambda: got.extend(link.answers()) or got)
@@ -329,12 +323,12 @@ def test_a_robot_never_waits(link: FleetLink, other: MemoryBus) -> None:
 
 def test_waiting_ends_when_the_time_is_over(link: FleetLink, other: MemoryBus) -> None:
     release = threading.Event()
-    other.serve(KEYS.route("s0"), lambda request: release.wait(5))
+    other.serve(KEYS.route("s0"), lambda request: release.wait(60))
     begin = time.monotonic()
     for number in (1, 2):
         link.ask(WhichWay(number, HERE, THERE))
     answers = link.answers(wait=True)
-    assert time.monotonic() - begin < 4.0
+    assert time.monotonic() - begin < 20
     assert [(a.number, a.content) for a in answers] == [(1, None), (2, None)]
     release.set()
 

@@ -8,70 +8,15 @@ import numpy as np
 import pytest
 
 from agent.agreement import AgreementSettings
-from agent.explorer import Explorer
 from agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
-from agent.observation import Command, Observation, Odometry, RobotDescription
+from agent.observation import Command, Observation, Odometry
 from agent.pipeline import Pipeline, PipelineSettings, Step
 from agent.resumption import ResumptionSettings
-from hybridmap.camera import Camera
 from hybridmap.change import NodePut
-from hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from hybridmap.node import Edge, EdgeKind, NodeId
 from hybridmap.pose import Pose2
+from tests.agent.ranged_body import BEARINGS, BODY, MAP, ROOM, essence, live, on, rangers, still
 from wire.codec import encode_body
-
-MAP = MapId("r0", 1)
-BEARINGS = tuple(np.linspace(-math.pi, math.pi, 24, endpoint=False).tolist())
-ROOM = (-1.2, 1.8, -1.5, 1.5)
-"""x0, x1, y0, y1 m: invisible walls that only rangers see, before the pictures."""
-
-
-BODY = RobotDescription(
-    Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3), ranger_bearings=BEARINGS, ranger_reach=3.0
-)
-"""The robot of the photographs, with rangers."""
-
-
-def rangers(pose: Pose2) -> np.ndarray:
-    """(K,) m, free way in the room."""
-    angle = pose.heading + np.array(BEARINGS)
-    c, s = np.cos(angle), np.sin(angle)
-    with np.errstate(divide="ignore"):
-        x = np.where(c > 0, (ROOM[1] - pose.x) / c, (ROOM[0] - pose.x) / c)
-        y = np.where(s > 0, (ROOM[3] - pose.y) / s, (ROOM[2] - pose.y) / s)
-    return np.clip(np.minimum(np.abs(x), np.abs(y)) - BODY.radius, 0.0, BODY.ranger_reach)
-
-
-def live(walls, pipeline: Pipeline, ticks: int) -> tuple[list[Observation], list[Step], list[Pose2]]:
-    """Let a pipeline drive a body that does exactly what it is told."""
-    pose, moved = Pose2(), Odometry(0.0, 0.0)
-    observations, steps, poses = [], [], []
-    for tick in range(ticks):
-        observation = Observation(tick * 100_000_000, moved, walls.render(pose), rangers(pose))
-        step = pipeline.step(observation)
-        moved = Odometry(step.command.forward * BODY.tick, step.command.turn * BODY.tick)
-        pose = pose @ moved.motion()
-        observations.append(observation)
-        steps.append(step)
-        poses.append(pose)
-    return observations, steps, poses
-
-
-def on(mission, settings=None, body=BODY) -> Pipeline:
-    """A pipeline with something to do."""
-    pipeline = Pipeline(MAP, body, settings)
-    pipeline.set_mission(mission)
-    return pipeline
-
-
-def essence(step: Step) -> tuple[object, ...]:
-    """All of a step, to the last bit."""
-    return (step.command, [encode_body(change) for change in step.changes], step.questions, step.status)
-
-
-def still(walls, pose=None, tick=0, **other) -> Observation:
-    """What a robot senses that has not moved."""
-    return Observation(tick * 100_000_000, Odometry(0.0, 0.0), walls.render(pose or Pose2()), **other)
-
 
 # The same again
 
@@ -187,57 +132,6 @@ def test_until_there_is_a_node_it_says_why_there_is_none(walls):
     assert said[-1] >= 1
 
 
-# Safety
-
-
-@pytest.fixture
-def reckless(monkeypatch):
-    """An explorer that wants something whatever is in the way."""
-
-    def want(command: Command) -> Pipeline:
-        monkeypatch.setattr(Explorer, "step", lambda self, *seen: (command, [], []))
-        return on(Explore())
-
-    return want
-
-
-def near(bearing: float, distance: float) -> np.ndarray:
-    """Readings of the rangers with one thing in the way."""
-    readings = np.full(len(BEARINGS), BODY.ranger_reach)
-    off = np.abs(np.angle(np.exp(1j * (np.array(BEARINGS) - bearing))))
-    readings[off < 0.3] = distance
-    return readings
-
-
-def test_no_command_drives_into_what_is_seen(walls, reckless):
-    pipeline = reckless(Command(0.3, 0.2))
-    step = pipeline.step(still(walls, proximity=near(0.0, 0.02)))
-    assert step.command == Command(0.0, 0.2), "it may still turn"
-    assert "stopped: an obstacle is ahead" in step.status.detail
-    assert "no nodes yet" in step.status.detail
-    step = pipeline.step(still(walls, tick=1, proximity=near(0.0, 0.12)))
-    assert 0 <= step.command.forward < 0.3
-    for free in (near(math.pi, 0.02), near(0.0, 2.0)):
-        step = pipeline.step(still(walls, tick=2, proximity=free))
-        assert step.command == Command(0.3, 0.2)
-        assert "obstacle" not in step.status.detail
-
-
-def test_nor_backward(walls, reckless):
-    pipeline = reckless(Command(-0.3, 0.0))
-    assert pipeline.step(still(walls, proximity=near(math.pi, 0.02))).command == Command()
-    assert pipeline.step(still(walls, tick=1, proximity=near(0.0, 0.02))).command == Command(-0.3, 0.0)
-
-
-@pytest.mark.parametrize("speed", [0.3, -0.3])
-def test_a_reckless_drive_ends_before_the_wall(walls, reckless, speed):
-    _, _, poses = live(walls, reckless(Command(speed, 0.05)), 150)
-    x, y = np.array([[p.x, p.y] for p in poses]).T
-    gap = np.min([x - ROOM[0], ROOM[1] - x, y - ROOM[2], ROOM[3] - y])
-    assert gap > BODY.radius
-    assert math.hypot(x[-1], y[-1]) > 0.5
-
-
 # Missions
 
 
@@ -340,17 +234,6 @@ def test_seeds_choose_the_side():
             step = pipeline.step(Observation(tick, Odometry(0.0, 0.0), grey, np.full(len(BEARINGS), 3.0)))
         turns.add(math.copysign(1.0, step.command.turn))
     assert turns == {1.0, -1.0}
-
-
-# Bumps, and missions that exclude each other
-
-
-def test_a_robot_that_is_stuck_at_something_its_rangers_miss_stops(walls, reckless):
-    pipeline = reckless(Command(0.3, 0.0))
-    for tick in range(3):
-        step = pipeline.step(still(walls, tick=tick, proximity=near(0.0, 3.0), bumped=True))
-    assert step.command.forward <= 0.0
-    assert "bump" in step.status.detail
 
 
 def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list[Step]]:

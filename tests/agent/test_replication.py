@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +15,7 @@ from agent.replication import ReplicationSettings, Replicator
 from hybridmap.change import ChangeBody, NodeRetired
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import MapId, NodeId
+from tests.waiting import eventually
 from wire.bus import Sample
 from wire.codec import decode_change
 from wire.keys import Keys
@@ -24,13 +25,6 @@ from wire.memory import MemoryBus, MemoryHub
 KEYS = Keys("fleet")
 MAP = MapId("r0", 1)
 QUICK = ReplicationSettings(beacon_interval=0.03, answer_bytes=2000, retry_interval=0.05)
-
-
-def eventually(condition: Callable[[], object], seconds: float = 5.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.003)
 
 
 def bodies(first: int, last: int) -> list[ChangeBody]:
@@ -129,18 +123,18 @@ def test_submitting_never_waits_for_the_disk(agent: Agent, monkeypatch: pytest.M
     write = agent.journal.write
 
     def slow(map_id: MapId, drafts: list[Draft]) -> int:
-        release.wait(5)
+        release.wait(60)
         return write(map_id, drafts)
 
     monkeypatch.setattr(agent.journal, "write", slow)
     begin = time.monotonic()
     for k in range(1, 51):
         agent.replicator.submit(bodies(k, k), 0)
-    assert time.monotonic() - begin < 0.2
+    assert time.monotonic() - begin < 20
     assert not agent.replicator.flush(0.05)
     assert agent.replicator.status().waiting == 50
     release.set()
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     assert agent.replicator.status().waiting == 0
     assert agent.journal.head(MAP) == 50
 

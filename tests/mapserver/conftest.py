@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,9 @@ from hybridmap.query import View
 from hybridmap.synthetic import World, room, take_map, take_view
 from mapserver.entry import Entry
 from mapserver.store import Store
+from tests.mapserver.played import HandAgent, Server
 from wire.codec import encode_change
+from wire.memory import MemoryHub
 
 ROBOT = MapId("r0", 1)
 
@@ -63,3 +65,25 @@ def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Mapped
         return MappedRoom(path, world, truth)
 
     return make
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    """The network."""
+    return MemoryHub()
+
+
+@pytest.fixture
+def server(hub: MemoryHub, tmp_path: Path) -> Iterator[Server]:
+    """An ingest, s0."""
+    server = Server(hub, tmp_path / "s0.sqlite")
+    yield server
+    server.end()
+
+
+@pytest.fixture
+def agent(hub: MemoryHub) -> Iterator[HandAgent]:
+    """Who speaks to it."""
+    agent = HandAgent(hub)
+    yield agent
+    agent.bus.close()

@@ -122,7 +122,7 @@ def test_the_store_becomes_the_journals(
     # The faults go on: only the cut is mended, so that there is a way at all.
     hub.restore(server.bus)
     for robot in robots:
-        assert robot.replicator.wait_acknowledged(20), "never complete"
+        assert robot.replicator.wait_acknowledged(60), "never complete"
     hub.calm()
     server.stop()
     server.start()

@@ -59,10 +59,10 @@ replicator = Replicator(bus, Keys(), journal, map_id, ("s0",))
 for number in range(journal.head(map_id) + 1, int(total) + 1):
     replicator.submit([NodeRetired(NodeId(*map_id, number))], number)
     if number % 5 == 0:
-        assert replicator.flush(5)
+        assert replicator.flush(30)
         print(number, flush=True)
     time.sleep(0.005)
-assert replicator.wait_acknowledged(20), replicator.status()
+assert replicator.wait_acknowledged(60), replicator.status()
 print("acknowledged", flush=True)
 replicator.close()
 bus.close()
@@ -97,7 +97,7 @@ class Life:
         self.process.communicate()
 
     def finish(self) -> None:
-        self.process.communicate(timeout=30)
+        self.process.communicate(timeout=120)
         assert self.process.returncode == 0
 
 

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import json
-import signal
-import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from mapweave.cli import main, parser
-from wire.mapfile import MapFile, write_map_file
+from tests.mapweave.command_line import complaint
 
-CAMERA = "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
+pytestmark = pytest.mark.usefixtures("signals", "simulator")
+
 COMMANDS = [
     "demo",
     "server",
@@ -40,54 +34,6 @@ COMMANDS = [
     "eval",
     "eval relocalize",
 ]
-
-
-@pytest.fixture(autouse=True)
-def signals() -> Iterator[None]:
-    """Commands take signals for themselves."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.fixture
-def port() -> Iterator[int]:
-    """A port that is taken."""
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        yield int(taken.getsockname()[1])
-
-
-@pytest.fixture
-def nobody() -> str:
-    """An endpoint where nobody listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-@pytest.fixture
-def recording(tmp_path: Path) -> Path:
-    """Three grey images without a robot that moves."""
-    folder = tmp_path / "walk"
-    (folder / "images").mkdir(parents=True)
-    for k in range(3):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), np.full((48, 64), 90, np.uint8))
-    (folder / "camera.toml").write_text(CAMERA)
-    (folder / "odometry.csv").write_text("forward_m,turn_rad\n" + "0,0\n" * 3)
-    return folder
-
-
-def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What a command that fails says: exactly one line."""
-    assert main([str(a) for a in arguments]) == 1
-    said = capfd.readouterr().err.splitlines()
-    assert len(said) == 1, said
-    assert said[0].startswith("mapweave: ")
-    assert len(said[0]) < 400
-    return said[0]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -119,83 +65,6 @@ def test_a_wrong_use_shows_how_to_use_it(arguments, capfd):
     assert "Traceback" not in err
 
 
-# Files
-
-
-def test_map_files(tmp_path, capfd):
-    path = tmp_path / "a.mapweave"
-    assert "cannot be read" in complaint(capfd, "map", "show", path)
-    assert "cannot be read" in complaint(capfd, "map", "show", tmp_path)
-    path.write_bytes(b"")
-    assert "is not a Mapweave map file" in complaint(capfd, "map", "show", path)
-    path.write_text("{}")
-    assert "is not a Mapweave map file" in complaint(capfd, "map", "show", path)
-    write_map_file(path, MapFile("agent", "r0.1", ()))
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-1])
-    assert "is truncated" in complaint(capfd, "map", "show", path)
-    path.write_bytes(whole[:20] + b"\0" + whole[21:])
-    assert "is damaged" in complaint(capfd, "map", "show", path)
-
-
-def test_settings(tmp_path, capfd, recording):
-    path = tmp_path / "robot.toml"
-    for command in (
-        ["agent", "r0"],
-        ["server"],
-        ["sim", "run", "office"],
-        ["sim", "serve", "office"],
-        ["replay", recording, "--offline"],
-    ):
-        assert "no such file" in complaint(capfd, *command, "--settings", path.with_name("none.toml"))
-        path.write_text("[netwrok]")
-        assert "did you mean 'network'?" in complaint(capfd, *command, "--settings", path)
-        path.write_text("[network")
-        assert "robot.toml" in complaint(capfd, *command, "--settings", path)
-
-
-def test_recordings(tmp_path, capfd, recording):
-    assert "no such folder" in complaint(capfd, "replay", tmp_path / "nothing")
-    assert "without it there is no robot 'a'" in complaint(capfd, "replay", recording, "--robot", "a")
-    (recording / "camera.toml").unlink()
-    assert "camera's intrinsics" in complaint(capfd, "replay", recording)
-
-
-def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
-    (recording / "images" / "1.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
-    arguments = ["replay", recording, "--offline", "--data", tmp_path / "data", "--epoch", 1]
-    assert main([str(a) for a in arguments]) == 1
-    said = capfd.readouterr().err.splitlines()
-    (line,) = [line for line in said if line.startswith("mapweave: ")]
-    assert "1.png: not an image that can be read" in line
-    assert said[-1] == line
-    assert not any("Traceback" in line for line in said)
-    assert (tmp_path / "data" / "walk.mapweave").exists(), "what was mapped before is kept"
-
-
-def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
-    taken = tmp_path / "taken"
-    taken.write_text("a file where a folder should be")
-    assert str(taken) in complaint(capfd, "replay", recording, "--offline", "--data", taken)
-    assert str(taken) in complaint(capfd, "server", "--listen", nobody, "--data", taken)
-    assert str(taken) in complaint(capfd, "demo", "--out", taken)
-    path = tmp_path / "a.mapweave"
-    write_map_file(path, MapFile("agent", "r0.1", one_node()))
-    assert str(taken) in complaint(capfd, "map", "show", path, "--out", taken / "a.png")
-
-
-def one_node():
-    """A map of one place."""
-    from hybridmap.camera import Camera
-    from hybridmap.change import NodePut
-    from hybridmap.node import Landmarks, Node, NodeId
-    from hybridmap.pose import Pose2, PoseGaussian
-
-    camera = Camera(64, 48, 60, 60, 32, 24, 0.3)
-    here = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
-    return (NodePut(Node(NodeId("r0", 1, 1), 0, here, camera, Landmarks.empty())),)
-
-
 # Names and numbers
 
 
@@ -210,19 +79,6 @@ def test_names_that_cannot_stand_in_a_key(name, capfd, recording, nobody, tmp_pa
         said = complaint(capfd, "server", "--listen", nobody, f"--name={name}", "--data", data)
         assert "use 1 to 32 of a-z" in said
         assert not data.exists(), "nothing is left behind"
-
-
-@pytest.mark.parametrize("endpoint", ["localhost", "tcp/localhost", "http/a:1", "tcp/:1", "tcp/a b:1"])
-def test_endpoints(endpoint, capfd, recording, tmp_path):
-    picture = recording / "images" / "0.png"
-    for command in (
-        ["agent", "r0"],
-        ["sim", "serve", "office"],
-        ["relocalize", picture],
-        ["replay", recording],
-    ):
-        assert "endpoint" in complaint(capfd, *command, "--connect", endpoint)
-    assert "endpoint" in complaint(capfd, "server", "--listen", endpoint, "--data", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -299,58 +155,6 @@ def test_an_epoch_out_of_range(capfd, recording, tmp_path):
         assert "epoch" in said
 
 
-# Network
-
-
-def test_a_port_that_is_taken(capfd, port, tmp_path):
-    said = complaint(capfd, "server", "--listen", f"tcp/127.0.0.1:{port}", "--data", tmp_path)
-    assert f"cannot listen at tcp/127.0.0.1:{port}: the port is taken" in said
-
-
-def test_a_port_for_people_that_is_taken(capfd, port, nobody, tmp_path):
-    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "a", "--http", port)
-    assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in said
-    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "b", "--http", "here")
-    assert "write a port, or HOST:PORT" in said
-    assert not (tmp_path / "b").exists()
-
-
-def test_an_address_of_another_machine(capfd, tmp_path):
-    said = complaint(capfd, "server", "--listen", "tcp/192.0.2.1:7447", "--data", tmp_path)
-    assert "cannot listen at tcp/192.0.2.1:7447" in said
-
-
-def test_asking_where_nobody_is(capfd, recording, nobody):
-    picture = recording / "images" / "0.png"
-    said = complaint(capfd, "relocalize", picture, "--connect", nobody, "--timeout", "0.3")
-    assert f"no router at {nobody}: start `mapweave server`" in said
-
-
-def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
-    rest = ["--connect", nobody, "--timeout", "0.1"]
-    lonely = tmp_path / "a.png"
-    lonely.write_bytes((recording / "images" / "0.png").read_bytes())
-    assert "give the intrinsics with --camera" in complaint(capfd, "relocalize", lonely, *rest)
-    camera = ["--camera", recording / "camera.toml"]
-    assert "no router" in complaint(capfd, "relocalize", lonely, *camera, *rest)
-    assert "no such file" in complaint(capfd, "relocalize", lonely, "--camera", tmp_path / "b.toml", *rest)
-    assert "not an image" in complaint(capfd, "relocalize", tmp_path / "b.png", *camera, *rest)
-    lonely.write_text("no image")
-    assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)
-    assert "not an image" in complaint(capfd, "relocalize", tmp_path, *camera, *rest)
-    cv2.imwrite(str(lonely), np.zeros((10, 20), np.uint8))
-    assert "is 20x10 px, but" in complaint(capfd, "relocalize", lonely, *camera, *rest)
-
-
-def test_a_recording_without_a_server_is_mapped_all_the_same(recording, tmp_path, capfd, nobody):
-    data = tmp_path / "data"
-    arguments = ["replay", recording, "--data", data, "--name", "r0", "--epoch", 1, "--offline"]
-    assert main([str(a) for a in arguments]) == 0
-    assert "0 nodes and 0 edges" in " ".join(capfd.readouterr().err.split())
-    assert main(["map", "show", str(data / "r0.mapweave"), "--json"]) == 0
-    assert json.loads(capfd.readouterr().out)["nodes"] == 0
-
-
 # As processes
 
 
@@ -367,35 +171,6 @@ def test_a_process_that_fails_says_one_line_and_ends(tmp_path):
         done.stderr
         == f"mapweave: {tmp_path / 'nothing.mapweave'}: cannot be read (No such file or directory)\n"
     )
-
-
-def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_path):
-    command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", nobody, "--data", str(tmp_path)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        watchdog = threading.Timer(40, process.kill)
-        watchdog.start()
-        eventually(lambda: (tmp_path / "r0.sqlite").exists())
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate()
-        watchdog.cancel()
-    assert "Traceback" not in said
-    assert len(said.splitlines()) <= 1
-    assert process.returncode in (0, 1, 130)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def simulator() -> None:
-    """PyBullet greets whoever loads it first; that is not what is tested."""
-    import sim.simulation  # noqa: F401
-
-
-def eventually(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    import time
-
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.05)
 
 
 def test_help_is_quick():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan, Rectangle
 from sim.world import Block, PanelSet, World
 from sim.worlds.office import make_office
+from tests.sim.stage import Stage
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +107,11 @@ def upright(pose: Pose2) -> tuple[Array, Array]:
 def stand():
     """`upright` for tests."""
     return upright
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    """A bridge, not yet started, that ends with the test."""
+    made = Stage()
+    yield made
+    made.end()

@@ -51,7 +51,7 @@ class Table:
     def end(self):
         self.stop.set()
         for thread in [self.thread, *self.threads]:
-            thread.join(5.0)
+            thread.join(30.0)
             assert not thread.is_alive()
         self.bridge.close()
         self.simulation.close()
@@ -71,33 +71,33 @@ def test_time_stands_still_until_it_is_asked_for_and_after(table):
     assert table.simulation.tick == 0
     assert table.events == []
     for tick in (3, 4, 9):
-        assert table.control.advance(tick, 5.0)
+        assert table.control.advance(tick, 30.0)
         assert table.simulation.tick == tick
         # Every robot has finished with the tick, the slow one too.
         assert {e for e in table.events if e[1] == tick} == {("r0", tick, "done"), ("r1", tick, "done")}
     time.sleep(0.15)
     assert table.simulation.tick == 9
-    assert table.control.advance(9, 5.0)
+    assert table.control.advance(9, 30.0)
 
 
 def test_whoever_loses_patience_may_ask_again(table):
     table.drive("r0")
     table.drive("r1", 0.05)
     assert not table.control.advance(8, 0.01)
-    assert table.control.advance(8, 5.0)
+    assert table.control.advance(8, 30.0)
     assert table.simulation.tick == 8
 
 
 def test_without_any_driver_time_passes_all_the_same(table):
     first = table.drive("r0")
     second = table.drive("r1")
-    assert table.control.advance(2, 5.0)
+    assert table.control.advance(2, 30.0)
     first.close()
     second.close()
     end = time.monotonic() + 5.0
     while any(robot.active for robot in table.control.status().robots.values()):
         assert time.monotonic() < end
-    assert table.control.advance(12, 5.0)
+    assert table.control.advance(12, 30.0)
     # They go on by what they wanted last for no tick: who is not driven stands still.
     assert table.control.truth_at("r0", [1_200_000_000])[0].x == pytest.approx(
         table.control.truth_at("r0", [900_000_000])[0].x, abs=1e-3
@@ -108,7 +108,7 @@ def test_who_meets_the_others_goes_on_when_they_have_finished_and_no_time_has_pa
     table.meet = {("r0", 2), ("r0", 4), ("r1", 4)}
     table.drive("r0")
     table.drive("r1", 0.03)
-    assert table.control.advance(6, 5.0)
+    assert table.control.advance(6, 30.0)
     for tick in (2, 4):
         mine = table.events.index(("r0", tick, "met"))
         assert table.events.index(("r1", tick, "done")) < mine

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,7 @@ from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.synthetic import random_vectors
+from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet
 
 # Examples run on machines that are busy with other things.
 settings.register_profile("mapweave", deadline=None)
@@ -164,3 +166,11 @@ def some() -> SimpleNamespace:
         cameras=cameras(), landmarks=landmarks, node=sample_node, edge=sample_edge, changes=sample_changes,
         map=MAP, camera=CAMERA,
     )  # fmt: skip
+
+
+@pytest.fixture(params=[MemoryFleet, ZenohFleet])
+def fleet(request: pytest.FixtureRequest) -> Iterator[Fleet]:
+    """Of either kind."""
+    fleet = request.param()
+    yield fleet
+    fleet.close()

@@ -3,123 +3,15 @@
 from __future__ import annotations
 
 import logging
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Protocol
 
 import pytest
 
-from hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected
-from wire.bus import Bus, Reply, Request, Sample
-from wire.bus_settings import BusSettings
-from wire.memory import MemoryBus, MemoryHub
-from wire.zenoh_bus import ZenohBus
-
-
-class Fleet(Protocol):
-    """Makes buses that can talk to each other, and cuts and mends their connection."""
-
-    def join(self) -> Bus: ...
-    def cut(self) -> None: ...
-    def mend(self) -> None: ...
-
-
-class MemoryFleet:
-    def __init__(self) -> None:
-        self.hub = MemoryHub()
-        self.buses: list[MemoryBus] = []
-
-    def join(self) -> MemoryBus:
-        self.buses.append(MemoryBus(self.hub))
-        return self.buses[-1]
-
-    def cut(self) -> None:
-        for bus in self.buses:
-            self.hub.cut(bus)
-
-    def mend(self) -> None:
-        for bus in self.buses:
-            self.hub.restore(bus)
-
-    def close(self) -> None:
-        for bus in self.buses:
-            bus.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-class ZenohFleet:
-    def __init__(self) -> None:
-        self.endpoints = (f"tcp/127.0.0.1:{free_port()}",)
-        self.router = self.open_router()
-        self.buses: list[ZenohBus] = []
-
-    def open_router(self) -> ZenohBus:
-        return ZenohBus(BusSettings(mode="router", listen=self.endpoints))
-
-    def join(self) -> ZenohBus:
-        bus = ZenohBus(BusSettings(endpoints=self.endpoints))
-        self.buses.append(bus)
-        assert bus.wait_connected(5)
-        return bus
-
-    def cut(self) -> None:
-        self.router.close()
-
-    def mend(self) -> None:
-        self.router = self.open_router()
-
-    def close(self) -> None:
-        for bus in self.buses:
-            bus.close()
-        self.router.close()
-
-
-@pytest.fixture(params=[MemoryFleet, ZenohFleet])
-def fleet(request: pytest.FixtureRequest) -> Iterator[Fleet]:
-    fleet = request.param()
-    yield fleet
-    fleet.close()
-
-
-def eventually(condition: Callable[[], object], seconds: float = 5.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.005)
-
-
-def settle(asker: Bus, key: str, servers: int = 1) -> list[Reply]:
-    """Ask until so many servers are seen: a declaration needs a moment to get about."""
-    replies: list[Reply] = []
-
-    def seen() -> bool:
-        replies[:] = asker.ask(key, b"ping", 2.0)
-        return len(replies) >= servers
-
-    eventually(seen)
-    return replies
-
-
-def subscribe(bus: Bus, others: Bus, pattern: str) -> list[Sample]:
-    """Subscribe and wait until it is known to the other side."""
-    got: list[Sample] = []
-    probes: list[Sample] = []
-    bus.subscribe(pattern, got.append)
-    bus.subscribe("probe/**", probes.append)
-
-    def arrives() -> bool:
-        others.publish("probe/x", b"")
-        return bool(probes)
-
-    eventually(arrives)
-    return got
+from hybridmap.errors import Busy, InvalidValue, MapweaveError
+from tests.waiting import eventually
+from tests.wire.fleets import Fleet, settle, subscribe
+from wire.bus import Reply, Request, Sample
 
 
 def test_a_message_comes_with_key_payload_and_attachment(fleet: Fleet) -> None:
@@ -147,7 +39,8 @@ def test_patterns(fleet: Fleet, pattern: str, keys: set[str]) -> None:
         sender.publish(key, b"")
     ends = subscribe(receiver, sender, "end")
     sender.publish("end", b"")
-    eventually(lambda: ends)
+    # Order is kept within a subscription, not between two: the end may overtake what is wanted.
+    eventually(lambda: ends and {sample.key for sample in got} >= keys)
     assert {sample.key for sample in got} == keys
     assert len(got) == len(keys)
 
@@ -183,8 +76,8 @@ def test_messages_of_one_sender_keep_their_order(fleet: Fleet) -> None:
 def test_nobody_to_ask(fleet: Fleet) -> None:
     bus = fleet.join()
     begin = time.monotonic()
-    assert bus.ask("nobody/here", b"?", 3.0) == []
-    assert time.monotonic() - begin < 1.0, "an empty answer must not cost the time-out"
+    assert bus.ask("nobody/here", b"?", 60.0) == []
+    assert time.monotonic() - begin < 20, "an empty answer must not cost the time-out"
 
 
 def test_one_server_answers(fleet: Fleet) -> None:
@@ -320,108 +213,3 @@ def test_handlers_run_one_at_a_time_and_may_use_the_bus(fleet: Fleet) -> None:
     bus.subscribe("two", handler)
     eventually(lambda: bus.publish("one", b"go") or bus.publish("two", b"") or echoed)
     assert not overlaps
-
-
-def test_who_is_alive_before_and_after(fleet: Fleet) -> None:
-    watcher, others = fleet.join(), fleet.join()
-    others.announce("agent/r0/alive")
-    news: list[tuple[str, bool]] = []
-    watching = watcher.watch("agent/*/alive", lambda key, alive: news.append((key, alive)))
-    eventually(lambda: news == [("agent/r0/alive", True)])
-    later = others.announce("agent/r1/alive")
-    others.announce("server/s/alive")
-    eventually(lambda: len(news) == 2)
-    later.close()
-    later.close()
-    eventually(lambda: len(news) == 3)
-    others.close()
-    eventually(lambda: len(news) == 4)
-    assert news[1:] == [("agent/r1/alive", True), ("agent/r1/alive", False), ("agent/r0/alive", False)]
-    watching.close()
-
-
-def test_what_is_closed_is_not_called_any_more(fleet: Fleet) -> None:
-    asker, server = fleet.join(), fleet.join()
-    got: list[Sample] = []
-    subscription = server.subscribe("a", got.append)
-    service = server.serve("q", lambda request: request.reply(b"yes"))
-    settle(asker, "q")
-    subscription.close()
-    subscription.close()
-    service.close()
-    eventually(lambda: asker.ask("q", b"", 1.0) == [])
-    ends = subscribe(server, asker, "end")
-    asker.publish("a", b"")
-    asker.publish("end", b"")
-    eventually(lambda: ends)
-    assert not got
-
-
-def test_closing_twice_and_using_what_is_closed(fleet: Fleet) -> None:
-    bus = fleet.join()
-    closing = bus.subscribe("a", lambda _: None)
-    bus.close()
-    bus.close()
-    closing.close()
-    assert not bus.connected()
-    bus.publish("a", b"")
-    assert bus.ask("a", b"", 1.0) == []
-    with pytest.raises(NotConnected):
-        bus.subscribe("a", lambda _: None)
-
-
-def test_a_question_whose_server_closes_does_not_wait_for_the_time_out(fleet: Fleet) -> None:
-    asker, server = fleet.join(), fleet.join()
-    kept: list[Request] = []
-    answer: list[list[Reply]] = []
-    server.serve("q", kept.append)
-    eventually(lambda: asker.ask("q", b"", 0.05) or kept)
-    held = len(kept)
-    thread = threading.Thread(target=lambda: answer.append(asker.ask("q", b"", 20.0)))
-    thread.start()
-    eventually(lambda: len(kept) > held)
-    server.close()
-    thread.join(timeout=5)
-    assert answer == [[]]
-
-
-def test_closing_a_bus_ends_its_own_questions(fleet: Fleet) -> None:
-    asker, server = fleet.join(), fleet.join()
-    kept: list[Request] = []
-    answer: list[list[Reply]] = []
-    server.serve("q", kept.append)
-    eventually(lambda: asker.ask("q", b"", 0.05) or kept)
-    held = len(kept)
-    thread = threading.Thread(target=lambda: answer.append(asker.ask("q", b"", 20.0)))
-    thread.start()
-    eventually(lambda: len(kept) > held)
-    asker.close()
-    thread.join(timeout=5)
-    assert answer == [[]]
-
-
-def test_without_a_connection_nothing_blocks_and_all_comes_back(fleet: Fleet) -> None:
-    one, two = fleet.join(), fleet.join()
-    got = subscribe(two, one, "a")
-    two.serve("q", lambda request: request.reply(b"yes"))
-    settle(one, "q")
-    news: list[bool] = []
-    two.announce("token")
-    one.watch("token", lambda _, alive: news.append(alive))
-    eventually(lambda: news == [True])
-
-    fleet.cut()
-    eventually(lambda: not one.connected() and not two.connected())
-    begin = time.monotonic()
-    for _ in range(1000):
-        one.publish("a", b"into the void")
-    assert one.ask("q", b"", 2.0) == []
-    assert time.monotonic() - begin < 1.0
-    eventually(lambda: news == [True, False])
-
-    fleet.mend()
-    eventually(lambda: one.connected() and two.connected())
-    eventually(lambda: one.ask("q", b"", 1.0) == [Reply(payload=b"yes")])
-    eventually(lambda: one.publish("a", b"back") or b"back" in [s.payload for s in got])
-    eventually(lambda: news == [True, False, True])
-    assert b"into the void" not in [s.payload for s in got]

@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from hybridmap.errors import SettingsError
+from tests.waiting import eventually
 from wire.bus import Reply, Request, Sample
 from wire.bus_settings import BusSettings
 from wire.dispatch import Dispatcher
 from wire.memory import Faults, MemoryBus, MemoryHub
-
-
-def eventually(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + 5
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.002)
 
 
 def run(faults: Faults, count: int = 300, seed: int = 1) -> list[int]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 
 import pytest
 
 from hybridmap.errors import InvalidMessage
+from tests.waiting import eventually
 from wire.memory import MemoryBus, MemoryHub
 from wire.metered import MeteredBus
 
@@ -19,13 +19,6 @@ def pair() -> Iterator[tuple[MemoryHub, MeteredBus, MemoryBus]]:
     yield hub, MeteredBus(inner), other
     inner.close()
     other.close()
-
-
-def eventually(condition) -> None:
-    end = time.monotonic() + 5.0
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.002)
 
 
 def test_what_is_published_and_heard(pair) -> None:

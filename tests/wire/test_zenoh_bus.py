@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 
 import pytest
 
 from hybridmap.errors import NotConnected
+from tests.waiting import eventually, free_port
 from wire.bus import Sample
 from wire.bus_settings import BusSettings
 from wire.zenoh_bus import ZenohBus
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def eventually(condition: Callable[[], object], seconds: float = 5.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.005)
 
 
 def test_a_client_may_come_before_its_router() -> None:
@@ -36,12 +22,12 @@ def test_a_client_may_come_before_its_router() -> None:
     got: list[Sample] = []
     client.subscribe("a", got.append)
     client.publish("a", b"lost")
-    assert client.ask("a", b"", 1.0) == []
+    assert client.ask("a", b"", 60.0) == []
     assert not client.wait_connected(0.05)
-    assert time.monotonic() - begin < 0.5
+    assert time.monotonic() - begin < 20
     router = ZenohBus(BusSettings(mode="router", listen=endpoints))
     try:
-        assert client.wait_connected(5)
+        assert client.wait_connected(30)
         eventually(lambda: router.publish("a", b"found") or got)
         assert {s.payload for s in got} == {b"found"}
     finally:
@@ -53,7 +39,7 @@ def test_a_client_that_never_connects_closes_at_once() -> None:
     client = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
     begin = time.monotonic()
     client.close()
-    assert time.monotonic() - begin < 0.5
+    assert time.monotonic() - begin < 5
 
 
 def test_a_taken_port_is_one_clear_line() -> None:
@@ -85,7 +71,7 @@ def declare():
     client.serve("b", kept.append)
     router.subscribe("a", lambda sample: None)
     ZenohBus(BusSettings(endpoints=listen)).subscribe("a", lambda sample: None)
-assert client.wait_connected(5)
+assert client.wait_connected(30)
 declaring = threading.Thread(target=declare, daemon={declaring_thread_is_daemon})
 declaring.start()
 declaring.join()
@@ -101,5 +87,5 @@ if {closes}:
     client.close()
     router.close()
 """
-    finished = subprocess.run([sys.executable, "-c", program], timeout=20, capture_output=True, text=True)
+    finished = subprocess.run([sys.executable, "-c", program], timeout=60, capture_output=True, text=True)
     assert (finished.returncode, finished.stderr) == (0, "")

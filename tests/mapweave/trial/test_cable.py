@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import threading
 import time
@@ -86,9 +87,12 @@ def test_a_bad_one_is_slow_but_loses_nothing(cable):
         # Ten pieces, each delayed; with this seed some have to be sent again.
         assert slow > 0.2 + 0.2
         cable.restore()
-        began = time.monotonic()
-        assert talk(one, b"quick") == b"quick"
-        assert time.monotonic() - began < 0.2
+        best = math.inf
+        for _ in range(20):
+            began = time.monotonic()
+            assert talk(one, b"quick") == b"quick"
+            best = min(best, time.monotonic() - began)
+        assert best < 0.04, "not even there and back is delayed"
 
 
 def test_without_a_router_connections_end(cable):

@@ -44,7 +44,16 @@ unsaved_changes = 0
 false_edges = 0
 """
 
-BUSY = "import time\nend = time.monotonic() + 60\nwhile time.monotonic() < end: sum(range(10000))"
+# Busy now and then, for up to 40 ms: that stirs the order of things more than a steady load does.
+BUSY = """
+import random, time
+end = time.monotonic() + 60
+while time.monotonic() < end:
+    until = time.monotonic() + random.uniform(0.0, 0.04)
+    while time.monotonic() < until:
+        sum(range(1000))
+    time.sleep(random.uniform(0.0, 0.08))
+"""
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,1 @@
+"""Tests, and what they share: pytest finds the tests, they import the rest by its name."""

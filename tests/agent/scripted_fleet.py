@@ -1,0 +1,120 @@
+"""A navigator, eyes that see known landmarks, and a fleet whose answers are scripted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from agent.mission import Answer, Question
+from agent.navigator import Navigator, NavigatorSettings
+from agent.observation import Command, Observation, Odometry, RobotDescription
+from agent.vision.lens import Lens
+from agent.vision.sift import Features
+from hybridmap.change import EdgePut, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, RouteLeg, Whereabouts
+from hybridmap.synthetic import CAMERA, World, room, take_map, take_view
+
+BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
+BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)
+FREE = np.full(len(BEARINGS), 3.0)
+WALL_AHEAD = np.where(np.cos(BEARINGS) > 0.8, 0.06, 3.0)
+EXACT = np.diag([1e-4, 1e-4, 1e-5])
+IMAGE = np.zeros((240, 320), np.uint8)
+TOUR = [Pose2(1.0 + 1.2 * k, 2.0) for k in range(3)]
+Fleet = Callable[[Question], Answer]
+
+
+def home_world() -> World:
+    """A room."""
+    return room(0, 0, 5, 4, 900, np.random.default_rng(0))
+
+
+def home_map(home: World) -> HybridMap:
+    """Three nodes in a row, each 1.2 m before the one before."""
+    nodes, edges = take_map(home, MapId("r0", 1), TOUR, np.random.default_rng(2), sigma_xy=0.002)
+    return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+
+
+class Eyes:
+    """Sees features of a world from where the robot is; takes the place of Sift."""
+
+    def __init__(self, world: World, pose: Pose2) -> None:
+        self.world, self.pose = world, pose
+        self.rng = np.random.default_rng(3)
+
+    def extract(self, image: np.ndarray) -> Features:
+        view, _ = take_view(self.world, self.pose, self.rng)
+        pixels = view.pixels.astype(np.float64)
+        return Features(pixels, pixels, view.codes, np.ones(len(view)))
+
+
+class Trial:
+    """A navigator, a body that does what it is told unless it is held, and a scripted fleet."""
+
+    def __init__(
+        self, navigator: Navigator, eyes: Eyes, fleet: Fleet, proximity: np.ndarray = FREE, held: bool = False
+    ) -> None:
+        self.navigator, self.eyes, self.fleet = navigator, eyes, fleet
+        self.proximity, self.held = proximity, held
+        self.asked: list[Question] = []
+        self.commands: list[Command] = []
+        self.said: list[tuple[str, str]] = []
+        self._moved = Odometry(0.0, 0.0)
+        self._answers: tuple[Answer, ...] = ()
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        for tick in range(round(seconds / BODY.tick)):
+            observation = Observation(tick * 100_000_000, self._moved, IMAGE, self.proximity)
+            command, questions = self.navigator.step(observation, self._answers)
+            self.commands.append(command)
+            saying = (str(self.navigator.stage), self.navigator.detail)
+            if not self.said or self.said[-1] != saying:
+                self.said.append(saying)
+            self.asked += questions
+            self._answers = tuple(map(self.fleet, questions))
+            share = 0.0 if self.held else BODY.tick
+            self._moved = Odometry(command.forward * share, command.turn * share)
+            self.eyes.pose = self.eyes.pose @ self._moved.motion()
+            if until():
+                return
+
+
+def navigator(
+    eyes: Eyes, own: HybridMap, goal: NodeId, settings: NavigatorSettings | None = None
+) -> Navigator:
+    return Navigator(BODY, Lens(BODY), eyes, own, goal, settings)  # type: ignore[arg-type]
+
+
+def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:
+    return Whereabouts(node, PoseGaussian(node_from_robot, EXACT), None, 0, 30, 0.99)
+
+
+def found(question: Question, *places: Whereabouts) -> Answer:
+    """One place is found; several are ambiguous; none is unknown."""
+    certainty = (Certainty.UNKNOWN, Certainty.FOUND)[len(places)] if len(places) < 2 else Certainty.AMBIGUOUS
+    return Answer(question.number, RelocalizeAnswer(certainty, places, "it may be a or b"))
+
+
+def bare(node_id: NodeId) -> Node:
+    """A node that shows nothing."""
+    rng = np.random.default_rng(0)
+    nodes, _ = take_map(room(0, 0, 5, 4, 1, rng), node_id.map, [Pose2()], rng)
+    some = nodes[0].landmarks
+    landmarks = Landmarks(some.pixels[:0], some.codes[:0], some.depths[:0], some.depth_sigmas[:0])
+    return replace(nodes[0], id=node_id, landmarks=landmarks)
+
+
+A, B, C = (NodeId("s", 1, number) for number in (1, 3, 5))
+NOWHERE = HybridMap()
+
+
+def straight(start: Node, *others: Node, step: float = 1.5) -> tuple[RouteLeg, ...]:
+    """A route whose nodes stand one behind the other, straight ahead."""
+    legs = [RouteLeg(start, PoseGaussian(Pose2(), np.zeros((3, 3))), None)]
+    return (*legs, *(RouteLeg(node, PoseGaussian(Pose2(step), EXACT), None) for node in others))

@@ -1,0 +1,172 @@
+"""Lost, and in doubt: what the navigator takes for a place, and how it looks for one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agent.helm import NO_ANSWER, Helm
+from agent.mission import Answer, Question, WhereAmI, WhichWay
+from agent.observation import Observation, Odometry
+from agent.search import Search, SearchSettings
+from agent.tally import Tally
+from agent.vision.lens import Lens
+from hybridmap.change import NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import RouteAnswer
+from hybridmap.synthetic import World, take_map
+from tests.agent.scripted_fleet import (
+    BODY,
+    FREE,
+    IMAGE,
+    NOWHERE,
+    TOUR,
+    A,
+    B,
+    C,
+    Eyes,
+    Trial,
+    bare,
+    found,
+    here,
+    home_map,
+    home_world,
+    navigator,
+    straight,
+)
+
+
+@pytest.fixture(scope="module")
+def home() -> World:
+    """A room."""
+    return home_world()
+
+
+@pytest.fixture(scope="module")
+def own_map(home: World) -> HybridMap:
+    """Three nodes in a row, each 1.2 m before the one before."""
+    return home_map(home)
+
+
+def test_an_ambiguous_view_is_never_taken_for_a_place(home):
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    trial = Trial(
+        navigator(eyes, NOWHERE, C), eyes,
+        lambda question: found(question, here(A, Pose2()), here(B, Pose2())),
+    )  # fmt: skip
+    trial.run(60.0)
+    assert trial.navigator.fix is None
+    assert all(isinstance(question, WhereAmI) for question in trial.asked)
+    assert any(detail.startswith("ambiguous: it may be a or b") for _, detail in trial.said)
+
+
+def test_it_drives_elsewhere_to_tell_two_places_apart(home):
+    """Near the start all views are alike; from 0.5 m away they are not."""
+    start = Pose2(2.5, 2.0)
+    eyes = Eyes(home, start)
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay):
+            return Answer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
+        if start.distance(eyes.pose) < 0.5:
+            return found(question, here(A, Pose2()), here(B, Pose2()))
+        return found(question, here(A, Pose2(0.1, 0.2, 0.3)))
+
+    trial = Trial(navigator(eyes, NOWHERE, C), eyes, fleet)
+    trial.run(60.0, lambda: trial.navigator.fix is not None)
+    assert trial.navigator.fix is not None and trial.navigator.fix.node == A
+    assert any("driving on to look from elsewhere" in detail for _, detail in trial.said)
+    assert trial.navigator.tally == Tally(relocalizations=1)
+    turned = sum(abs(command.turn) for command in trial.commands) * BODY.tick
+    assert turned > math.tau, "first it looked all around"
+
+
+def test_without_room_it_stays_and_looks_on(home):
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    trial = Trial(
+        navigator(eyes, NOWHERE, C), eyes,
+        lambda question: found(question, here(A, Pose2()), here(B, Pose2())), proximity=np.full(16, 0.1),
+    )  # fmt: skip
+    trial.run(60.0)
+    assert all(command.forward == 0.0 for command in trial.commands)
+    assert trial.navigator.fix is None
+
+
+def test_two_own_nodes_that_look_the_same_are_not_told_apart_by_guessing(home):
+    """The same view hangs in two rooms of the own map: the fleet is asked, and knows no better."""
+    nodes, _ = take_map(home, MapId("r0", 1), [TOUR[0]] * 2, np.random.default_rng(4), sigma_xy=0.002)
+    first = nodes[0]
+    far = PoseGaussian(first.map_from_robot.mean @ Pose2(0.0, 8.0), first.map_from_robot.covariance)
+    alike = HybridMap([NodePut(first), NodePut(replace(nodes[1], map_from_robot=far))])
+    eyes = Eyes(home, TOUR[0])
+    alone = Trial(navigator(eyes, HybridMap([NodePut(first)]), C), eyes, found)
+    alone.run(2.0)
+    assert alone.navigator.tally.relocalizations, "one of them alone is recognised at once"
+    eyes = Eyes(home, TOUR[0])
+    trial = Trial(navigator(eyes, alike, C), eyes, found)
+    trial.run(2.0)
+    assert not trial.navigator.tally.relocalizations and trial.navigator.fix is None
+    assert any(isinstance(question, WhereAmI) for question in trial.asked)
+
+
+def test_a_place_that_another_robot_knows_a_twin_of_is_not_taken_either(home, own_map):
+    """The own map alone would be sure; the fleet knows another room that looks the same."""
+    eyes = Eyes(home, TOUR[0])
+    trial = Trial(
+        navigator(eyes, own_map, C), eyes,
+        lambda question: found(question, here(min(own_map.nodes), Pose2()), here(B, Pose2())),
+    )  # fmt: skip
+    trial.run(30.0)
+    assert not trial.navigator.tally.relocalizations
+
+
+def test_the_fleet_is_believed_where_it_contradicts_the_own_map(home, own_map):
+    eyes = Eyes(home, TOUR[0])
+    trial = Trial(
+        navigator(eyes, own_map, C), eyes, lambda question: found(question, here(B, Pose2(0.1, 0.0, 0.2)))
+    )
+    trial.run(2.0, lambda: trial.navigator.fix is not None)
+    assert trial.navigator.fix is not None and trial.navigator.fix.node == B
+
+
+def test_a_silent_fleet_is_not_waited_for_at_each_look(home):
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    navigator_ = navigator(eyes, NOWHERE, C)
+    trial = Trial(navigator_, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
+    trial.run(18.0)
+    assert len(trial.asked) == 1
+    trial.run(15.0)
+    assert len(trial.asked) == 2
+
+
+def test_a_robot_that_has_lost_sight_of_everything_looks_where_nodes_nearby_have_looked(home, own_map):
+    """It stands at a node, turned away from what that shows: one turn finds it, not a turn all around."""
+    turned = 2.4
+    eyes = Eyes(home, TOUR[1] @ Pose2(0.05, 0.0, turned))
+    helm = Helm(BODY, 50)
+    search = Search(
+        BODY, Lens(BODY), eyes, own_map, helm, SearchSettings(), np.random.default_rng(0)  # type: ignore[arg-type]
+    )  # fmt: skip
+    # The wheels' belief is off by a little.
+    believed = TOUR[0].inverse() @ TOUR[1] @ Pose2(0.1, -0.05, turned + 0.08)
+    behaviour, moved, way, fix = search.look_around(believed), Odometry(0.0, 0.0), 0.0, None
+    answers: tuple[Answer, ...] = ()
+    for tick in range(200):
+        helm.take_in(Observation(tick * 100_000_000, moved, IMAGE, FREE), answers)
+        try:
+            command = next(behaviour)
+        except StopIteration as stop:
+            fix = stop.value
+            break
+        answers = tuple(map(found, helm.questions()))
+        moved, way = Odometry(0.0, command.turn * BODY.tick), way + command.turn * BODY.tick
+        eyes.pose = eyes.pose @ moved.motion()
+    assert fix is not None
+    assert way == pytest.approx(-turned, abs=0.3), "the shorter way round, and no further"
+    true = own_map.nodes[fix.node].map_from_robot.mean.inverse() @ (TOUR[0].inverse() @ eyes.pose)
+    assert fix.node_from_robot.mean.distance(true) < 0.1

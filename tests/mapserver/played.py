@@ -1,0 +1,93 @@
+"""An agent's log played by hand, and an ingest with its store that can be restarted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from hybridmap.change import Change, NodeRetired
+from hybridmap.node import MapId, NodeId
+from mapserver.agent_log import PullSettings
+from mapserver.ingest import Ingest, IngestSettings
+from mapserver.store import Store
+from wire.bus import Request
+from wire.codec import encode_change
+from wire.keys import Keys
+from wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark
+from wire.memory import MemoryBus, MemoryHub
+
+KEYS = Keys("fleet")
+MAP = MapId("r0", 3)
+LOG_ID = 77
+QUICK = IngestSettings(PullSettings(grace=0.1, first_pause=0.02, longest_pause=0.1), retry_interval=0.05)
+
+
+def message(sequence: int, map_id: MapId = MAP) -> bytes:
+    return encode_change(Change(map_id, sequence, sequence, NodeRetired(NodeId(*map_id, sequence))))
+
+
+class HandAgent:
+    """Does exactly what the test says."""
+
+    def __init__(self, hub: MemoryHub, map_id: MapId = MAP, log_id: int = LOG_ID) -> None:
+        self.bus = MemoryBus(hub)
+        self.map, self.log_id = map_id, log_id
+        self.acks: list[Ack] = []
+        self.asked: list[LogRequest] = []
+        self.log: dict[int, bytes] = {}
+        self.bus.subscribe(
+            KEYS.acks(map_id.agent), lambda sample: self.acks.append(Ack.decode(sample.payload))
+        )
+
+    def publish(self, sequence: int, data: bytes | None = None) -> None:
+        mark = Mark(sequence, self.log_id).encode()
+        data = message(sequence, self.map) if data is None else data
+        self.bus.publish(KEYS.change(self.map), data, mark)
+
+    def beacon(self, newest: int, **acknowledged: int) -> None:
+        self.bus.publish(KEYS.head(self.map), Head(self.log_id, newest, acknowledged).encode())
+
+    def serve(
+        self, newest: int, answer: Callable[[LogRequest], LogAnswer | bytes | str] | None = None
+    ) -> None:
+        """Answer for the log 1 .. newest, or as told; text refuses."""
+        self.log = {sequence: message(sequence, self.map) for sequence in range(1, newest + 1)}
+
+        def handle(request: Request) -> None:
+            asked = LogRequest.decode(request.payload)
+            self.asked.append(asked)
+            given = answer(asked) if answer else self.answer(asked)
+            if isinstance(given, str):
+                request.refuse(given)
+            else:
+                request.reply(given if isinstance(given, bytes) else given.encode())
+
+        self.bus.serve(KEYS.log(self.map), handle)
+
+    def answer(self, asked: LogRequest) -> LogAnswer:
+        rows = tuple((s, data) for s, data in self.log.items() if asked.first <= s <= asked.last)
+        return LogAnswer(self.log_id, asked.first, min(asked.last, max(self.log)), rows)
+
+
+class Server:
+    """An ingest with its store, which can be restarted."""
+
+    def __init__(self, hub: MemoryHub, path: Path, name: str = "s0") -> None:
+        self.hub, self.path, self.name = hub, path, name
+        self.seen: list[Change] = []
+        self.on_change: Callable[[Change], None] = self.seen.append
+        self.begin()
+
+    def begin(self) -> None:
+        self.bus = MemoryBus(self.hub)
+        self.store = Store(self.path)
+        self.ingest = Ingest(self.bus, KEYS, self.store, self.name, lambda c: self.on_change(c), QUICK)
+
+    def end(self) -> None:
+        self.ingest.close()
+        self.bus.close()
+        self.store.close()
+
+    @property
+    def sequences(self) -> list[int]:
+        return [change.sequence for change in self.seen]

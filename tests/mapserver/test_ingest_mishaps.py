@@ -1,0 +1,161 @@
+"""The ingest against what goes wrong: damage, refusals, silence, full disks, strangers."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import pytest
+
+from hybridmap.change import Change
+from hybridmap.errors import InvalidFile
+from hybridmap.node import MapId
+from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server, message
+from tests.waiting import eventually
+from wire.bus import Request
+from wire.codec import MAX_CHANGE_BYTES
+from wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
+from wire.memory import MemoryHub
+
+
+def test_a_change_damaged_on_the_way_is_pulled(server: Server, agent: HandAgent) -> None:
+    agent.serve(2)
+    agent.publish(1, b"\xc1" * 50)
+    agent.publish(2)
+    eventually(lambda: server.sequences == [1, 2])
+    assert server.ingest.counters().damaged == 1
+    assert server.store.refused() == 0
+
+
+def test_a_change_bad_in_the_log_is_refused_once_and_the_log_goes_on(
+    server: Server, agent: HandAgent
+) -> None:
+    agent.serve(4)
+    agent.log[2] = b"\xc1" * 50
+    agent.log[3] = message(99)
+    agent.beacon(4)
+    eventually(lambda: server.sequences == [1, 4])
+    eventually(lambda: agent.acks and agent.acks[-1].watermark == 4)
+    refusals = agent.acks[-1].refusals
+    assert [refusal.sequence for refusal in refusals] == [2, 3]
+    assert "MessagePack" in refusals[0].reason
+    assert "came as" in refusals[1].reason
+    server.end()
+    server.seen.clear()
+    server.begin()
+    agent.beacon(4)
+    eventually(lambda: len(agent.acks) > 1 and agent.acks[-1].refusals == refusals)
+    assert server.sequences == [1, 4]
+    assert server.store.refused() == 2
+
+
+def test_a_change_that_cannot_even_be_carried_is_found_and_refused(server: Server, agent: HandAgent) -> None:
+    """It spoils every answer that it is in, so the pieces get smaller until it is alone."""
+    agent.serve(20)
+    agent.log[7] = b"x" * (MAX_CHANGE_BYTES + 1)
+    agent.beacon(20)
+    eventually(lambda: server.sequences == [s for s in range(1, 21) if s != 7])
+    assert [refusal.sequence for refusal in server.store.refusals(MAP)] == [7]
+
+
+def test_answers_that_are_none_are_asked_again(server: Server, agent: HandAgent) -> None:
+    tries: list[int] = []
+
+    def answer(asked: LogRequest) -> LogAnswer | bytes | str:
+        tries.append(1)
+        wrong: dict[int, LogAnswer | bytes | str] = {
+            1: "too busy",
+            2: LogAnswer(LOG_ID + 1, 1, 2, ()),
+            3: LogAnswer(LOG_ID, 2, 2, ()),
+            4: b"garbage",
+        }
+        return wrong.get(len(tries), agent.answer(asked))
+
+    agent.serve(2, answer)
+    agent.beacon(2)
+    eventually(lambda: agent.beacon(2) or server.sequences == [1, 2])
+    assert len(tries) >= 5
+    assert server.store.refused() == 0
+
+
+def test_an_agent_that_cannot_be_asked_is_asked_less_and_less(server: Server, agent: HandAgent) -> None:
+    agent.beacon(5)
+    time.sleep(0.5)
+    pulls = server.ingest.counters().pulls
+    assert 2 <= pulls <= 9, "at 0, 0.02, 0.06, 0.14, 0.24 ... s"
+    agent.serve(5)
+    eventually(lambda: server.sequences == [1, 2, 3, 4, 5])
+
+
+def test_a_silent_agent_does_not_hold_up_another(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+    kept: list[Request] = []
+    agent.bus.serve(KEYS.log(MAP), kept.append)
+    agent.beacon(5)
+    eventually(lambda: kept)
+    other = HandAgent(hub, MapId("r1", 1))
+    other.serve(3)
+    other.beacon(3)
+    eventually(lambda: server.store.watermark(other.map) == 3, seconds=1)
+    other.bus.close()
+
+
+def test_another_log_under_the_same_name_is_told_so(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+    agent.publish(1)
+    eventually(lambda: server.sequences == [1])
+    impostor = HandAgent(hub, MAP, LOG_ID + 1)
+    impostor.serve(3)
+    impostor.publish(2)
+    impostor.beacon(3)
+    eventually(lambda: len([ack for ack in impostor.acks if ack.log_id == LOG_ID + 1]) == 2)
+    ack = impostor.acks[-1]
+    reason = "another log goes by the name r0.3 here: begin a fresh map"
+    assert (ack.watermark, ack.refusals) == (0, (Refusal(0, reason),))
+    assert server.sequences == [1]
+    impostor.bus.close()
+
+
+def test_messages_that_are_none_are_counted_and_change_nothing(server: Server, agent: HandAgent) -> None:
+    agent.bus.publish(KEYS.change(MAP), message(1), b"short")
+    agent.bus.publish(KEYS.change(MAP), message(1))
+    agent.bus.publish(f"{KEYS.root}/agent/R0/change/3", message(1), Mark(1, 1).encode())
+    agent.bus.publish(KEYS.head(MAP), b"garbage")
+    agent.publish(1, b"x" * 200_000)
+    eventually(lambda: server.ingest.counters().damaged == 5)
+    agent.publish(1)
+    eventually(lambda: server.sequences == [1])
+
+
+def test_one_who_chokes_on_a_change_gets_the_next(
+    server: Server, agent: HandAgent, caplog: pytest.LogCaptureFixture
+) -> None:
+    def choke(change: Change) -> None:
+        server.seen.append(change)
+        if change.sequence == 1:
+            raise ZeroDivisionError("choked")
+
+    server.on_change = choke
+    with caplog.at_level(logging.ERROR):
+        agent.publish(1)
+        agent.publish(2)
+        eventually(lambda: server.sequences == [1, 2])
+    assert "choked" in caplog.text
+
+
+def test_a_disk_that_is_full_for_a_while(
+    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    agent.serve(3)
+
+    def full(*_: object) -> None:
+        raise InvalidFile("s0.sqlite: map store cannot be used (database or disk is full)")
+
+    with monkeypatch.context() as patched, caplog.at_level(logging.ERROR):
+        patched.setattr(server.store, "apply", full)
+        for sequence in (1, 2, 3):
+            agent.publish(sequence)
+        eventually(lambda: server.ingest.counters().failures >= 3)
+        assert "disk is full" in server.ingest.failure
+    assert len(caplog.records) == 1, "one line, not one for each attempt"
+    assert not agent.acks
+    eventually(lambda: server.sequences == [1, 2, 3])
+    assert server.ingest.failure == ""

@@ -1,0 +1,57 @@
+"""What the tests of commands need: a recording, a taken port, an endpoint where nobody is."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.mapweave.command_line import CAMERA
+from tests.waiting import free_port
+
+
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Commands take signals for themselves."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A port that is taken."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        yield int(taken.getsockname()[1])
+
+
+@pytest.fixture
+def nobody() -> str:
+    """An endpoint where nobody listens."""
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Three grey images without a robot that moves."""
+    folder = tmp_path / "walk"
+    (folder / "images").mkdir(parents=True)
+    for k in range(3):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), np.full((48, 64), 90, np.uint8))
+    (folder / "camera.toml").write_text(CAMERA)
+    (folder / "odometry.csv").write_text("forward_m,turn_rad\n" + "0,0\n" * 3)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def simulator() -> None:
+    """PyBullet greets whoever loads it first; that is not what is tested."""
+    import sim.simulation  # noqa: F401

@@ -1,0 +1,96 @@
+"""The command line and files: one line on stderr for whatever is wrong with one."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from mapweave.cli import main
+from tests.mapweave.command_line import complaint
+from wire.mapfile import MapFile, write_map_file
+
+pytestmark = pytest.mark.usefixtures("signals", "simulator")
+
+
+def test_map_files(tmp_path, capfd):
+    path = tmp_path / "a.mapweave"
+    assert "cannot be read" in complaint(capfd, "map", "show", path)
+    assert "cannot be read" in complaint(capfd, "map", "show", tmp_path)
+    path.write_bytes(b"")
+    assert "is not a Mapweave map file" in complaint(capfd, "map", "show", path)
+    path.write_text("{}")
+    assert "is not a Mapweave map file" in complaint(capfd, "map", "show", path)
+    write_map_file(path, MapFile("agent", "r0.1", ()))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    assert "is truncated" in complaint(capfd, "map", "show", path)
+    path.write_bytes(whole[:20] + b"\0" + whole[21:])
+    assert "is damaged" in complaint(capfd, "map", "show", path)
+
+
+def test_settings(tmp_path, capfd, recording):
+    path = tmp_path / "robot.toml"
+    for command in (
+        ["agent", "r0"],
+        ["server"],
+        ["sim", "run", "office"],
+        ["sim", "serve", "office"],
+        ["replay", recording, "--offline"],
+    ):
+        assert "no such file" in complaint(capfd, *command, "--settings", path.with_name("none.toml"))
+        path.write_text("[netwrok]")
+        assert "did you mean 'network'?" in complaint(capfd, *command, "--settings", path)
+        path.write_text("[network")
+        assert "robot.toml" in complaint(capfd, *command, "--settings", path)
+
+
+def test_recordings(tmp_path, capfd, recording):
+    assert "no such folder" in complaint(capfd, "replay", tmp_path / "nothing")
+    assert "without it there is no robot 'a'" in complaint(capfd, "replay", recording, "--robot", "a")
+    (recording / "camera.toml").unlink()
+    assert "camera's intrinsics" in complaint(capfd, "replay", recording)
+
+
+def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
+    (recording / "images" / "1.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
+    arguments = ["replay", recording, "--offline", "--data", tmp_path / "data", "--epoch", 1]
+    assert main([str(a) for a in arguments]) == 1
+    said = capfd.readouterr().err.splitlines()
+    (line,) = [line for line in said if line.startswith("mapweave: ")]
+    assert "1.png: not an image that can be read" in line
+    assert said[-1] == line
+    assert not any("Traceback" in line for line in said)
+    assert (tmp_path / "data" / "walk.mapweave").exists(), "what was mapped before is kept"
+
+
+def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
+    taken = tmp_path / "taken"
+    taken.write_text("a file where a folder should be")
+    assert str(taken) in complaint(capfd, "replay", recording, "--offline", "--data", taken)
+    assert str(taken) in complaint(capfd, "server", "--listen", nobody, "--data", taken)
+    assert str(taken) in complaint(capfd, "demo", "--out", taken)
+    path = tmp_path / "a.mapweave"
+    write_map_file(path, MapFile("agent", "r0.1", one_node()))
+    assert str(taken) in complaint(capfd, "map", "show", path, "--out", taken / "a.png")
+
+
+def one_node():
+    """A map of one place."""
+    from hybridmap.camera import Camera
+    from hybridmap.change import NodePut
+    from hybridmap.node import Landmarks, Node, NodeId
+    from hybridmap.pose import Pose2, PoseGaussian
+
+    camera = Camera(64, 48, 60, 60, 32, 24, 0.3)
+    here = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
+    return (NodePut(Node(NodeId("r0", 1, 1), 0, here, camera, Landmarks.empty())),)
+
+
+def test_a_recording_without_a_server_is_mapped_all_the_same(recording, tmp_path, capfd, nobody):
+    data = tmp_path / "data"
+    arguments = ["replay", recording, "--data", data, "--name", "r0", "--epoch", 1, "--offline"]
+    assert main([str(a) for a in arguments]) == 0
+    assert "0 nodes and 0 edges" in " ".join(capfd.readouterr().err.split())
+    assert main(["map", "show", str(data / "r0.mapweave"), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["nodes"] == 0

@@ -1,0 +1,84 @@
+"""The command line and the network: one line on stderr where nobody is, or somebody else."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.mapweave.command_line import complaint
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.usefixtures("signals", "simulator")
+
+
+@pytest.mark.parametrize("endpoint", ["localhost", "tcp/localhost", "http/a:1", "tcp/:1", "tcp/a b:1"])
+def test_endpoints(endpoint, capfd, recording, tmp_path):
+    picture = recording / "images" / "0.png"
+    for command in (
+        ["agent", "r0"],
+        ["sim", "serve", "office"],
+        ["relocalize", picture],
+        ["replay", recording],
+    ):
+        assert "endpoint" in complaint(capfd, *command, "--connect", endpoint)
+    assert "endpoint" in complaint(capfd, "server", "--listen", endpoint, "--data", tmp_path)
+
+
+def test_a_port_that_is_taken(capfd, port, tmp_path):
+    said = complaint(capfd, "server", "--listen", f"tcp/127.0.0.1:{port}", "--data", tmp_path)
+    assert f"cannot listen at tcp/127.0.0.1:{port}: the port is taken" in said
+
+
+def test_a_port_for_people_that_is_taken(capfd, port, nobody, tmp_path):
+    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "a", "--http", port)
+    assert f"cannot listen at http 127.0.0.1:{port}: the port is taken" in said
+    said = complaint(capfd, "server", "--listen", nobody, "--data", tmp_path / "b", "--http", "here")
+    assert "write a port, or HOST:PORT" in said
+    assert not (tmp_path / "b").exists()
+
+
+def test_an_address_of_another_machine(capfd, tmp_path):
+    said = complaint(capfd, "server", "--listen", "tcp/192.0.2.1:7447", "--data", tmp_path)
+    assert "cannot listen at tcp/192.0.2.1:7447" in said
+
+
+def test_asking_where_nobody_is(capfd, recording, nobody):
+    picture = recording / "images" / "0.png"
+    said = complaint(capfd, "relocalize", picture, "--connect", nobody, "--timeout", "0.3")
+    assert f"no router at {nobody}: start `mapweave server`" in said
+
+
+def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
+    rest = ["--connect", nobody, "--timeout", "0.1"]
+    lonely = tmp_path / "a.png"
+    lonely.write_bytes((recording / "images" / "0.png").read_bytes())
+    assert "give the intrinsics with --camera" in complaint(capfd, "relocalize", lonely, *rest)
+    camera = ["--camera", recording / "camera.toml"]
+    assert "no router" in complaint(capfd, "relocalize", lonely, *camera, *rest)
+    assert "no such file" in complaint(capfd, "relocalize", lonely, "--camera", tmp_path / "b.toml", *rest)
+    assert "not an image" in complaint(capfd, "relocalize", tmp_path / "b.png", *camera, *rest)
+    lonely.write_text("no image")
+    assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)
+    assert "not an image" in complaint(capfd, "relocalize", tmp_path, *camera, *rest)
+    cv2.imwrite(str(lonely), np.zeros((10, 20), np.uint8))
+    assert "is 20x10 px, but" in complaint(capfd, "relocalize", lonely, *camera, *rest)
+
+
+def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_path):
+    command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", nobody, "--data", str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        watchdog = threading.Timer(40, process.kill)
+        watchdog.start()
+        eventually(lambda: (tmp_path / "r0.sqlite").exists())
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate()
+        watchdog.cancel()
+    assert "Traceback" not in said
+    assert len(said.splitlines()) <= 1
+    assert process.returncode in (0, 1, 130)

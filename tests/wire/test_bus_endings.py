@@ -1,0 +1,104 @@
+"""What every bus must do when somebody closes, dies or is cut off, on both implementations."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from hybridmap.errors import NotConnected
+from tests.waiting import eventually
+from tests.wire.fleets import Fleet, settle, subscribe
+from wire.bus import Reply, Request, Sample
+
+
+def test_who_is_alive_before_and_after(fleet: Fleet) -> None:
+    watcher, others = fleet.join(), fleet.join()
+    others.announce("agent/r0/alive")
+    news: list[tuple[str, bool]] = []
+    watching = watcher.watch("agent/*/alive", lambda key, alive: news.append((key, alive)))
+    eventually(lambda: news == [("agent/r0/alive", True)])
+    later = others.announce("agent/r1/alive")
+    others.announce("server/s/alive")
+    eventually(lambda: len(news) == 2)
+    later.close()
+    later.close()
+    eventually(lambda: len(news) == 3)
+    others.close()
+    eventually(lambda: len(news) == 4)
+    assert news[1:] == [("agent/r1/alive", True), ("agent/r1/alive", False), ("agent/r0/alive", False)]
+    watching.close()
+
+
+def test_what_is_closed_is_not_called_any_more(fleet: Fleet) -> None:
+    asker, server = fleet.join(), fleet.join()
+    got: list[Sample] = []
+    subscription = server.subscribe("a", got.append)
+    service = server.serve("q", lambda request: request.reply(b"yes"))
+    settle(asker, "q")
+    subscription.close()
+    subscription.close()
+    service.close()
+    eventually(lambda: asker.ask("q", b"", 1.0) == [])
+    ends = subscribe(server, asker, "end")
+    asker.publish("a", b"")
+    asker.publish("end", b"")
+    eventually(lambda: ends)
+    assert not got
+
+
+def test_closing_twice_and_using_what_is_closed(fleet: Fleet) -> None:
+    bus = fleet.join()
+    closing = bus.subscribe("a", lambda _: None)
+    bus.close()
+    bus.close()
+    closing.close()
+    assert not bus.connected()
+    bus.publish("a", b"")
+    assert bus.ask("a", b"", 1.0) == []
+    with pytest.raises(NotConnected):
+        bus.subscribe("a", lambda _: None)
+
+
+@pytest.mark.parametrize("who", ["the asker", "the server"])
+def test_a_question_to_or_of_one_who_closes_does_not_wait_for_the_time_out(fleet: Fleet, who: str) -> None:
+    asker, server = fleet.join(), fleet.join()
+    kept: list[Request] = []
+    answer: list[list[Reply]] = []
+    server.serve("q", kept.append)
+    eventually(lambda: asker.ask("q", b"", 0.05) or kept)
+    held = len(kept)
+    thread = threading.Thread(target=lambda: answer.append(asker.ask("q", b"", 60.0)))
+    thread.start()
+    eventually(lambda: len(kept) > held)
+    (asker if who == "the asker" else server).close()
+    thread.join(timeout=30)
+    assert answer == [[]]
+
+
+def test_without_a_connection_nothing_blocks_and_all_comes_back(fleet: Fleet) -> None:
+    one, two = fleet.join(), fleet.join()
+    got = subscribe(two, one, "a")
+    two.serve("q", lambda request: request.reply(b"yes"))
+    settle(one, "q")
+    news: list[bool] = []
+    two.announce("token")
+    one.watch("token", lambda _, alive: news.append(alive))
+    eventually(lambda: news == [True])
+
+    fleet.cut()
+    eventually(lambda: not one.connected() and not two.connected())
+    begin = time.monotonic()
+    for _ in range(1000):
+        one.publish("a", b"into the void")
+    assert one.ask("q", b"", 60.0) == []
+    assert time.monotonic() - begin < 20
+    eventually(lambda: news == [True, False])
+
+    fleet.mend()
+    eventually(lambda: one.connected() and two.connected())
+    eventually(lambda: one.ask("q", b"", 1.0) == [Reply(payload=b"yes")])
+    eventually(lambda: one.publish("a", b"back") or b"back" in [s.payload for s in got])
+    eventually(lambda: news == [True, False, True])
+    assert b"into the void" not in [s.payload for s in got]
