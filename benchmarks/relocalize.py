@@ -9,17 +9,24 @@ postures, then disturbed ones, views of twin rooms, and views of buildings that 
 two "here" is always a false answer. The ceiling compares every view with every real place by whole SIFT
 descriptors; a bag of visual words answers the same questions through the same verification. The first run
 takes its pictures (some minutes) and keeps them in the system's folder for temporary files.
+
+A server has its nodes ready; here those beyond the real ones are made when somebody looks at them, and the
+time for that is not counted, neither in an answer's nor in the index's.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
+import gc
 import json
 import os
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -38,7 +45,7 @@ from benchmarks.relocalize_score import Reply, ask, figures, judged, recall_by_k
 from hybridmap.descriptor import decode
 from hybridmap.node import Node, NodeId
 from mapserver.placeindex import PlaceIndex
-from mapserver.relocalization import Relocalizer
+from mapserver.relocalization import RelocalizationSettings, Relocalizer
 
 REAL = 1000
 """Places that are real, at most."""
@@ -46,6 +53,7 @@ DONORS = 800
 """Views behind the others."""
 AT_ONCE = 4096
 """Nodes that are added to an index at once."""
+CANDIDATES = RelocalizationSettings().candidates
 PEER_AT_MOST = 100_000
 """Beyond, the bag of words is left out: it is not what is asked."""
 
@@ -71,6 +79,13 @@ class Bench:
         with self.task("views of other buildings", DONORS) as step:
             self.distractors = gather(DONORS, self.places, seed, step)
         self.merged = joined(self.places, seed)
+        self.making = 0.0
+        """Seconds spent on making nodes."""
+
+    @cached_property
+    def vocabulary(self) -> Vocabulary:
+        """Of the bag of words, learned from the real places."""
+        return Vocabulary(np.concatenate([decode(p.node.landmarks.codes) for p in self.places]), self.seed)
 
     @contextmanager
     def task(self, name: str, total: int) -> Iterator[Callable[[], None]]:
@@ -82,19 +97,26 @@ class Bench:
     def node(self, node_id: NodeId) -> Node | None:
         """A node of the fleet, whichever size it has."""
         if node_id.agent == AGENT:
-            return self.distractors.node(node_id.number)
+            return self.made(node_id.number)
         place = self.truth.get(node_id)
         return None if place is None else place.node
+
+    def made(self, number: int) -> Node:
+        """A node that is not real."""
+        began = time.perf_counter()
+        node = self.distractors.node(number)
+        self.making += time.perf_counter() - began
+        return node
 
     def nodes(self, size: int) -> Iterator[Node]:
         """The fleet's nodes, at a size."""
         yield from (place.node for place in self.places[:size])
-        yield from (self.distractors.node(k) for k in range(size - len(self.places)))
+        yield from (self.made(k) for k in range(size - len(self.places)))
 
     def asked(self, name: str, relocalizer: Relocalizer) -> list[Reply]:
         """All answers."""
         with self.task(name, len(self.queries)) as step:
-            return ask(relocalizer.answer, self.queries, self.truth, step)
+            return ask(relocalizer.answer, self.queries, self.truth, step, lambda: self.making)
 
     def ceiling(self, kinds: list[str]) -> dict[str, float]:
         """Recall of the exhaustive search by kind."""
@@ -131,30 +153,48 @@ def chunks(nodes: Iterable[Node], size: int) -> Iterator[list[Node]]:
         yield some
 
 
+def searched(bench: Bench, index: PlaceIndex) -> dict[str, float]:
+    """How long the search takes of an answer."""
+    ms = []
+    for query in bench.queries:
+        if query.kind in ("near", "nowhere"):
+            view = query.picture.view
+            began = time.perf_counter()
+            index.query(view, CANDIDATES)
+            ms.append(1e3 * (time.perf_counter() - began))
+    return {f"search_p{q}_ms": round(float(np.percentile(ms, q)), 2) for q in (50, 95)}
+
+
 def resident() -> float:
-    """MB of memory that the process holds now."""
+    """MB of memory that the process holds now; what it has freed is given back first, where that can be."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
 def measured(bench: Bench, size: int, peer: bool) -> dict[str, Any]:
     """Everything at one size."""
-    index, before, began = PlaceIndex(), resident(), time.perf_counter()
+    index, before, made, began = PlaceIndex(), resident(), bench.making, time.perf_counter()
     with bench.task(f"{size} nodes: index", size) as step:
         for some in chunks(bench.nodes(size), AT_ONCE):
             index.extend(some)
             for _ in some:
                 step()
         index.settle()
-    built = time.perf_counter() - began
+    built = time.perf_counter() - began - (bench.making - made)
     grown = resident() - before
+    searches = searched(bench, index)
     replies = bench.asked(f"{size} nodes", Relocalizer(index, bench.node, bench.merged))
     out: dict[str, Any] = {
-        **figures(replies), "build_s": round(built, 1), "memory_mb": round(grown, 1),
+        **figures(replies), **searches, "build_s": round(built, 1), "memory_mb": round(grown, 1),
+        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3, 1),
         "index_bytes_per_node": round(1e6 * grown / size), "recall": recall_by_kind(replies),
     }  # fmt: skip
+    del index
     if peer and size <= PEER_AT_MOST:
-        sample = np.concatenate([decode(p.node.landmarks.codes) for p in bench.places])
-        words = WordIndex(list(bench.nodes(size)), Vocabulary(sample, bench.seed))
+        with bench.task(f"{size} nodes: words", size) as step:
+            words = WordIndex(bench.nodes(size), bench.vocabulary, step)
         theirs = figures(
             bench.asked(f"{size} nodes: bag of words", Relocalizer(words, bench.node, bench.merged))
         )
@@ -204,14 +244,12 @@ def main() -> None:
     console.print(f"exhaustive: {ceiling}; load of the machine {os.getloadavg()[0]:.1f}")
     console.print(f"votes of the best wrong node: {hard}")
     if arguments.json:
-        keyed = {
+        by_name = {
             name: {size: one.get(name) for size, one in found.items()} for name in next(iter(found.values()))
         }
-        print(
-            json.dumps(
-                {**keyed, "recall_exhaustive_by_kind": ceiling, "hardness": hard, "load": os.getloadavg()[0]}
-            )
-        )
+        run = {"seed": arguments.seed, "queries": arguments.queries, "load": os.getloadavg()[0]}
+        extra = {"sizes": found, "recall_exhaustive_by_kind": ceiling, "hardness": hard}
+        print(json.dumps({**by_name, **extra, **run}))
 
 
 if __name__ == "__main__":

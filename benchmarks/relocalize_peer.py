@@ -6,7 +6,8 @@ A vocabulary tree (Nister and Stewenius, CVPR 2006) over the same compact descri
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ BRANCHES, LEVELS = 24, 3
 """13 824 words."""
 TRAINED_ON = 60_000
 """Descriptors."""
+AT_ONCE = 1024
+"""Nodes whose words are counted at once."""
 
 
 class Vocabulary:
@@ -57,34 +60,46 @@ class Vocabulary:
         """(N,) word of each descriptor."""
         word = np.zeros(len(vectors), np.int64)
         for means in self._levels:
-            word = self._descend(vectors.astype(np.float64), word, means)
+            word = self._descend(vectors, word, means)
         return word
 
     @staticmethod
     def _descend(vectors: NDArray[Any], word: NDArray[np.int64], means: NDArray[Any]) -> NDArray[np.int64]:
         out = np.empty(len(word), np.int64)
-        for start in range(0, len(word), 4096):
-            part = slice(start, start + 4096)
-            off = means[word[part]] - vectors[part, None]
-            out[part] = word[part] * BRANCHES + (off * off).sum(axis=2).argmin(axis=1)
+        order = np.argsort(word, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(word[order])) + 1):
+            if len(rows):
+                parent = int(word[rows[0]])
+                there = np.isfinite(means[parent, :, 0])
+                own = means[parent, there].astype(vectors.dtype)
+                nearest = ((own * own).sum(axis=1) - 2 * (vectors[rows] @ own.T)).argmin(axis=1)
+                out[rows] = parent * BRANCHES + np.flatnonzero(there)[nearest]
         return out
 
 
 class WordIndex:
     """Nodes by tf-idf; answers like mapserver.placeindex.PlaceIndex."""
 
-    def __init__(self, nodes: Sequence[Node], vocabulary: Vocabulary) -> None:
+    def __init__(
+        self, nodes: Iterable[Node], vocabulary: Vocabulary, progress: Callable[[], None] = lambda: None
+    ) -> None:
         """Count words."""
         self._vocabulary, self._size = vocabulary, BRANCHES**LEVELS
-        self._ids = [node.id for node in nodes]
-        words = [vocabulary.words(decode(node.landmarks.codes)) for node in nodes]
-        rows = np.repeat(np.arange(len(nodes)), [len(one) for one in words])
+        self._ids: list[NodeId] = []
+        words, lengths, rest = [], list[int](), iter(nodes)
+        while some := list(islice(rest, AT_ONCE)):
+            self._ids += [node.id for node in some]
+            lengths += [len(node.landmarks) for node in some]
+            words.append(vocabulary.words(decode(np.concatenate([node.landmarks.codes for node in some]))))
+            for _ in some:
+                progress()
+        rows = np.repeat(np.arange(len(lengths)), lengths)
         counts = sparse.csr_matrix(
-            (np.ones(len(rows)), (rows, np.concatenate(words))), shape=(len(nodes), self._size)
+            (np.ones(len(rows)), (rows, np.concatenate(words))), shape=(len(lengths), self._size)
         )
         counts.sum_duplicates()
         occurs = np.bincount(counts.indices, minlength=self._size)
-        self._idf = np.log(len(nodes) / np.maximum(occurs, 1))
+        self._idf = np.log(len(lengths) / np.maximum(occurs, 1))
         weighted = counts @ sparse.diags(self._idf)
         norms = np.sqrt(np.asarray(weighted.multiply(weighted).sum(axis=1)).ravel())
         self._by_word = (sparse.diags(1.0 / np.maximum(norms, 1e-9)) @ weighted).T.tocsr()
