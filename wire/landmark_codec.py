@@ -27,7 +27,7 @@ from hybridmap.grid import (
 )
 from hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION, landmark_tables
 from hybridmap.node import CODE_BYTES, Landmarks
-from wire.lanes import BitReader, Column, Ints, LaneReader, LaneWriter, pack_bits
+from wire.lanes import BitReader, Column, Columns, Ints, LaneReader, LaneWriter, pack_bits
 
 MAX_LANDMARKS = 2000
 HEAD = struct.Struct("<BBHHHHH")
@@ -85,8 +85,8 @@ def unpack_features(data: bytes, camera: Camera) -> tuple[NDArray[np.float32], N
 
 
 @cache
-def _code_columns() -> tuple[Column, ...]:
-    return tuple(Column(frequencies) for frequencies in landmark_tables().codes)
+def _code_columns() -> Columns:
+    return Columns(tuple(Column(frequencies) for frequencies in landmark_tables().codes))
 
 
 @cache
@@ -111,7 +111,7 @@ def _pack(rounded: Rounded, codes: NDArray[np.uint8], with_depths: bool) -> byte
     if with_depths:
         _push_depths(lanes, rounded)
     for k in reversed(range(CODE_BYTES)):
-        lanes.push(codes[:, k].astype(np.int64), _code_columns()[k])
+        lanes.push(codes[:, k].astype(np.int64), _code_columns().columns[k])
     flags = ASCENDING * ascending + WITH_DEPTHS * with_depths
     head = HEAD.pack(VERSION, flags, count, least_x, reach_x, least_y, reach_y)
     rows = row, np.ones_like(row)
@@ -139,9 +139,7 @@ def _unpack(data: bytes, with_depths: bool) -> tuple[Rounded, NDArray[np.uint8]]
     high = _read_row(bits, count, reach_y >> low) if ascending else np.zeros(count, np.int64)
     size = _lane_size(reach_x, low)
     lanes = LaneReader(bits, count, size)
-    codes = np.empty((CODE_BYTES, count), np.uint8)
-    for k, column in enumerate(_code_columns()):
-        codes[k] = lanes.pop(column)
+    codes = lanes.pop_columns(_code_columns())
     share, depth = _pop_depths(lanes) if with_depths else (np.zeros(count, np.int64),) * 2
     bits.end()
     seeds = lanes.states - (1 << size)

@@ -10,7 +10,8 @@ hold m bits of something else. All lanes move together: a column is a few operat
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from hybridmap.landmark_tables import TOTAL_BITS
 
 TOTAL = 1 << TOTAL_BITS
 Ints = NDArray[np.int64]
+Small = NDArray[np.uint16]
 Lanes = Ints | slice
 EVERY = slice(None)
 
@@ -58,6 +60,30 @@ class Column:
     def places(self) -> Ints:
         """(4096,) number of each slot among those of its symbol."""
         return np.arange(TOTAL) - self.starts[self.symbols]
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns that are read one after the other.
+
+    Attributes:
+        columns: K of them, in the order of reading.
+    """
+
+    columns: tuple[Column, ...]
+
+    @cached_property
+    def tables(self) -> tuple[Small, Small, Small, NDArray[np.uint8]]:
+        """Four (K, 4096): symbols, widths and places as of Column, and bits that a state lacks, or one more.
+
+        They are small, because all of them are needed for each landmark.
+        """
+        symbols, widths, places = (
+            np.stack([getattr(column, name) for column in self.columns]).astype(np.uint16)
+            for name in ("symbols", "widths", "places")
+        )
+        missing = np.maximum(TOTAL_BITS - 1 - log2(widths.astype(np.int64)), 0)
+        return symbols, widths, places, missing.astype(np.uint8)
 
 
 @dataclass(eq=False)
@@ -113,6 +139,27 @@ class LaneReader:
         symbols: Ints = column.symbols[slots]
         return symbols
 
+    def pop_columns(self, columns: Columns) -> NDArray[np.uint8]:
+        """(K, N) one symbol of each lane for each of K columns.
+
+        Raises:
+            InvalidMessage: there are not enough bits.
+        """
+        out = np.empty((len(columns.columns), len(self.states)), np.uint8)
+        compiled = _compiled()
+        if compiled is None:
+            for k, column in enumerate(columns.columns):
+                out[k] = self.pop(column)
+            return out
+        end = compiled.pop_columns(
+            self.states, self._size, self._bits.windows, self._bits.at, self._bits.length,
+            *columns.tables, out,
+        )  # fmt: skip
+        if end < 0:
+            raise InvalidMessage("landmarks: cut off")
+        self._bits.at = end
+        return out
+
     def pop_plain(self, widths: Ints, lanes: Lanes = EVERY) -> Ints:
         """A number of 0 to 12 bits of each lane."""
         states, left = self.states[lanes], TOTAL_BITS - widths
@@ -127,17 +174,22 @@ class LaneReader:
 
 
 class BitReader:
-    """Numbers of so many bits each, first bit first."""
+    """Numbers of so many bits each, first bit first.
+
+    Attributes:
+        windows: (N + 1,) int64, 40 bits from each byte on.
+        length: bits that there are.
+        at: the bit from which on it reads.
+    """
 
     def __init__(self, data: bytes) -> None:
         """Take the bytes."""
+        self.at = 0
         padded = np.frombuffer(data + bytes(5), np.uint8).astype(np.int64)
-        # 40 bits from each byte on.
-        self._windows = np.zeros(len(data) + 1, np.int64)
+        self.windows = np.zeros(len(data) + 1, np.int64)
         for k in range(5):
-            self._windows |= padded[k : len(data) + 1 + k] << 8 * (4 - k)
-        self._length = 8 * len(data)
-        self._at = 0
+            self.windows |= padded[k : len(data) + 1 + k] << 8 * (4 - k)
+        self.length = 8 * len(data)
 
     def read(self, widths: Ints) -> Ints:
         """Numbers of 0 to 32 bits.
@@ -145,13 +197,13 @@ class BitReader:
         Raises:
             InvalidMessage: there are not that many.
         """
-        ends = np.cumsum(widths) + self._at
-        if len(ends) and ends[-1] > self._length:
+        ends = np.cumsum(widths) + self.at
+        if len(ends) and ends[-1] > self.length:
             raise InvalidMessage("landmarks: cut off")
         begins = ends - widths
-        numbers: Ints = self._windows[begins >> 3] >> (40 - widths - (begins & 7)) & ((1 << widths) - 1)
+        numbers: Ints = self.windows[begins >> 3] >> (40 - widths - (begins & 7)) & ((1 << widths) - 1)
         if len(ends):
-            self._at = int(ends[-1])
+            self.at = int(ends[-1])
         return numbers
 
     def end(self) -> None:
@@ -160,9 +212,19 @@ class BitReader:
         Raises:
             InvalidMessage: there is more, or it is not zero.
         """
-        left = self._length - self._at
+        left = self.length - self.at
         if left >= 8 or self.read(np.array([left])).any():
             raise InvalidMessage("landmarks: more than there should be")
+
+
+@cache
+def _compiled() -> ModuleType | None:
+    """wire.compiled_lanes, where this installation has a compiler for it."""
+    try:
+        from wire import compiled_lanes
+    except ImportError:
+        return None
+    return compiled_lanes
 
 
 def pack_bits(numbers: Ints, widths: Ints) -> bytes:
