@@ -20,7 +20,7 @@ from hybridmap.node import NodeId
 from hybridmap.pose import Array
 from hybridmap.pose_arrays import PoseGaussians
 from merge.fragments import Fragment
-from merge.links import Link, RefusedLink, refuse
+from merge.links import Link, RefusedLink, place_told, refuse
 
 
 @dataclass(frozen=True)
@@ -217,10 +217,13 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
     """Why a consistent set does not suffice; empty if it does."""
     if not kept:
         return "no links"
-    independent = independent_links(kept)
+    telling = [link for link in kept if link.telling]
+    if not telling or not place_told(kept):
+        return f"what links show is found at other places too ({len(kept)} that agree)"
+    independent = independent_links(telling)
     if independent >= s.least_links:
         return ""
-    for link in kept:
+    for link in telling:
         share = link.evidence.get("share", 0.0)
         if link.weight >= s.overwhelming_inliers and share >= s.overwhelming_share:
             return ""

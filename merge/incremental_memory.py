@@ -7,6 +7,7 @@ links are never changed, only replaced. So a merge with a memory is the merge wi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -16,8 +17,9 @@ from merge.fragments import Fragment
 from merge.groups import LinkGroup, Verdict
 from merge.links import Link
 
+T = TypeVar("T")
 Key = tuple[NodeId, NodeId]
-"""Names of two fragments, smaller first."""
+"""Names of two fragments, or two nodes, smaller first."""
 
 
 class Memory:
@@ -27,6 +29,7 @@ class Memory:
         """Nothing is known yet."""
         self._maps: dict[MapId, tuple[HybridMap, list[Fragment]]] = {}
         self._groups: dict[Key, tuple[Fragment, Fragment, tuple[Link, ...], LinkGroup]] = {}
+        self._weighed: dict[Key, tuple[Link, Link]] = {}
 
     def fragments(
         self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings, strain: float
@@ -39,6 +42,23 @@ class Memory:
                 known = self._maps[map_id] = one, fragments_of({map_id: one}, s, strain)
             found += known[1]
         return sorted(found, key=lambda fragment: fragment.name)
+
+    def weighed(self, links: Sequence[Link], weighed: Sequence[Link]) -> list[Link]:
+        """Links as they were weighed now; one that has the weight it had before is the same object as before.
+
+        Args:
+            links: as they were verified.
+            weighed: the same by `merge.distinctness.weigh`, in the same order.
+        """
+        found = []
+        for link, now in zip(links, weighed, strict=True):
+            if now is not link:
+                before = self._weighed.get(link.pair)
+                if before is None or before[0] is not link or before[1].doubles != now.doubles:
+                    before = self._weighed[link.pair] = link, now
+                now = before[1]
+            found.append(now)
+        return found
 
     def group(
         self,
@@ -70,9 +90,13 @@ class Memory:
     def forget(self, maps: set[MapId]) -> None:
         """Drop what is known of maps that are gone."""
         self._maps = {k: v for k, v in self._maps.items() if k not in maps}
-        self._groups = {
-            k: v for k, v in self._groups.items() if k[0].map not in maps and k[1].map not in maps
-        }
+        self._groups = _among(self._groups, maps)
+        self._weighed = _among(self._weighed, maps)
+
+
+def _among(known: dict[Key, T], gone: set[MapId]) -> dict[Key, T]:
+    """What is known between two nodes of maps that are not gone."""
+    return {k: v for k, v in known.items() if k[0].map not in gone and k[1].map not in gone}
 
 
 def _same(one: Sequence[Link], other: Sequence[Link]) -> bool:

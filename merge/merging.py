@@ -20,6 +20,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from merge.agglomeration import agglomerate
 from merge.consistency import ConsistencySettings, group_links
+from merge.distinctness import weigh
 from merge.drives import refuse_drives
 from merge.exclusion import ExclusionSettings
 from merge.incremental_memory import Memory
@@ -81,6 +82,7 @@ def merge_maps(
     by_node = solver.by_node
     refutation = Refutation(maps, solver, s.consistency, s.exclusion)
     present = [link for link in links if link.a in by_node and link.b in by_node]
+    present = memory.weighed(present, weigh(present, by_node, maps, s.consistency))
     refusals = [r for r in refused if r.a in by_node and r.b in by_node]
     refusals += [r for fragment in fragments for r in fragment.refused]
     given = {link.canonical().pair: link for link in present}

@@ -158,7 +158,7 @@ def test_a_room_that_fits_two_others_alike_is_joined_to_neither() -> None:
     )
     merged = fleet.merge()
     assert fleet.false_links(merged) == 0 and not merged.joined(A, B)
-    assert any("ambiguous" in r.reason for r in merged.refused)
+    assert any("at other places too" in r.reason for r in merged.refused)
 
 
 def chain(agent: str, n: int) -> HybridMap:
