@@ -14,7 +14,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -73,8 +73,9 @@ class Ingest:
         server_name: str,
         on_change: Callable[[Change], None],
         settings: IngestSettings | None = None,
+        replay: Callable[[Iterable[Change]], None] | None = None,
     ) -> None:
-        """Replay the store to `on_change`, then listen.
+        """Replay the store, then listen.
 
         Args:
             bus: the connection; stays the caller's.
@@ -85,6 +86,7 @@ class Ingest:
                 all that is in the store, in the caller's thread, later in the ingest's own. It should only
                 take note, because the next change waits for it.
             settings: how.
+            replay: called instead with all that is in the store at once, map by map.
 
         Raises:
             InvalidFile: the store is damaged.
@@ -103,9 +105,13 @@ class Ingest:
         self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
         self._stopping = False
         self._failure = ""
-        for map_id in self._store.maps():
-            for change in self._store.replay(map_id):
-                self._on_change(change)
+        maps = self._store.maps()
+        stored = (change for map_id in maps for change in self._store.replay(map_id))
+        if replay is not None:
+            replay(stored)
+        for change in stored:
+            self._on_change(change)
+        for map_id in maps:
             watermark, log_id = self._store.watermark(map_id), self._store.log_id(map_id) or 0
             refusals = tuple(self._store.refusals(map_id))
             self._logs[map_id] = AgentLog(

@@ -113,11 +113,13 @@ class Merger:
             overlaps: if they are known already, of all pairs of these nodes; else they are looked for.
             links: what is known already of pairs of these nodes.
         """
+        put: dict[NodeId, None] = {}
         for map_id, body in log:
             self._replay(map_id, body)
-        fresh = [
-            node for one in self.maps.values() for node in one.nodes.values() if node.id not in self.index
-        ]
+            if isinstance(body, NodePut):
+                put[body.node.id] = None
+        # What the index has already, just so, it leaves as it is.
+        fresh = [node for node_id in put if (node := self.node(node_id)) is not None]
         self.index.extend(fresh)
         if overlaps is None:
             for node in fresh:
@@ -170,6 +172,7 @@ class Merger:
                 self._forget(node.id)
             case NodeRetired(node_id):
                 self._forget(node_id)
+                self.index.remove(node_id)
             case EdgePut(edge):
                 # Nodes so near to each other on a robot's way are not compared: it tells nothing new. A
                 # later drive says nothing of that; it may lead from map to map.
@@ -192,8 +195,6 @@ class Merger:
 
     def _forget(self, node_id: NodeId) -> None:
         """Drop what was found out about a node: it is gone, or is known better."""
-        if node_id in self.index:
-            self.index.remove(node_id)
         self._pairs.forget(node_id)
         for other in self._known.pop(node_id, {}):
             del self._known[other][node_id]

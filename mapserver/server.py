@@ -91,7 +91,9 @@ class MapServer:
     def __enter__(self) -> MapServer:
         """Begin to serve."""
         self._upkeep.start()
-        self._ingest = Ingest(self._bus, self._keys, self._store, self._name, self._upkeep.take)
+        self._ingest = Ingest(
+            self._bus, self._keys, self._store, self._name, self._upkeep.take, replay=self._upkeep.read
+        )
         self._services = Services(
             self._bus, self._keys, self._name, self._in_step, self._desk, self._blockages, self.status
         )

@@ -6,6 +6,7 @@ import logging
 import queue
 import threading
 import time
+from collections.abc import Iterable
 
 from hybridmap.change import Change
 from hybridmap.errors import MapweaveError
@@ -36,7 +37,9 @@ class Upkeep:
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(index)
-        self._changes: queue.SimpleQueue[Change | Rulings | threading.Event | None] = queue.SimpleQueue()
+        self._changes: queue.SimpleQueue[Change | list[Change] | Rulings | threading.Event | None] = (
+            queue.SimpleQueue()
+        )
         self._answers = Answers.of(self._merger, MergedMap.empty())
         self._dirty = False
         self._event = ""
@@ -67,6 +70,11 @@ class Upkeep:
         """Take note of a change, in the order of its log. Returns at once."""
         self._put(change)
 
+    def read(self, changes: Iterable[Change]) -> None:
+        """Take note of many changes at once, map by map in the order of its log."""
+        if many := list(changes):
+            self._put(many)
+
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others. Returns at once."""
         self._put(rulings)
@@ -82,7 +90,7 @@ class Upkeep:
         self._changes.put(None)
         self._thread.join(30.0)
 
-    def _put(self, news: Change | Rulings) -> None:
+    def _put(self, news: Change | list[Change] | Rulings) -> None:
         with self._counting:
             self._came += 1
         self._changes.put(news)
@@ -109,12 +117,22 @@ class Upkeep:
                 continue
             if isinstance(change, Rulings):
                 self._merger.rule(change)
+            elif isinstance(change, list):
+                self._read(change)
             else:
                 self._apply(change)
             self._applied += 1
             self._dirty = True
             if time.monotonic() > rest_until + 2.0:
                 rest_until = time.monotonic()
+
+    def _read(self, changes: list[Change]) -> None:
+        try:
+            self._merger.read((change.map, change.body) for change in changes)
+        except Exception:  # a log may be replayed: whatever is wrong with one change, the others are taken
+            log.exception("the changes in the store are taken in one by one")
+            for change in changes:
+                self._apply(change)
 
     def _apply(self, change: Change) -> None:
         try:
