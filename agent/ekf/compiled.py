@@ -14,19 +14,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.compiled_motion import ahead, mirror, propagate, transition
+from agent.ekf.compiled_motion import advance, drive, propagate, transition
 from agent.ekf.landmarks import Ids
 from hybridmap.machine_code import MATRIX, SLOTS, VECTOR, machine_code
 from hybridmap.pose import Array
 
 __all__ = [
-    "ahead", "condition", "examine", "innovations", "leave_one_out", "propagate", "sighted",
-    "slots_of", "spread", "told", "transition", "vote", "wheel_errors", "whiten",
+    "advance", "condition", "drive", "examine", "glance", "innovations", "leave_one_out", "propagate",
+    "sighted", "slots_of", "spread", "told", "transition", "vote", "wheel_errors", "whiten",
 ]  # fmt: skip
 
 _IDS, _MASK = "int64[::1]", "boolean[::1]"
-_TILE = 96
-"""Rows and columns of G^T G that are multiplied at once: all, for a state of 31 landmarks."""
+_TILE = 32
+"""Rows and columns of G^T G that are multiplied at once: a few of the vectors that BLAS works with."""
 
 
 @machine_code(SLOTS, _IDS, _IDS)
@@ -125,33 +125,38 @@ def whiten(spread: Array) -> Array:
     """See agent.ekf.algebra. [S | 1] is eliminated to [L^T | L^-1].
 
     Two rows are taken off the rows below them at once, so that each of these is read and written half as
-    often.
+    often. Of a row only a window counts, from the pivot to the end of L^-1, which is as wide for every pivot.
+    Its place is told by unsigned numbers: they cannot be negative, so that the compiler may use vectors.
     """
     n = spread.shape[0]
-    both = np.zeros((n, 2 * n))
+    width = (n + 9) // 8 * 8
+    stride = n + width
+    both = np.zeros((n, stride))
     for i in range(n):
         for k in range(n):
             both[i, k] = spread[i, k]
         both[i, n + i] = 1.0
+    flat = both.ravel()
     for j in range(0, n, 2):
         last = min(j + 1, n - 1)
-        # L^-1 has nothing right of its diagonal.
-        width = n + last + 1
+        one, other = np.uint64(j * stride + j), np.uint64(last * stride + j)
         for i in range(j, last + 1):
+            row = np.uint64(i * stride + j)
             if i > j:
                 above = both[j, i]
                 for k in range(width):
-                    both[i, k] -= above * both[j, k]
+                    flat[row + np.uint64(k)] -= above * flat[one + np.uint64(k)]
             if not both[i, i] > 0.0:
                 raise np.linalg.LinAlgError("the covariance of the innovations is not positive definite")
             scale = 1.0 / math.sqrt(both[i, i])
             for k in range(width):
-                both[i, k] *= scale
+                flat[row + np.uint64(k)] *= scale
         for i in range(last + 1, n):
-            first, second = both[j, i], both[last, i]
+            first, second, row = both[j, i], both[last, i], np.uint64(i * stride + j)
             for k in range(width):
-                both[i, k] -= first * both[j, k] + second * both[last, k]
-    return both[:, n:].copy()
+                here = np.uint64(k)
+                flat[row + here] -= first * flat[one + here] + second * flat[other + here]
+    return both[:, n : 2 * n].copy()
 
 
 @machine_code(VECTOR, MATRIX, MATRIX)
@@ -183,6 +188,36 @@ def examine(
     return residual, whitening, distances[-1], distances[len(slots) // 2]
 
 
+@machine_code(
+    f"Tuple((float64, {VECTOR}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, float64, float64))",
+    VECTOR, MATRIX, MATRIX, "UniTuple(float64, 2)", "float64", MATRIX, "float64", VECTOR, MATRIX, SLOTS,
+    MATRIX, VECTOR, "float64",
+)  # fmt: skip
+def glance(
+    posture: Array,
+    rays: Array,
+    covariance: Array,
+    measured: tuple[float, float],
+    mount_forward: float,
+    wheel_root: Array,
+    side_slip: float,
+    posture_variances: Array,
+    expected: Array,
+    slots: NDArray[np.intp],
+    slopes: Array,
+    variances: Array,
+    most: float,
+) -> tuple[float, Array, Array, Array, Array, Array, Array, float, float]:
+    """See agent.ekf.algebra."""
+    turn = measured[1] + vote(expected, slots, slopes, wheel_root, most)
+    moved, after, by_input, predicted = advance(
+        posture, rays, covariance, (measured[0], turn), measured, mount_forward, wheel_root, side_slip,
+        posture_variances,
+    )  # fmt: skip
+    residual, whitening, worst, median = examine(after, predicted, slots, slopes, variances)
+    return turn, moved, after, by_input, predicted, residual, whitening, worst, median
+
+
 @machine_code("UniTuple(float64, 3)", MATRIX, MATRIX, SLOTS, MATRIX, MATRIX)
 def wheel_errors(
     by_input: Array, wheel_root: Array, slots: NDArray[np.intp], whitening: Array, residual: Array
@@ -207,17 +242,19 @@ def wheel_errors(
     return forward, turn, math.sqrt(squares)
 
 
-@machine_code(MATRIX, MATRIX)
-def _squared(root: Array) -> Array:
-    """Lower triangle of G^T G; of a large one only tiles on the diagonal and left of it are multiplied."""
-    size = root.shape[1]
-    if size <= _TILE:
-        return root.T @ root
-    out = np.empty((size, size))
-    for top in range(0, size, _TILE):
-        end = min(top + _TILE, size)
-        out[top:end, :end] = root[:, top:end].copy().T @ root[:, :end].copy()
-    return out
+@machine_code("void", VECTOR, VECTOR, MATRIX, "intp", "intp", "intp")
+def _lessen(before: Array, after: Array, product: Array, size: int, top: int, left: int) -> None:
+    """Take a tile of G^T G off P, (size^2,), and write what is left at its place and at its mirror's."""
+    height, width = min(_TILE, size - top), min(_TILE, size - left)
+    for i in range(height):
+        start = np.uint64((top + i) * size + left)
+        for k in range(width):
+            here = start + np.uint64(k)
+            after[here] = before[here] - product[i, k]
+    for k in range(width):
+        start = np.uint64((left + k) * size + top)
+        for i in range(k + 1 if top == left else 0, height):
+            after[start + np.uint64(i)] = after[(top + i) * size + left + k]
 
 
 @machine_code(
@@ -226,19 +263,26 @@ def _squared(root: Array) -> Array:
 def condition(
     posture: Array, rays: Array, covariance: Array, slots: NDArray[np.intp], whitening: Array, residual: Array
 ) -> tuple[Array, Array, Array, float]:
-    """See agent.ekf.algebra."""
+    """See agent.ekf.algebra. Of G^T G only tiles on the diagonal and left of it are multiplied."""
     size, m2 = covariance.shape[0], 2 * slots.shape[0]
-    measured = np.empty((m2, size))
-    for i in range(m2):
-        row = 3 + 3 * slots[i // 2] + i % 2
-        for k in range(size):
-            measured[i, k] = covariance[row, k]
-    root = whitening @ measured
-    white = whitening @ residual.ravel()
-    step = white @ root
-    after = _squared(root)
-    for row in range(size):
-        for k in range(row + 1):
-            after[row, k] = covariance[row, k] - after[row, k]
-    mirror(after)
-    return posture + step[:3], rays + step[3:].reshape(-1, 3), after, float(white @ white)
+    tiles = (size + _TILE - 1) // _TILE
+    before, after = covariance.ravel(), np.empty(size * size)
+    measured, root = np.zeros((m2, _TILE)), np.empty((tiles, m2, _TILE))
+    white, step = whitening @ residual.ravel(), np.empty(tiles * _TILE)
+    for t in range(tiles):
+        left = t * _TILE
+        width = min(_TILE, size - left)
+        for i in range(m2):
+            start = np.uint64((3 + 3 * slots[i // 2] + i % 2) * size + left)
+            for k in range(width):
+                measured[i, k] = before[start + np.uint64(k)]
+            for k in range(width, _TILE):
+                measured[i, k] = 0.0
+        root[t] = whitening @ measured
+        step[left : left + _TILE] = white @ root[t]
+        for u in range(t + 1):
+            _lessen(before, after, root[t].T @ root[u], size, left, u * _TILE)
+    moved = step[:size]
+    return (
+        posture + moved[:3], rays + moved[3:].reshape(-1, 3), after.reshape(size, size), float(white @ white)
+    )  # fmt: skip

@@ -13,14 +13,6 @@ from hybridmap.pose import Array
 _INPUT = "UniTuple(float64, 2)"
 
 
-@machine_code("void", MATRIX)
-def mirror(lower: Array) -> None:
-    """Copy the lower triangle to the upper, in place."""
-    for row in range(lower.shape[0]):
-        for k in range(row):
-            lower[k, row] = lower[row, k]
-
-
 @machine_code(
     f"Tuple(({VECTOR}, {MATRIX}, {VECTOR}, {CUBE}, {MATRIX}))", VECTOR, MATRIX, _INPUT, _INPUT, "float64"
 )
@@ -121,10 +113,60 @@ def propagate(
     return out
 
 
-@machine_code("boolean[::1]", MATRIX, VECTOR, "float64", "float64")
-def ahead(rays: Array, scale: Array, nearest: float, widest_slope: float) -> NDArray[np.bool_]:
-    """See agent.ekf.algebra."""
-    out = np.empty(len(rays), np.bool_)
-    for i in range(len(rays)):
-        out[i] = rays[i, 2] * nearest <= 1.0 and scale[i] > 1e-3 and abs(rays[i, 0]) <= widest_slope
-    return out
+@machine_code(
+    f"Tuple(({VECTOR}, {MATRIX}, boolean[::1], intp))",
+    VECTOR,
+    MATRIX,
+    _INPUT,
+    "float64",
+    "float64",
+    "float64",
+)
+def drive(
+    posture: Array,
+    rays: Array,
+    measured: tuple[float, float],
+    mount_forward: float,
+    nearest: float,
+    widest_slope: float,
+) -> tuple[Array, Array, NDArray[np.bool_], int]:
+    """See agent.ekf.algebra_motion."""
+    n = rays.shape[0]
+    forward, turn = measured
+    c, s, ch, sh = math.cos(turn), math.sin(turn), math.cos(0.5 * turn), math.sin(0.5 * turn)
+    tx, ty = forward * ch + mount_forward * (c - 1.0), forward * sh + mount_forward * s
+    moved, after, stays, gone = np.empty(3), np.empty((n, 3)), np.empty(n, np.bool_), 0
+    moved[0] = posture[0] + forward * math.cos(posture[2] + 0.5 * turn)
+    moved[1] = posture[1] + forward * math.sin(posture[2] + 0.5 * turn)
+    moved[2] = posture[2] + turn
+    for i in range(n):
+        a, b, w = rays[i, 0], rays[i, 1], rays[i, 2]
+        along, right = 1.0 - tx * w, a + ty * w
+        d = c * along - s * right
+        q = 1.0 / (d if abs(d) > 1e-9 else 1e-9)
+        a, b, w = (s * along + c * right) * q, b * q, w * q
+        after[i, 0], after[i, 1], after[i, 2] = a, b, w
+        stays[i] = w * nearest <= 1.0 and d > 1e-3 and abs(a) <= widest_slope
+        gone += not stays[i]
+    return moved, after, stays, gone
+
+
+@machine_code(
+    f"Tuple(({VECTOR}, {MATRIX}, {MATRIX}, {MATRIX}))",
+    VECTOR, MATRIX, MATRIX, _INPUT, _INPUT, "float64", MATRIX, "float64", VECTOR,
+)  # fmt: skip
+def advance(
+    posture: Array,
+    rays: Array,
+    covariance: Array,
+    at: tuple[float, float],
+    measured: tuple[float, float],
+    mount_forward: float,
+    wheel_root: Array,
+    side_slip: float,
+    posture_variances: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """See agent.ekf.algebra_motion."""
+    moved, after, _, blocks, by_input = transition(posture, rays, at, measured, mount_forward)
+    predicted = propagate(covariance, blocks, by_input, wheel_root, side_slip, posture_variances)
+    return moved, after, by_input, predicted

@@ -12,9 +12,9 @@ from typing import Any
 from agent.ekf import algebra
 
 PRODUCTS = (
-    "transition", "propagate", "ahead",
+    "drive", "advance",
     "slots_of", "sighted", "told", "innovations", "vote",
-    "spread", "whiten", "leave_one_out", "examine", "wheel_errors", "condition",
+    "spread", "whiten", "leave_one_out", "examine", "glance", "wheel_errors", "condition",
 )  # fmt: skip
 
 

@@ -72,11 +72,12 @@ class MappingFilter:
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are let go."""
+        state, mount, s = self.state, self._camera.mount_forward, self.settings
+        posture, rays, stays, gone = kernels.drive(
+            state.posture, state.rays, (odometry.forward, odometry.turn), mount, s.nearest, s.widest_slope
+        )
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
-        mount = self._camera.mount_forward
-        taken = Step.predict(self.state, odometry, root, aside, self._posture_variances, mount)
-        stays = kernels.ahead(taken.rays, taken.scale, self.settings.nearest, self.settings.widest_slope)
-        gone = len(stays) - int(np.count_nonzero(stays))
+        taken = Step(state, odometry, root, aside, self._posture_variances, mount, odometry, posture, rays)
         if gone:
             self.lost += gone
             self.ids = self.ids[stays]
@@ -134,10 +135,13 @@ class MappingFilter:
         if not len(seen.slots):
             self._watch.saw(Health.BLIND, "no landmark of the filter is in view")
             return UpdateReport.blind(ids, "no landmark of the filter is in view")
-        by_wheels = self._step
+        by_wheels, variances = self._step, self._noise.variances
         if by_wheels is not None and s.relinearisations and len(seen.slots) >= s.least_agreeing:
-            self._step = by_wheels.again(at=by_wheels.seems(seen.slots, seen.slopes, s.slip_sigmas))
-        judged = self._judge(seen)
+            self._step, found = by_wheels.glanced(seen.slots, seen.slopes, variances, s.slip_sigmas)
+        else:
+            expected = self.state
+            found = kernels.examine(expected.rays, expected.covariance, seen.slots, seen.slopes, variances)
+        judged = self._judge(seen, *found)
         nis, health, reason = math.nan, judged.health, judged.reason
         if judged.agreeing:
             nis, slip = self._correct(seen, judged)
@@ -220,12 +224,11 @@ class MappingFilter:
         spread: Array = kernels.spread(self.state.covariance, slots, self._noise.variances)
         return spread
 
-    def _judge(self, seen: Sighting) -> Judgement:
+    def _judge(
+        self, seen: Sighting, innovations: Array, whitening: Array, worst: float, median: float
+    ) -> Judgement:
         """Which of the landmarks seen to correct by, and what that tells of the wheels and the pixels."""
-        s, slots, expected = self.settings, seen.slots, self.state
-        innovations, whitening, worst, median = kernels.examine(
-            expected.rays, expected.covariance, slots, seen.slopes, self._noise.variances
-        )
+        s, slots = self.settings, seen.slots
         believed = np.ones(len(slots), np.bool_)
         if not worst <= self._gate:
             believed, whitening, median = believe_some(innovations, self._spread(slots), self._gate)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from agent.ekf import kernels
 from agent.observation import Odometry
 from hybridmap.pose import Array, Pose2, PoseGaussian
+
+Examined = tuple[Array, Array, float, float]
+"""An image beside what was expected of it: what agent.ekf.algebra.examine returns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +103,6 @@ class Step:
         at: where the step is linearised: as measured, or a better guess.
         posture: (3,) expected after the step.
         rays: (n, 3) expected after the step.
-        scale: (n,) depth after over depth before; not positive for landmarks now behind the camera.
-        blocks: (1 + n, 3, 3) Jacobian of the state after by the state before.
-        by_input: (3 + 3n, 3) Jacobian of the state after by (u1, u2, u3), u3 the slip aside.
     """
 
     before: MovingState
@@ -114,66 +114,61 @@ class Step:
     at: Odometry
     posture: Array
     rays: Array
-    scale: Array
-    blocks: Array
-    by_input: Array
-    _state: MovingState | None = field(default=None, init=False)
-
-    @staticmethod
-    def predict(
-        before: MovingState,
-        measured: Odometry,
-        wheel_root: Array,
-        side_slip: float,
-        posture_variances: Array,
-        mount_forward: float,
-        at: Odometry | None = None,
-    ) -> Step:
-        """Move the mean, with the exact motion; the covariance waits until somebody asks for it."""
-        guess = at or measured
-        posture, rays, scale, blocks, by_input = kernels.transition(
-            before.posture,
-            before.rays,
-            (guess.forward, guess.turn),
-            (measured.forward, measured.turn),
-            mount_forward,
-        )
-        return Step(
-            before, measured, wheel_root, side_slip, posture_variances, mount_forward, guess, posture, rays,
-            scale, blocks, by_input,
-        )  # fmt: skip
+    _state: MovingState | None = None
+    _by_input: Array | None = None
 
     @property
     def state(self) -> MovingState:
         """After the step: P- = A P A^T + B S B^T + Q of paper-notes; computed when first asked for."""
         if self._state is None:
-            covariance = kernels.propagate(
-                self.before.covariance, self.blocks, self.by_input, self.wheel_root, self.side_slip,
+            at, measured = self.at, self.measured
+            posture, rays, self._by_input, covariance = kernels.advance(
+                self.before.posture, self.before.rays, self.before.covariance, (at.forward, at.turn),
+                (measured.forward, measured.turn), self.mount_forward, self.wheel_root, self.side_slip,
                 self.posture_variances,
             )  # fmt: skip
-            self._state = MovingState(self.posture, self.rays, covariance)
+            self.posture, self.rays = posture, rays
+            self._state = MovingState(posture, rays, covariance)
         return self._state
 
     def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> Step:
         """The same step linearised elsewhere, or with the wheels believed less."""
-        root = self.wheel_root if wheel_root is None else wheel_root
-        return Step.predict(
-            self.before, self.measured, root, self.side_slip, self.posture_variances, self.mount_forward,
-            at or self.at,
+        step = Step(
+            self.before, self.measured, self.wheel_root if wheel_root is None else wheel_root,
+            self.side_slip, self.posture_variances, self.mount_forward, at or self.at,
+            self.posture, self.rays,
         )  # fmt: skip
+        # What is expected is another now as well.
+        _ = step.state
+        return step
 
-    def seems(self, slots: NDArray[np.intp], slopes: Array, most: float) -> Odometry:
-        """Where to linearise, at a first glance at the image: a quarter of the landmarks may be wrong.
+    def glanced(
+        self, slots: NDArray[np.intp], slopes: Array, variances: Array, most: float
+    ) -> tuple[Step, Examined]:
+        """Linearise where the step seems to have gone at a first glance at its image, and look from there.
 
-        The turn is as the landmarks vote; the way is left as the wheels say.
+        The turn is as the landmarks vote, of whom a quarter may be wrong; the way is left as the wheels say.
 
         Args:
             slots: (m,) landmarks seen, m > 0.
             slopes: (m, 2) where.
+            variances: (2,) of a slope.
             most: sigmas of the wheels by which the guess may be off what they say.
+
+        Returns:
+            The step, its covariance computed; and the image beside it.
         """
-        turn = kernels.vote(self.rays, slots, slopes, self.wheel_root, most)
-        return Odometry(self.measured.forward, self.measured.turn + turn)
+        before, measured = self.before, self.measured
+        turn, posture, rays, by_input, covariance, *examined = kernels.glance(
+            before.posture, before.rays, before.covariance, (measured.forward, measured.turn),
+            self.mount_forward, self.wheel_root, self.side_slip, self.posture_variances,
+            self.rays, slots, slopes, variances, most,
+        )  # fmt: skip
+        step = Step(
+            before, measured, self.wheel_root, self.side_slip, self.posture_variances, self.mount_forward,
+            Odometry(measured.forward, turn), posture, rays, MovingState(posture, rays, covariance), by_input,
+        )  # fmt: skip
+        return step, tuple(examined)
 
     def in_hindsight(
         self, slots: NDArray[np.intp], residual: Array, whitening: Array
@@ -185,8 +180,9 @@ class Step:
             residual: (m, 2) measured minus expected.
             whitening: (2m, 2m) what whitens the residuals.
         """
+        _ = self.state
         forward, turn, surprise = kernels.wheel_errors(
-            self.by_input, self.wheel_root, slots, whitening, residual
+            self._by_input, self.wheel_root, slots, whitening, residual
         )
         return Odometry(self.measured.forward + forward, self.measured.turn + turn), surprise
 
@@ -194,12 +190,4 @@ class Step:
         """The step of only some of the landmarks."""
         if mask.all():
             return self
-        rows = np.concatenate([[True, True, True], np.repeat(mask, 3)])
-        return replace(
-            self,
-            before=self.before.kept(mask),
-            rays=self.rays[mask],
-            scale=self.scale[mask],
-            blocks=self.blocks[np.concatenate([[True], mask])],
-            by_input=self.by_input[rows],
-        )
+        return replace(self, before=self.before.kept(mask), rays=self.rays[mask], _state=None, _by_input=None)

@@ -226,19 +226,52 @@ def test_what_is_in_sight(size: tuple[int, int], in_order: bool) -> None:
 
 
 @settings(deadline=None)
-@given(sizes)
-def test_what_lies_ahead(size: tuple[int, int]) -> None:
+@given(sizes, steps)
+def test_where_the_wheels_lead(size: tuple[int, int], step: tuple[float, float, float]) -> None:
+    """As the motion has it, landmark by landmark; and which are no longer ahead."""
     n, _ = size
-    rng, _, rays, _ = scene(*size)
+    rng, posture, rays, _ = scene(*size)
     rays[rng.random(n) < 0.3, 0] *= 10.0
     rays[rng.random(n) < 0.3, 2] = 30.0
-    scale = rng.uniform(-0.5, 1.5, n)
-    one, other = (form.ahead(rays, scale, 0.05, 4.0).tolist() for form in FORMS)
-    assert (
-        one
-        == other
-        == [bool(w <= 20 and d > 1e-3 and abs(a) <= 4) for (a, _, w), d in zip(rays, scale, strict=True)]
+    forward, turn, mount = step
+    moved = move_rays(rays, Odometry(forward, turn), mount)
+    told = [
+        bool(w <= 20 and d > 1e-3 and abs(a) <= 4)
+        for (a, _, w), d in zip(moved.rays, moved.scale, strict=True)
+    ]
+    for form in FORMS:
+        got_posture, got_rays, stays, gone = form.drive(posture, rays, (forward, turn), mount, 0.05, 4.0)
+        np.testing.assert_allclose(got_posture, move_posture(posture, Odometry(forward, turn))[0], atol=1e-12)
+        np.testing.assert_allclose(got_rays, moved.rays, rtol=1e-9, atol=1e-12)
+        assert stays.tolist() == told
+        assert gone == told.count(False)
+
+
+@settings(deadline=None)
+@given(sizes)
+def test_a_glance_is_its_parts(size: tuple[int, int]) -> None:
+    """Vote, transition, propagate and examine, one after the other, each of which is tested by itself."""
+    n, _ = size
+    rng, posture, rays, covariance = scene(*size)
+    slots, root = some_slots(rng, n), rng.normal(size=(2, 2)) * 0.01
+    measured, mount, aside = (0.05, 0.02), 0.1, 0.003
+    variances, slope_variances = rng.random(3), rng.uniform(0.2, 2.0, 2)
+    expected = algebra.transition(posture, rays, measured, measured, mount)[1]
+    slopes = expected[slots, :2] + rng.normal(0, 0.01, (len(slots), 2))
+    turn = measured[1] + algebra.vote(expected, slots, slopes, root, 4.0)
+    moved, after, _, blocks, by_input = algebra.transition(
+        posture, rays, (measured[0], turn), measured, mount
     )
+    predicted = algebra.propagate(covariance, blocks, by_input, root, aside, variances)
+    examined = algebra.examine(after, predicted, slots, slopes, slope_variances)
+    for form in FORMS:
+        got_turn, *got = form.glance(
+            posture, rays, covariance, measured, mount, root, aside, variances, expected, slots, slopes,
+            slope_variances, 4.0,
+        )  # fmt: skip
+        assert got_turn == pytest.approx(turn, abs=1e-12)
+        for one, other in zip(got, (moved, after, by_input, predicted, *examined), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("form", FORMS)
