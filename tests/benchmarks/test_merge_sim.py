@@ -1,0 +1,143 @@
+"""Merging in the simulator: rays against the renderer, wrong joins, and runs that fail are told."""
+
+import json
+import signal
+import sys
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks import merge_sim
+from benchmarks.merge_sim import Failure, figures, measure, outcome, summary
+from benchmarks.merge_sim_run import Run, false_merges
+from benchmarks.merge_sim_views import lengths, views_shared
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2
+from sim.camera import WEBCAM
+from sim.renderer import Renderer
+from sim.texture import Texture
+from sim.world import PanelSet, World
+from sim.worlds.catalog import make_world
+
+RUN = Run("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 40, 8, 0.7, 150.0, 90.0)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return make_world("warehouse", 4, rows=1, bays=2)
+
+
+def test_rays_end_where_the_renderer_draws(world: World) -> None:
+    """Each panel in a grey of its own: the pixel says which one a ray must meet, and that how far away."""
+    panels = PanelSet.of(world.panels)
+    count = len(panels.corner)
+    assert count <= 250
+    grey = PanelSet(panels.corner, panels.along, panels.down, [Texture.plain(k) for k in range(count)])
+    rng, agreed, compared = np.random.default_rng(0), 0, 0
+    for _ in range(5):
+        pose = world.plan.random_free_pose(rng, 0.4)
+        turn = np.eye(3)
+        turn[:2, :2] = pose.rotation
+        image = Renderer(WEBCAM, 255).render(grey, turn, np.array([pose.x, pose.y, 0.0]))
+        rows, columns = (part.ravel() for part in np.mgrid[7:240:15, 7:320:15])
+        tips = WEBCAM.back_project(np.stack([columns, rows], axis=1), np.ones(len(rows)))
+        eye = np.array([pose.x, pose.y, WEBCAM.mount_height])
+        ways = tips @ turn.T + [pose.x, pose.y, 0.0] - eye
+        found = lengths(panels, eye, ways)
+        drawn = image[rows, columns].astype(int)
+        meets = drawn < count
+        assert (found[~meets] > 50.0).mean() > 0.95 if (~meets).any() else True
+        normals = np.cross(panels.along, panels.down)[drawn[meets]]
+        expected = ((panels.corner[drawn[meets]] - eye) * normals).sum(axis=1) / (ways[meets] * normals).sum(
+            axis=1
+        )
+        agreed += int((abs(found[meets] / expected - 1.0) < 1e-6).sum())
+        compared += int(meets.sum())
+    # At edges of panels the renderer blends, and greys that are blended are other panels'.
+    assert compared > 1000 and agreed / compared > 0.97
+
+
+def test_views_are_shared_by_those_that_look_at_one_thing(world: World) -> None:
+    panels = PanelSet.of(world.panels)
+    rng = np.random.default_rng(1)
+    here = world.plan.random_free_pose(rng, 0.6)
+    near, back = here @ Pose2(0.1, 0.0, 0.05), here @ Pose2(0.0, 0.0, np.pi)
+    shared = views_shared(panels, WEBCAM, [here, near, back])
+    assert np.allclose(shared, shared.T) and np.allclose(np.diag(shared), 1.0)
+    assert shared[0, 1] > 0.6 and shared[0, 2] == 0.0
+    wanted = views_shared(panels, WEBCAM, [here, near, back], least=0.5)
+    assert np.allclose(wanted, np.where(shared >= 0.5, shared, 0.0))
+
+
+def test_what_stands_between_hides() -> None:
+    """Two cameras on both sides of a wall look the same way: they show nothing in common."""
+    rooms = make_world("twins", 0)
+    panels = PanelSet.of(rooms.panels)
+    east = Pose2(1.0, 2.0, 0.0)
+    shared = views_shared(panels, WEBCAM, [east, Pose2(6.0, 2.0, 0.0)])
+    assert shared[0, 1] == 0.0
+
+
+def test_maps_that_are_joined_wrongly_are_counted() -> None:
+    rng = np.random.default_rng(2)
+    truth = {
+        NodeId(agent, 1, k): Pose2.from_vector(rng.uniform([0, 0, -3], [9, 9, 3]))
+        for agent in "abc"
+        for k in range(6)
+    }
+    merged_from_world = Pose2(3.0, -2.0, 1.0)
+    right = {node: (0, merged_from_world @ pose) for node, pose in truth.items()}
+    assert false_merges(right, truth) == 0
+    shift = Pose2(1.8, 0.0, 0.0)
+    moved = {n: (0, merged_from_world @ (shift @ truth[n] if n.agent == "c" else truth[n])) for n in truth}
+    assert false_merges(moved, truth) == 2
+    apart = {n: (int(n.agent == "c"), pose) for n, (_, pose) in moved.items()}
+    assert false_merges(apart, truth) == 0
+    near = Pose2(0.3, 0.0, 0.0)
+    close = {n: (0, merged_from_world @ (near @ truth[n] if n.agent == "c" else truth[n])) for n in truth}
+    assert false_merges(close, truth) == 0
+
+
+def test_a_run_that_fails_or_is_killed_is_told() -> None:
+    said = json.dumps(asdict(RUN))
+    assert outcome("office", 3, 0, f"noise\n{said}\n", "") == RUN
+    for status, out, words, reason in (
+        (-signal.SIGKILL, "", "", "killed by signal 9"),
+        (1, "", "a warning\noffice, seed 3: no room\n", "no room"),
+        (1, "", "", "status 1"),
+        (0, "", "", "nothing that can be read"),
+        (0, '{"scenario": "office"}', "", "nothing that can be read"),
+    ):
+        failure = outcome("office", 3, status, out, words)
+        assert isinstance(failure, Failure) and reason in failure.reason
+    found = summary(7, ["office", "warehouse"], [RUN, Failure("warehouse", 7000, "was killed by signal 9")])
+    assert found["runs"] == {"office": 1, "warehouse": 0}
+    assert found["merged_ate_m_median"] == {"office": 0.02, "warehouse": None}
+    assert found["false_merges"] == {"office": 0, "warehouse": None}
+    assert found["link_recall"]["office"] == pytest.approx(0.2)
+    assert [one["reason"] for one in found["failed"]] == ["was killed by signal 9"]
+    json.dumps(found, allow_nan=False)
+
+
+def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scenario that cannot be built beside one that there is not: each is one line, nothing hangs."""
+    wrong = {
+        "none": ("no-such-scenario",),
+        "small": ("twin-rooms", "--set", "world.length=0.1"),
+    }
+    monkeypatch.setattr(merge_sim, "SCENARIOS", wrong)
+    results = measure(["none", "small"], 1, 0, 2, Console(file=sys.stderr, quiet=True))
+    assert [type(one) for one in results] == [Failure, Failure]
+    assert isinstance(results[0], Failure) and "no scenario 'no-such-scenario'" in results[0].reason
+    assert isinstance(results[1], Failure) and "twin room's length" in results[1].reason
+
+
+def test_median_and_sums_over_runs() -> None:
+    other = Run("office", 4, 60, 3, 2, 0.04, 5, 1, 1, 20, 4, None, 150.0, 80.0)
+    found = figures([RUN, other])
+    assert found["merged_ate_m_median"] == pytest.approx(0.03)
+    assert found["components"] == 1.5 and found["whole"] == 0.5
+    assert found["false_merges"] == 1 and found["false_links"] == 1
+    assert found["link_recall"] == pytest.approx(12 / 60) and found["place_recall"] == 0.7
