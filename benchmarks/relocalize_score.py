@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from benchmarks.relocalize_places import Place
 from benchmarks.relocalize_queries import Query
 from hybridmap.node import NodeId
-from hybridmap.pose import PoseGaussian, wrap_angle
+from hybridmap.pose import Array, PoseGaussian, wrap_angle
 from hybridmap.query import Certainty, RelocalizeAnswer, View
 
 RIGHT_M, RIGHT_DEG = 0.25, 5.0
@@ -33,6 +33,7 @@ class Reply:
         error_deg: likewise.
         nees: squared Mahalanobis distance of the truth, 3 expected; NaN without a candidate there.
         ms: from features to answer.
+        cpu_ms: of processors meanwhile: a busy machine leaves it nearly as it is.
     """
 
     query: Query
@@ -41,7 +42,8 @@ class Reply:
     error_m: float
     error_deg: float
     nees: float
-    ms: float
+    ms: float = 0.0
+    cpu_ms: float = 0.0
 
     @property
     def near(self) -> bool:
@@ -59,7 +61,7 @@ def ask(
     queries: Sequence[Query],
     truth: Mapping[NodeId, Place],
     progress: Callable[[], None],
-    aside: Callable[[], float] = lambda: 0.0,
+    aside: Callable[[], Array] = lambda: np.zeros(2),
 ) -> list[Reply]:
     """Ask all questions, one after the other.
 
@@ -68,22 +70,29 @@ def ask(
         queries: what to ask.
         truth: about the real places.
         progress: called once a question.
-        aside: seconds spent so far on what a server has ready and the benchmark has not; they do not count.
+        aside: what was spent so far, see `spent`, on what a server has ready and the benchmark has not; it
+            does not count.
     """
     replies = []
     for query in queries:
         view = query.picture.view
-        began = time.perf_counter() - aside()
+        began = spent() - aside()
         told = answer(view)
-        replies.append(judged(query, told, truth, 1e3 * (time.perf_counter() - aside() - began)))
+        ms, cpu_ms = 1e3 * (spent() - aside() - began)
+        replies.append(replace(judged(query, told, truth), ms=float(ms), cpu_ms=float(cpu_ms)))
         progress()
     return replies
 
 
-def judged(query: Query, told: RelocalizeAnswer, truth: Mapping[NodeId, Place], ms: float = 0.0) -> Reply:
+def spent() -> Array:
+    """(2,) s on the clock on the wall, and of processors by this process."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def judged(query: Query, told: RelocalizeAnswer, truth: Mapping[NodeId, Place]) -> Reply:
     """Compare an answer with the truth."""
     if not told.candidates:
-        return Reply(query, told.certainty, 0.0, math.inf, math.inf, math.nan, ms)
+        return Reply(query, told.certainty, 0.0, math.inf, math.inf, math.nan)
     best = told.candidates[0]
     place = truth.get(best.node)
     error_m, error_deg = errors(query, place, best.node_from_robot)
@@ -91,7 +100,7 @@ def judged(query: Query, told: RelocalizeAnswer, truth: Mapping[NodeId, Place], 
     if place is not None and place.site == query.site:
         true = place.world_from_node.inverse() @ query.picture.world_from_robot
         nees = best.node_from_robot.mahalanobis2(true)
-    return Reply(query, told.certainty, best.probability, error_m, error_deg, nees, ms)
+    return Reply(query, told.certainty, best.probability, error_m, error_deg, nees)
 
 
 def errors(query: Query, place: Place | None, node_from_robot: PoseGaussian) -> tuple[float, float]:
@@ -114,7 +123,7 @@ def figures(replies: Sequence[Reply]) -> dict[str, float]:
     strangers = [reply for reply in replies if reply.query.kind in STRANGERS]
     known = [reply for reply in replies if reply.query.kind not in STRANGERS]
     right = [reply for reply in near if reply.recalled]
-    ms = [reply.ms for reply in replies]
+    ms, cpu_ms = [reply.ms for reply in replies], [reply.cpu_ms for reply in replies]
     return {
         "recall_at_1": share(near, lambda r: r.recalled),
         "false_accept": share(strangers, _found),
@@ -126,6 +135,8 @@ def figures(replies: Sequence[Reply]) -> dict[str, float]:
         "nees_over_16": share(right, lambda r: r.nees > 16.3),
         "p50_ms": round(float(np.percentile(ms, 50)), 2),
         "p95_ms": round(float(np.percentile(ms, 95)), 2),
+        "cpu_p50_ms": round(float(np.percentile(cpu_ms, 50)), 2),
+        "cpu_p95_ms": round(float(np.percentile(cpu_ms, 95)), 2),
     }
 
 
