@@ -13,9 +13,9 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from agent.drivers.image_file import read_grey
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError, InvalidValue
@@ -117,18 +117,10 @@ class Replay:
         frame = self._frames[self._position]
         before = self._frames[self._position - 1] if self._position else frame
         self._position += 1
-        path = self._images[frame]
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise DeviceError(f"{path}: not an image that can be read")
-        if image.shape != (self._camera.height, self._camera.width):
-            raise DeviceError(
-                f"{path}: {image.shape[1]}x{image.shape[0]} px, but camera.toml says "
-                f"{self._camera.width}x{self._camera.height}"
-            )
+        image = read_grey(self._images[frame], self._camera, "camera.toml")
         forward, turn = self._odometry[before + 1 : frame + 1].sum(axis=0)
         stamp_ns = round(self._times[frame] * 1e9)
-        return Observation(stamp_ns, Odometry(float(forward), float(turn)), np.asarray(image, np.uint8))
+        return Observation(stamp_ns, Odometry(float(forward), float(turn)), image)
 
     def act(self, command: Command) -> Command:
         """Nothing moves: what is applied is always standing still."""

@@ -45,9 +45,7 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    import cv2
-    import numpy as np
-
+    from agent.drivers.image_file import read_grey
     from agent.drivers.replay import read_camera
     from agent.observation import RobotDescription
     from agent.vision.lens import Lens
@@ -65,15 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.draw is not None and arguments.draw.suffix.lower() != ".png":
         raise DeviceError(f"{arguments.draw}: the picture will be a PNG; end its name with .png")
     camera, distortion = read_camera(camera_file)
-    image = cv2.imread(str(arguments.image), cv2.IMREAD_GRAYSCALE) if arguments.image.exists() else None
-    if image is None:
-        raise DeviceError(f"{arguments.image}: not an image that can be read")
-    if image.shape != (camera.height, camera.width):
-        raise DeviceError(
-            f"{arguments.image} is {image.shape[1]}x{image.shape[0]} px, "
-            f"but {camera_file} says {camera.width}x{camera.height}"
-        )
-    grey = np.asarray(image, np.uint8)
+    grey = read_grey(arguments.image, camera, str(camera_file))
     lens = Lens(RobotDescription(camera, distortion))
     view = Sift(lens).extract(grey).view(camera)
     network = network_of(arguments, settings_of(arguments))

@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 from rich.console import Console
 from rich.progress import track
 
+from agent.drivers.image_file import read_grey
 from agent.drivers.replay import Replay, images_of, read_camera
 from agent.pipeline import PipelineSettings
 from hybridmap.camera import Camera
@@ -131,9 +131,6 @@ def _camera_of(
     if focal_px is None:
         return read_camera(camera_file or folder / "camera.toml")
     first: Sequence[Path] = images_of(folder)[:1]
-    image = cv2.imread(str(first[0]), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise DeviceError(f"{first[0]}: not an image that can be read")
-    height, width = image.shape
+    height, width = read_grey(first[0]).shape
     middle = 0.5 * (width - 1), 0.5 * (height - 1)
     return Camera(width, height, focal_px, focal_px, *middle, STAND_IN_HEIGHT), (0.0,) * 5

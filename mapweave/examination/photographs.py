@@ -18,8 +18,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from agent.drivers.image_file import read_grey
 from agent.drivers.replay import images_of
 from agent.observation import RobotDescription
 from agent.vision.lens import Lens
@@ -200,16 +200,7 @@ class AppearanceMap:
         return (Certainty.AMBIGUOUS if rivals else Certainty.FOUND), best
 
     def _view(self, path: Path) -> View:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise DeviceError(f"{path}: not an image that can be read")
-        if image.shape != (self._camera.height, self._camera.width):
-            raise DeviceError(
-                f"{path} is {image.shape[1]}x{image.shape[0]} px, "
-                f"but the camera's images are {self._camera.width}x{self._camera.height}"
-            )
-        grey: NDArray[np.uint8] = np.asarray(image, np.uint8)
-        return self._sift.extract(grey).view(self._camera)
+        return self._sift.extract(read_grey(path, self._camera)).view(self._camera)
 
 
 def _is_right(place: int, reference: Reference | None) -> bool:

@@ -1,0 +1,53 @@
+"""Images from disk: as they were written, or one line that says what is wrong."""
+
+from __future__ import annotations
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from agent.drivers.image_file import read_grey
+from hybridmap.camera import Camera
+from hybridmap.errors import DeviceError
+
+CAMERA = Camera(64, 48, 60, 60, 32, 24, 0.3)
+
+
+def test_what_was_written_is_read(tmp_path):
+    grey = np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8)
+    path = tmp_path / "grün 1.png"
+    cv2.imwrite(str(path), grey)
+    for camera in (None, CAMERA):
+        read = read_grey(path, camera)
+        assert read.dtype == np.uint8
+        assert np.array_equal(read, grey)
+    cv2.imwrite(str(path), np.dstack([grey] * 3))
+    assert np.array_equal(read_grey(path, CAMERA), grey)
+
+
+@pytest.mark.parametrize("how", ["missing", "a folder", "empty", "text", "torn"])
+def test_what_is_no_image_is_one_line(tmp_path, how, capfd):
+    path = tmp_path / "1.png"
+    match how:
+        case "a folder":
+            path.mkdir()
+        case "empty":
+            path.write_bytes(b"")
+        case "text":
+            path.write_text("no image")
+        case "torn":
+            path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
+    with pytest.raises(DeviceError, match=re.escape(f"{path}: not an image that can be read")):
+        read_grey(path)
+    # OpenCV has something to say of a torn file, and nothing of the others.
+    assert how == "torn" or capfd.readouterr().err == ""
+
+
+def test_an_image_of_another_camera_is_refused(tmp_path):
+    path = tmp_path / "1.png"
+    cv2.imwrite(str(path), np.zeros((48, 60), np.uint8))
+    assert read_grey(path).shape == (48, 60)
+    with pytest.raises(DeviceError, match=re.escape(f"{path}: 60x48 px, but camera.toml says 64x48")):
+        read_grey(path, CAMERA, "camera.toml")
