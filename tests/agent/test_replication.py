@@ -143,7 +143,7 @@ def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent) -> Non
     for bad in (NodeRetired(NodeId("r0", 1, -1)), NodeRetired(NodeId("r1", 1, 1))):
         with pytest.raises(InvalidValue):
             agent.replicator.submit([*bodies(1, 2), bad], 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     assert agent.journal.head(MAP) == 0
 
 
@@ -164,7 +164,7 @@ def test_a_full_disk_is_said_once_and_tried_again(
         assert "disk is full" in agent.replicator.status().failure
     assert len(caplog.records) == 1
     assert not server.changes
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     assert agent.replicator.status().failure == ""
     eventually(lambda: [Mark.decode(s.attachment).sequence for s in server.changes] == [1, 2, 3])
 
@@ -192,7 +192,7 @@ def test_the_beacon_says_how_long_the_log_is_and_what_is_known(agent: Agent, ser
 def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer) -> None:
     agent = Agent(hub, path, ("s0", "s1"))
     agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     assert not agent.replicator.wait_acknowledged(0.05)
     assert agent.replicator.status().since_ack == float("inf")
     server.acknowledge(agent.log_id, 3)
@@ -202,7 +202,7 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
     assert not agent.replicator.wait_acknowledged(0.05)
     assert agent.replicator.status().unacknowledged == 1
     other.acknowledge(agent.log_id, 3)
-    assert agent.replicator.wait_acknowledged(5)
+    assert agent.replicator.wait_acknowledged(30)
     assert agent.replicator.status().unacknowledged == 0
     assert agent.replicator.status().since_ack < 5
     agent.close()
@@ -212,16 +212,16 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
 def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer) -> None:
     agent = Agent(hub, path, ())
     agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     assert not agent.replicator.wait_acknowledged(0.05)
     server.acknowledge(agent.log_id, 3)
-    assert agent.replicator.wait_acknowledged(5)
+    assert agent.replicator.wait_acknowledged(30)
     agent.close()
 
 
 def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: HandServer) -> None:
     agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     server.acknowledge(agent.log_id, 2)
     server.acknowledge(agent.log_id, 1)
     server.acknowledge(agent.log_id + 1, 3)
@@ -235,7 +235,7 @@ def test_a_server_that_has_more_than_the_disk(
     agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture
 ) -> None:
     agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     with caplog.at_level(logging.WARNING):
         server.acknowledge(agent.log_id, 9)
         eventually(lambda: "begin a fresh map" in agent.replicator.status().failure)
@@ -245,7 +245,7 @@ def test_a_server_that_has_more_than_the_disk(
 
 def test_refusals_are_said_once(agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture) -> None:
     agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             server.acknowledge(agent.log_id, 3, Refusal(2, "landmark 9 is not there"))
@@ -261,7 +261,7 @@ def test_refusals_are_said_once(agent: Agent, server: HandServer, caplog: pytest
 
 def test_the_log_answers_for_ranges(agent: Agent, server: HandServer) -> None:
     agent.replicator.submit(bodies(1, 30), 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     answer = server.ask(4, 6)
     assert (answer.log_id, answer.first, answer.covered) == (agent.log_id, 4, 6)
     assert [(s, decode_change(data).sequence) for s, data in answer.changes] == [(4, 4), (5, 5), (6, 6)]
@@ -274,7 +274,7 @@ def test_the_log_answers_for_ranges(agent: Agent, server: HandServer) -> None:
 def test_the_log_answers_in_pieces(agent: Agent, server: HandServer) -> None:
     """Not more than 256 changes, and not more than the settings' bytes."""
     agent.replicator.submit(bodies(1, 600), 0)
-    assert agent.replicator.flush(5)
+    assert agent.replicator.flush(30)
     collected: list[int] = []
     while len(collected) < 600:
         answer = server.ask(len(collected) + 1, 600)
@@ -298,7 +298,7 @@ def test_a_map_that_was_left_is_still_handed_over(hub: MemoryHub, path: Path, se
     assert replicator.status().unacknowledged == 3
     assert [sequence for sequence, _ in server.ask(1, 9).changes] == [1, 2, 3]
     server.acknowledge(old_id, 3)
-    assert replicator.wait_acknowledged(5)
+    assert replicator.wait_acknowledged(30)
     server.heads.clear()
     eventually(lambda: len(server.heads) > 12)
     assert sum(head.log_id == old_id for head in server.heads) <= 2, "it is complete: rarely a beacon"
@@ -319,7 +319,7 @@ def test_a_restarted_agent_goes_on_and_prunes_what_all_have(
     agent.replicator.submit([*bodies(1, 1), *bodies(1, 1), *bodies(2, 2)], 0)
     eventually(lambda: len(server.changes) == 3)
     server.acknowledge(agent.log_id, 3)
-    assert agent.replicator.wait_acknowledged(5)
+    assert agent.replicator.wait_acknowledged(30)
     agent.close()
     agent = Agent(hub, path)
     assert agent.replicator.status().newest == 3

@@ -37,7 +37,7 @@ def wait_for(condition, seconds, children, what):
         time.sleep(0.05)
 
 
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(420)
 def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
     """Map for a minute, then carry a robot to another place of its room: it must find itself and park."""
     keys, endpoint = Keys("e2e"), f"tcp/127.0.0.1:{free_port()}"
@@ -65,7 +65,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
                 stamps = [a.stamp_ns for a in agents().values()]
                 return len(stamps) == 2 and min(stamps) >= EXPLORE * 1e9
 
-            wait_for(explored, 120, children, "nobody explores")
+            wait_for(explored, 240, children, "nobody explores")
             for name in ("r0", "r1"):
                 assert bus.ask(keys.mission(name), encode_mission(Idle()), 10)[0].payload == b"ok"
 

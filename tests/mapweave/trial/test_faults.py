@@ -60,7 +60,7 @@ troubles = 0
 """
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(300)
 def test_a_bad_day(tmp_path):
     path = tmp_path / "bad-day.toml"
     path.write_text(BAD_DAY)

@@ -86,7 +86,7 @@ def same(one, other):
         assert getattr(one.figures, name) == getattr(other.figures, name), name
 
 
-@pytest.mark.timeout(180)
+@pytest.mark.timeout(400)
 def test_again_on_a_busy_machine(first, run):
     busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(2 * (os.cpu_count() or 2))]
     try:
@@ -102,6 +102,6 @@ def test_again_on_a_busy_machine(first, run):
     assert first.passed
 
 
-@pytest.mark.timeout(180)
+@pytest.mark.timeout(400)
 def test_in_processes(first, run):
     same(first, run("processes", processes=True))
