@@ -11,6 +11,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
+from hybridmap.reach import closed_edges
 from hybridmap.route import find_route
 
 
@@ -31,7 +32,7 @@ def own_route(
         goal: where it shall be.
         blocked: pairs of nodes, in either order, between which the robot cannot drive.
     """
-    found = find_route(own_map, start, goal, blocked=blocked)
+    found = find_route(own_map, start, goal, blocked=blocked, closed=closed_edges(own_map))
     if not found.nodes:
         return RouteAnswer((), f"own map: {found.reason}")
     here = PoseGaussian(Pose2(), np.zeros((3, 3)))

@@ -78,7 +78,8 @@ class PairExplanation:
         probability: that the link is right, see merge.credence; None without a posture.
         misfit: against the merged map; None if nothing joins the two.
         witnesses: other links between the same two pieces of map.
-        claims: what the robots themselves say of the two by their edges, one sentence each.
+        claims: what the robots themselves say of the two by their edges, whether the servo could drive them,
+            and which of the two another node stands for; one sentence each.
         rulings: what people have ruled about these two or their maps, in order.
     """
 

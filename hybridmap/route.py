@@ -46,6 +46,75 @@ class Route:
     reason: str
 
 
+class Ways:
+    """All ways through a map at one time: made once, asked from several starts."""
+
+    def __init__(
+        self,
+        hybrid_map: HybridMap,
+        *,
+        postures: Mapping[NodeId, Pose2] | None = None,
+        penalties: Mapping[EdgeId, float] | None = None,
+        blocked: Collection[tuple[NodeId, NodeId]] = (),
+        closed: Collection[EdgeId] = (),
+        settings: RouteSettings | None = None,
+    ) -> None:
+        """Take a map; the arguments are those of `find_route`."""
+        s = settings or RouteSettings()
+        self._map = hybrid_map
+        self._postures = postures
+        self._closed = closed
+        self._places = postures if postures is not None else _own_postures(hybrid_map)
+        self._barred = {frozenset(pair) for pair in blocked}
+        self._graph: nx.Graph = nx.Graph()
+        # In the order of ids, so that among ways of equal cost the same one is found whatever came first.
+        for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
+            if edge.a == edge.b or edge.id in closed or frozenset((edge.a, edge.b)) in self._barred:
+                continue
+            if edge.a not in self._places or edge.b not in self._places:
+                continue
+            cost = edge_cost(edge, self._places, postures is not None, s) + max(
+                (penalties or {}).get(edge.id, 0.0), 0.0
+            )
+            known = self._graph.get_edge_data(edge.a, edge.b)
+            if known is None or cost < known["weight"]:
+                self._graph.add_edge(edge.a, edge.b, weight=cost, edge=edge.id)
+        self._comparable = postures is not None or len({node_id.map for node_id in self._graph}) <= 1
+
+    def find(self, start: NodeId, goal: NodeId) -> Route:
+        """The cheapest way; see `find_route`."""
+        for name, node_id in (("start", start), ("goal", goal)):
+            if node_id not in self._map.nodes:
+                return Route((), (), 0.0, f"{name} {node_id} is not in the map")
+            if self._postures is not None and node_id not in self._postures:
+                return Route((), (), 0.0, f"{name} {node_id} has no posture in the merged map")
+        if start == goal:
+            return Route((start,), (), 0.0, "already there")
+        try:
+            nodes = nx.astar_path(self._graph, start, goal, heuristic=self._distance, weight="weight")
+        except (nx.NetworkXNoPath, nx.NodeNotFound):
+            return Route((), (), 0.0, self._why_not(start, goal))
+        hops = [self._graph.edges[pair] for pair in pairwise(nodes)]
+        cost = sum(hop["weight"] for hop in hops)
+        return Route(
+            tuple(nodes), tuple(hop["edge"] for hop in hops), cost, f"{len(hops)} edges, {cost:.1f} m"
+        )
+
+    def _distance(self, node: NodeId, target: NodeId) -> float:
+        return self._places[node].distance(self._places[target]) if self._comparable else 0.0
+
+    def _why_not(self, start: NodeId, goal: NodeId) -> str:
+        present = self._map.graph.subgraph(self._map.nodes)
+        if not nx.has_path(present, start, goal):
+            return f"{start} and {goal} are in parts of the map that nothing joins"
+        ties = [hop for hop in present.edges(keys=True) if hop[2] in self._closed]
+        if not nx.has_path(nx.restricted_view(present, [], ties), start, goal):
+            return f"what joins {start} and {goal} only ties postures: nothing there could be driven"
+        if self._barred:
+            return f"every way from {start} to {goal} is blocked ({len(self._barred)} pairs)"
+        return f"a node on every way from {start} to {goal} has no posture in the merged map"
+
+
 def find_route(
     hybrid_map: HybridMap,
     start: NodeId,
@@ -54,6 +123,7 @@ def find_route(
     postures: Mapping[NodeId, Pose2] | None = None,
     penalties: Mapping[EdgeId, float] | None = None,
     blocked: Collection[tuple[NodeId, NodeId]] = (),
+    closed: Collection[EdgeId] = (),
     settings: RouteSettings | None = None,
 ) -> Route:
     """Find the cheapest way from node to node.
@@ -71,47 +141,17 @@ def find_route(
         postures: all in one frame; nodes without one cannot be on the way.
         penalties: extra cost of edges, m; not negative, negative ones count as none.
         blocked: pairs of nodes, in either order, between which the robot cannot drive.
+        closed: edges that nobody could drive: they only say how nodes stand to each other, see
+            hybridmap.reach.
         settings: what a way costs.
 
     Returns:
         The way; one node and no edge if start is goal.
     """
-    s = settings or RouteSettings()
-    for name, node_id in (("start", start), ("goal", goal)):
-        if node_id not in hybrid_map.nodes:
-            return Route((), (), 0.0, f"{name} {node_id} is not in the map")
-        if postures is not None and node_id not in postures:
-            return Route((), (), 0.0, f"{name} {node_id} has no posture in the merged map")
-    if start == goal:
-        return Route((start,), (), 0.0, "already there")
-    places = postures if postures is not None else _own_postures(hybrid_map)
-    graph: nx.Graph = nx.Graph()
-    barred = {frozenset(pair) for pair in blocked}
-    # In the order of ids, so that among ways of equal cost the same one is found whatever came first.
-    for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
-        if edge.a == edge.b or frozenset((edge.a, edge.b)) in barred:
-            continue
-        if edge.a not in places or edge.b not in places:
-            continue
-        cost = edge_cost(edge, places, postures is not None, s) + max(
-            (penalties or {}).get(edge.id, 0.0), 0.0
-        )
-        known = graph.get_edge_data(edge.a, edge.b)
-        if known is None or cost < known["weight"]:
-            graph.add_edge(edge.a, edge.b, weight=cost, edge=edge.id)
-
-    comparable = postures is not None or len({node_id.map for node_id in graph}) <= 1
-
-    def heuristic(node: NodeId, target: NodeId) -> float:
-        return places[node].distance(places[target]) if comparable else 0.0
-
-    try:
-        nodes = nx.astar_path(graph, start, goal, heuristic=heuristic, weight="weight")
-    except (nx.NetworkXNoPath, nx.NodeNotFound):
-        return Route((), (), 0.0, _why_not(hybrid_map, start, goal, len(barred)))
-    hops = [graph.edges[pair] for pair in pairwise(nodes)]
-    cost = sum(hop["weight"] for hop in hops)
-    return Route(tuple(nodes), tuple(hop["edge"] for hop in hops), cost, f"{len(hops)} edges, {cost:.1f} m")
+    ways = Ways(
+        hybrid_map, postures=postures, penalties=penalties, blocked=blocked, closed=closed, settings=settings
+    )
+    return ways.find(start, goal)
 
 
 def edge_cost(edge: Edge, places: Mapping[NodeId, Pose2], one_frame: bool, settings: RouteSettings) -> float:
@@ -129,12 +169,3 @@ def edge_cost(edge: Edge, places: Mapping[NodeId, Pose2], one_frame: bool, setti
 
 def _own_postures(hybrid_map: HybridMap) -> dict[NodeId, Pose2]:
     return {node.id: node.map_from_robot.mean for node in hybrid_map.nodes.values()}
-
-
-def _why_not(hybrid_map: HybridMap, start: NodeId, goal: NodeId, barred: int) -> str:
-    present = hybrid_map.graph.subgraph(hybrid_map.nodes)
-    if not nx.has_path(present, start, goal):
-        return f"{start} and {goal} are in parts of the map that nothing joins"
-    if barred:
-        return f"every way from {start} to {goal} is blocked ({barred} pairs)"
-    return f"a node on every way from {start} to {goal} has no posture in the merged map"

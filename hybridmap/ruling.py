@@ -1,4 +1,4 @@
-"""Rulings: what a person has decided of links, against or again with what the robots saw."""
+"""Rulings: what a person has decided of links and maps, against or again with what the robots saw."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hybridmap.errors import InvalidValue
 from hybridmap.node import MapId, NodeId
 
 Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
-"""Two nodes, or two maps; the smaller first."""
+"""Two nodes, or two maps; the smaller first. The same map twice: it is about the map itself."""
 
 MOST_WORDS = 300
 """Characters of a reason."""
@@ -17,10 +17,11 @@ MOST_WORDS = 300
 
 @dataclass(frozen=True, slots=True)
 class Ruling:
-    """That two nodes, or two maps, shall not be linked, or that they may be again.
+    """That two nodes, or two maps, shall not be linked, or that they may be again; or that a map is retired.
 
     Attributes:
-        ends: what it is about. Of two maps it holds for every link between them, also for those to come.
+        ends: what it is about. Of two maps it holds for every link between them, also for those to come. The
+            same map twice: the map is retired, and takes no part in anything.
         apart: whether they shall not be linked; False takes back what was ruled before.
         who: has decided.
         stamp_ns: when, wall time since 1970.
@@ -40,12 +41,18 @@ class Ruling:
             InvalidValue: no two different nodes or maps, or words that are no single printable line.
         """
         first, second = sorted(self.ends)
-        if len(first) != len(second) or first == second:
-            raise InvalidValue("a ruling needs two different nodes or two different maps")
+        if len(first) != len(second) or (first == second and isinstance(first, NodeId)):
+            raise InvalidValue("a ruling needs two different nodes, or two maps")
         for words in (self.who, self.because):
             if len(words) > MOST_WORDS or not words.isprintable():
                 raise InvalidValue(f"who and why must be one printable line, at most {MOST_WORDS} characters")
         object.__setattr__(self, "ends", (first, second))
+
+    @property
+    def retires(self) -> MapId | None:
+        """The map that it retires, or takes in again; None if it is about two nodes or two maps."""
+        first, second = self.ends
+        return MapId(*first) if first == second else None
 
 
 class Rulings:
@@ -65,9 +72,14 @@ class Rulings:
         """Those that keep something apart, in the order of their ends."""
         return tuple(self._last[ends] for ends in sorted(self._last) if self._last[ends].apart)
 
+    @property
+    def retired(self) -> dict[MapId, Ruling]:
+        """Maps that are retired, with the rulings that say so."""
+        return {one.retires: one for one in self.in_force if one.retires is not None}
+
     def against(self, a: NodeId, b: NodeId) -> Ruling | None:
         """The ruling by which two nodes shall not be linked; None if there is none in force."""
-        for ends in (_ordered(a, b), _ordered(a.map, b.map)):
+        for ends in (_ordered(a, b), _ordered(a.map, b.map), (a.map, a.map), (b.map, b.map)):
             found = self._last.get(ends)
             if found is not None and found.apart:
                 return found
@@ -76,8 +88,8 @@ class Rulings:
     def about(self, first: NodeId | MapId, second: NodeId | MapId) -> tuple[Ruling, ...]:
         """Every ruling that was ever made of these two, or of the maps of these two nodes."""
         ends = [_ordered(first, second)]
-        if isinstance(first, NodeId) and isinstance(second, NodeId):
-            ends.append(_ordered(first.map, second.map))
+        maps = [one.map if isinstance(one, NodeId) else one for one in (first, second)]
+        ends += [_ordered(*maps), *((one, one) for one in maps)]
         return tuple(ruling for ruling in self.made if ruling.ends in ends)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mapserver.known import Known
+from mapserver.living import LivingPlaces
 from mapserver.merger import Merger
 from mapserver.relocalization import Relocalizer
 from mapserver.routes import Router
@@ -30,5 +31,6 @@ class Answers:
     @classmethod
     def of(cls, merger: Merger, merged: MergedMap) -> Answers:
         """Answers from a merged map; nodes that are newer are recognised, but lie nowhere yet."""
-        relocalizer = Relocalizer(merger.index, merger.node, merged)
-        return cls(merged, relocalizer, Router(merged), Known(merged))
+        places = LivingPlaces(merger.index, merger.node, merged)
+        relocalizer = Relocalizer(places, places.node, merged)
+        return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Known(merged))

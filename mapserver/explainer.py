@@ -125,7 +125,16 @@ class Explainer:
             check_ruling(self._answers().merged, self._book.rulings, ruling)
             self._book.add(ruling)
             self._rule(self._book.rulings)
-        first, second = ruling.ends
-        words = reason_of(ruling) if ruling.apart else f"may be linked again, says {ruling.who or 'somebody'}"
-        log.warning("%s and %s: %s", first, second, words)
-        return encode_record({"said": f"{first} and {second}: {words}"})
+        said = said_of(ruling)
+        log.warning("%s", said)
+        return encode_record({"said": said})
+
+
+def said_of(ruling: Ruling) -> str:
+    """What has come of a ruling, in one sentence."""
+    first, second = ruling.ends
+    who = ruling.who or "somebody"
+    if ruling.retires is not None:
+        return reason_of(ruling) if ruling.apart else f"map {ruling.retires} is in use again, says {who}"
+    words = reason_of(ruling) if ruling.apart else f"may be linked again, says {who}"
+    return f"{first} and {second}: {words}"

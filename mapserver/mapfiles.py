@@ -37,6 +37,7 @@ def map_file_of(merged: MergedMap) -> MapFile:
         dict(merged.postures),
         tuple(RefusedPair(r.a, r.b, r.reason, _edge(merged, r)) for r in merged.refused),
         merged.rulings.made,
+        merged.superseded,
     )
 
 
@@ -66,7 +67,9 @@ def merged_of(content: MapFile) -> MergedMap:
     }
     refused = tuple(_refused(pair) for pair in content.refused)
     components = tuple(frozenset(graph.nodes) for graph in solved)
-    return MergedMap(dict(sorted(maps.items())), links, refused, components, postures, tuple(solved), rulings)
+    superseded = {node: fate for node, fate in content.superseded.items() if node in postures}
+    parts = dict(sorted(maps.items()))
+    return MergedMap(parts, links, refused, components, postures, tuple(solved), rulings, superseded)
 
 
 def _is_link(edge: Edge) -> bool:

@@ -10,12 +10,15 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.placeindex import PlaceIndex
+from mapserver.roadmap import ReachBook
 from merge.candidates import CandidateSettings, Pair
+from merge.fading import Fader, FadingSettings
 from merge.incremental import Islands, Verdict, Verdicts
 from merge.incremental_pairs import PairTable
 from merge.links import Link
 from merge.merged import MergedMap
 from merge.merging import MergeSettings
+from merge.renewal import RenewalSettings, Renewer
 from merge.verification import VerificationSettings, verify
 
 
@@ -27,11 +30,15 @@ class MergerSettings:
         candidates: which pairs are looked at; the place index must have the same.
         verification: when two nodes are linked.
         merging: which links are believed.
+        renewal: when newer nodes stand for older ones.
+        fading: when landmarks are thought to be gone.
     """
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     merging: MergeSettings = field(default_factory=MergeSettings)
+    renewal: RenewalSettings = field(default_factory=RenewalSettings)
+    fading: FadingSettings = field(default_factory=FadingSettings)
 
 
 @dataclass
@@ -69,6 +76,7 @@ class Merger:
         self.index = index or PlaceIndex()
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
+        self.reaches = ReachBook()
         self._settings = settings or MergerSettings()
         self._pairs = PairTable(self._settings.candidates)
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
@@ -76,6 +84,8 @@ class Merger:
         self._islands = Islands(self._settings.merging)
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
+        self._renewer = Renewer(self._settings.renewal, self._settings.verification)
+        self._fader = Fader(self._settings.fading)
         self._rulings = Rulings()
         self._merged = MergedMap.empty()
         self._dirty = False
@@ -148,7 +158,8 @@ class Merger:
             for map_id in self._touched & self.maps.keys():
                 # Copies: a merged map stays as it was when later changes come.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
-            self._merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
+            merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
+            self._merged = self._fader.fade(self._renewer.renewed(merged))
             self.counters.merges += 1
             self._touched = set()
             self._dirty = False

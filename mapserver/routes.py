@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from hybridmap.node import EdgeId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
-from hybridmap.route import Route, RouteSettings, find_route
+from hybridmap.reach import RECOGNISED
+from hybridmap.route import Route, RouteSettings, Ways
+from mapserver.living import without_faded
+from mapserver.roadmap import ReachBook, Roadmap
 from merge.merged import MergedMap
+from merge.undoing import reason_of
 
 ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""
-UNDRIVEN = (EdgeKind.LOOP, EdgeKind.MERGED)
-"""Edges that were recognised, but that nobody may have driven."""
 
 
 @dataclass(frozen=True)
@@ -48,25 +49,28 @@ class RouterSettings:
 class Router:
     """Answers how to get from node to node. It stands for one merged map; make another for the next."""
 
-    def __init__(self, merged: MergedMap, settings: RouterSettings | None = None) -> None:
-        """Take a merged map."""
-        self._union: HybridMap = merged.union()
-        self._postures = {node: place.merged_from_robot.mean for node, place in merged.postures.items()}
+    def __init__(
+        self, merged: MergedMap, settings: RouterSettings | None = None, reaches: ReachBook | None = None
+    ) -> None:
+        """Take a merged map. Nothing is made of it before the first question.
+
+        Args:
+            merged: the map.
+            settings: how routes are chosen.
+            reaches: what is known of edges from maps before; it is written to.
+        """
         self._merged = merged
         self._settings = settings or RouterSettings()
-        self._join_near()
+        self._reaches = reaches or ReachBook()
+        self._turn = threading.Lock()
+        self._made: Roadmap | None = None
 
-    def _join_near(self) -> None:
-        """Let routes change between nodes that stand in one place and look in different directions."""
-        for number, members in enumerate(self._merged.components):
-            nodes = sorted(members)
-            places = np.array([[self._postures[n].x, self._postures[n].y] for n in nodes])
-            for k, (i, j) in enumerate(sorted(cKDTree(places).query_pairs(self._settings.near))):
-                a, b = nodes[i], nodes[j]
-                if not self._union.graph.has_edge(a, b):
-                    between = PoseGaussian(self._postures[a].inverse() @ self._postures[b], np.zeros((3, 3)))
-                    edge = Edge(EdgeId("near", number, k), a, b, between, EdgeKind.LOOP)
-                    self._union.edges[edge.id] = edge
+    @property
+    def _roads(self) -> Roadmap:
+        with self._turn:
+            if self._made is None:
+                self._made = Roadmap(self._merged, self._settings.near, self._reaches)
+            return self._made
 
     def route(
         self,
@@ -91,43 +95,74 @@ class Router:
             The legs. Their relative postures are those of the optimised graph: each is the best estimate
             from all edges together. That of the first is relative to `start`.
         """
+        placed = self._merged.postures
         for name, node in (("start", start), ("goal", goal)):
-            if node not in self._postures:
-                return RouteAnswer((), f"{name} {node} is not in the merged map")
+            if node not in placed:
+                retired = self._merged.rulings.retired.get(node.map)
+                why = f": {reason_of(retired)}" if retired is not None else ""
+                return RouteAnswer((), f"{name} {node} is not in the merged map{why}")
         if self._merged.component_of(start) != self._merged.component_of(goal):
             return RouteAnswer((), f"{start} and {goal} are in parts of the map that nothing joins yet")
-        penalties = self._penalties(wary)
+        roads = self._roads
+        ends = {node: roads.postures[node] for node in (start, goal)}
+        # Nodes that others stand for are passed only where it must be.
+        for postures in (roads.living | ends, roads.postures):
+            best, reason = self._cheapest(start, goal, postures, blocked, wary, start_from_robot)
+            if best is not None:
+                return self._answer(start, best)
+        return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
+
+    def _cheapest(
+        self,
+        start: NodeId,
+        goal: NodeId,
+        postures: Mapping[NodeId, Pose2],
+        blocked: Collection[tuple[NodeId, NodeId]],
+        wary: Collection[tuple[NodeId, NodeId]],
+        start_from_robot: Pose2 | None,
+    ) -> tuple[Route | None, str]:
+        """The cheapest way over nodes with these postures, or why the nearest entry has none."""
+        roads = self._roads
+        ways = Ways(
+            roads.union, postures=postures, penalties=self._penalties(wary), blocked=blocked,
+            closed=roads.closed, settings=self._settings.route,
+        )  # fmt: skip
         best: Route | None = None
         reason, best_cost = "", math.inf
-        for entry, cost in self._entries(start, start_from_robot, blocked):
+        for entry, cost in self._entries(start, postures, start_from_robot, blocked):
             if cost >= best_cost:
                 break
-            found = find_route(
-                self._union, entry, goal, postures=self._postures, penalties=penalties, blocked=blocked,
-                settings=self._settings.route,
-            )  # fmt: skip
+            found = ways.find(entry, goal)
             reason = reason or found.reason
             if found.nodes and cost + found.cost < best_cost:
                 best, best_cost = found, cost + found.cost
-        if best is None:
-            return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
-        legs = [RouteLeg(self._union.nodes[best.nodes[0]], self._relative(start, best.nodes[0]), None)]
+        return best, reason
+
+    def _answer(self, start: NodeId, best: Route) -> RouteAnswer:
+        union = self._roads.union
+        nodes = {node: without_faded(union.nodes[node], self._merged) for node in best.nodes}
+        legs = [RouteLeg(nodes[best.nodes[0]], self._relative(start, best.nodes[0]), None)]
         for before, node, edge_id in zip(best.nodes, best.nodes[1:], best.edges, strict=False):
-            edge = self._union.edges[edge_id]
-            legs.append(RouteLeg(self._union.nodes[node], self._relative(before, node), edge.kind))
+            kind = union.edges[edge_id].kind
+            legs.append(RouteLeg(nodes[node], self._relative(before, node), kind))
         return RouteAnswer(tuple(legs), best.reason)
 
     def _entries(
-        self, start: NodeId, start_from_robot: Pose2 | None, blocked: Collection[tuple[NodeId, NodeId]]
+        self,
+        start: NodeId,
+        postures: Mapping[NodeId, Pose2],
+        start_from_robot: Pose2 | None,
+        blocked: Collection[tuple[NodeId, NodeId]],
     ) -> list[tuple[NodeId, float]]:
         """Nodes where the route may begin with what it costs to get there, cheapest first."""
         if start_from_robot is None:
             return [(start, 0.0)]
         s = self._settings
-        here = self._postures[start] @ start_from_robot
+        here = postures[start] @ start_from_robot
         component = self._merged.component_of(start)
         barred = {frozenset(pair) for pair in blocked}
-        near = sorted((here.distance(self._postures[n]), n) for n in self._merged.components[component or 0])
+        members = self._merged.components[component or 0]
+        near = sorted((here.distance(postures[n]), n) for n in members if n in postures)
         entries = [
             (node, s.entry_cost * distance - self._saved(here, node, distance, barred))
             for distance, node in near
@@ -137,17 +172,17 @@ class Router:
 
     def _saved(self, here: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
         """By how much it is cheaper to get to a node for a robot that stands on an edge to it, m."""
-        s = self._settings
-        target = self._postures[node]
+        s, roads = self._settings, self._roads
+        target = roads.postures[node]
         goal = np.array([target.x, target.y])
         at = np.array([here.x, here.y])
         saved = 0.0
-        for _, other, edge_id in self._union.graph.edges(node, keys=True):
-            if self._union.edges[edge_id].kind in UNDRIVEN or frozenset((node, other)) in barred:
+        for _, other, edge_id in roads.union.graph.edges(node, keys=True):
+            if roads.union.edges[edge_id].kind in RECOGNISED or frozenset((node, other)) in barred:
                 continue
-            if other not in self._postures:
+            if other not in roads.postures:
                 continue
-            along = np.array([self._postures[other].x, self._postures[other].y]) - goal
+            along = np.array([roads.postures[other].x, roads.postures[other].y]) - goal
             share = float(np.clip((at - goal) @ along / max(along @ along, 1e-9), 0.0, 1.0))
             off = float(np.linalg.norm(at - goal - share * along))
             if off <= s.on_edge and share < 1.0:
@@ -158,7 +193,9 @@ class Router:
         if not wary:
             return {}
         pairs, cost = {frozenset(pair) for pair in wary}, self._settings.wary_cost
-        return {edge.id: cost for edge in self._union.edges.values() if frozenset((edge.a, edge.b)) in pairs}
+        return {
+            edge.id: cost for edge in self._roads.union.edges.values() if frozenset((edge.a, edge.b)) in pairs
+        }
 
     def _relative(self, a: NodeId, b: NodeId) -> PoseGaussian:
         if a == b:

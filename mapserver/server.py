@@ -135,6 +135,7 @@ class MapServer:
         traffic = self._store.traffic()
         return {
             "nodes": len(merged.postures),
+            "superseded": len(merged.superseded),
             "maps": len(merged.maps),
             "components": len(merged.components),
             "links": len(between),

@@ -169,5 +169,7 @@ def _ruling(ruling: Ruling) -> str:
     when = datetime.fromtimestamp(ruling.stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M UTC")
     word = "ruled that they shall not be linked" if ruling.apart else "ruled that they may be linked again"
     why = f': "{ruling.because}"' if ruling.because else ""
-    ends = f"{ruling.ends[0]} and {ruling.ends[1]}"
+    if ruling.retires is not None:
+        word = "ruled that it is retired" if ruling.apart else "ruled that it is in use again"
+    ends = f"{ruling.ends[0]} and {ruling.ends[1]}" if ruling.retires is None else f"map {ruling.retires}"
     return f"{when} {ruling.who or 'somebody'} {word} ({ends}){why}"

@@ -12,8 +12,9 @@ from hybridmap.errors import InvalidValue
 from hybridmap.explanation import Misfit, PairExplanation, Standing, Witness
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.matching import match
-from hybridmap.node import EdgeKind, MapId, Node, NodeId
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2
+from hybridmap.reach import RECOGNISED, reach_of
 from hybridmap.recognition import Recognition
 from merge.claims import CLAIMS
 from merge.consistency import ConsistencySettings, group_links, loop_distances2
@@ -59,6 +60,10 @@ def explain_nodes(
     link, refusal = _link(merged, one.id, two.id), _refusal(merged, one.id, two.id)
     found = _looked_at(one, two, link or (refusal.link if refusal else None), verification)
     ruling = merged.rulings.against(one.id, two.id)
+    retired = next((r for m, r in merged.rulings.retired.items() if m in (one.id.map, two.id.map)), None)
+    if retired is not None:
+        about = merged.rulings.about(one.id, two.id)
+        return replace(found, standing=Standing.UNDONE, reason=reason_of(retired), rulings=about)
     witnesses: tuple[Witness, ...] = ()
     if link is not None:
         witnesses = _witnesses(merged, link, consistency)
@@ -83,7 +88,7 @@ def explain_nodes(
         found,
         standing=standing,
         reason=reason,
-        claims=tuple(_claims(merged, one.id, two.id)),
+        claims=(*_claims(merged, one.id, two.id), *_consequences(merged, one.id, two.id)),
         rulings=merged.rulings.about(one.id, two.id),
     )
     if geometry is None:
@@ -223,4 +228,20 @@ def _claims(merged: MergedMap, a: NodeId, b: NodeId) -> Iterator[str]:
                     words += f"; refused: {refused[edge.id]}"
                 elif edge.kind in CLAIMS:
                     words += "; believed"
+                    if edge.kind in RECOGNISED:
+                        words += f"; {_reach(merged, edge)}"
                 yield words
+
+
+def _consequences(merged: MergedMap, a: NodeId, b: NodeId) -> Iterator[str]:
+    """What follows for routes and for the two nodes' lives."""
+    link = _link(merged, a, b)
+    if link is not None:
+        yield f"the link {_reach(merged, link.edge())}"
+    for node in (a, b):
+        if node in merged.superseded:
+            yield f"{node} is superseded: {merged.superseded[node]}"
+
+
+def _reach(merged: MergedMap, edge: Edge) -> str:
+    return reach_of(edge, node_of(merged, edge.a), node_of(merged, edge.b)).reason

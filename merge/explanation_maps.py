@@ -13,6 +13,7 @@ from hybridmap.errors import InvalidValue
 from hybridmap.explanation import MapsExplanation, NearMiss
 from hybridmap.matching import match
 from hybridmap.node import MapId, NodeId
+from hybridmap.reach import reach_of
 from merge.explanation import node_of
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap
@@ -96,12 +97,19 @@ def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[
     if links:
         landmarks = sum(link.weight for link in links)
         many = "1 link joins" if len(links) == 1 else f"{len(links)} links join"
-        return f"{first} and {second} are one map: {many} them, with {landmarks} landmarks behind"
+        driven = sum(_drivable(merged, link) for link in links)
+        ways = f"{driven} of them can be driven" if driven else "they tie postures, none can be driven"
+        return f"{first} and {second} are one map: {many} them, with {landmarks} landmarks behind; {ways}"
     graph: nx.Graph = nx.Graph((link.a.map, link.b.map) for link in merged.links)
     # A map may be in several pieces, so a way over maps is no more than a hint where to look.
     way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
     over = ", ".join(map(str, way[1:-1])) or "each other's pieces"
     return f"{first} and {second} are one map by way of {over}; no link joins the two directly"
+
+
+def _drivable(merged: MergedMap, link: Link) -> bool:
+    edge = link.edge()
+    return reach_of(edge, node_of(merged, edge.a), node_of(merged, edge.b)).drivable
 
 
 def _why_apart(
@@ -113,7 +121,8 @@ def _why_apart(
     nearest: Sequence[NearMiss],
 ) -> str:
     head = f"{first} and {second} are not one map"
-    ruling = next((r for r in merged.rulings.in_force if r.ends == (first, second)), None)
+    ends = ((first, second), (first, first), (second, second))
+    ruling = next((r for r in merged.rulings.in_force if r.ends in ends), None)
     if ruling is not None:
         return f"{head}: {reason_of(ruling)}"
     if refused:

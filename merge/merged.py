@@ -6,11 +6,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hybridmap.change import EdgePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ruling import Rulings
+from hybridmap.superseded import Superseded
 from merge.links import Link, RefusedLink
 from merge.posegraph import PoseGraph
 
@@ -86,6 +90,10 @@ class MergedMap:
         postures: of all nodes.
         graphs: the solved graph of each component, for covariances between nodes.
         rulings: of people on what shall not be linked; the refused say which of them had anything to undo.
+        superseded: nodes that newer ones of the same place stand for, see merge.renewal. They go on tying
+            postures; questions are answered from the others.
+        faded: (N,) of nodes, which of their landmarks are thought to be gone, see merge.fading. Nodes where
+            none is are left out.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -95,6 +103,8 @@ class MergedMap:
     postures: Mapping[NodeId, Placement]
     graphs: tuple[PoseGraph, ...] = ()
     rulings: Rulings = field(default_factory=Rulings)
+    superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
+    faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
 
     @staticmethod
     def empty() -> MergedMap:
@@ -159,7 +169,10 @@ class MergedMap:
         return f"{a} and {b} were not compared: they share too few alike features"
 
     def summary(self) -> str:
-        """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
+        """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused, 4 superseded`.
+
+        Superseded nodes and retired maps are among the nodes and maps.
+        """
         refused = sum(refusal.link is not None for refusal in self.refused)
         counts = (
             (len(self.postures), "node"),
@@ -168,4 +181,6 @@ class MergedMap:
             (len(self.links), "link"),
         )
         words = [f"{count} {word}{'' if count == 1 else 's'}" for count, word in counts]
-        return ", ".join([*words, f"{refused} refused"])
+        more = ((len(self.superseded), "superseded"), (len(self.rulings.retired), "retired"))
+        words += [f"{refused} refused", *(f"{count} {word}" for count, word in more if count)]
+        return ", ".join(words)

@@ -46,7 +46,7 @@ class Undone:
 
 
 def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Rulings) -> Undone:
-    """Take away what is ruled out: links, and what a robot itself claims to have recognised.
+    """Take away what is ruled out: retired maps, links, and what a robot itself claims to have recognised.
 
     How a robot drove and turned while it mapped is measured and stands.
 
@@ -65,8 +65,10 @@ def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Ruling
             refused.append(refuse(link, reason_of(ruling)))
     if not rulings.in_force:
         return Undone(maps, tuple(kept), (), maps, rulings)
-    left = dict(maps)
-    for map_id, one in maps.items():
+    retired = rulings.retired
+    left = {map_id: one for map_id, one in maps.items() if map_id not in retired}
+    kept = [link for link in kept if link.a.map not in retired and link.b.map not in retired]
+    for map_id, one in tuple(left.items()):
         out = [
             (edge, ruling)
             for edge in one.edges.values()
@@ -94,6 +96,9 @@ def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
     """
     first, second = ruling.ends
     known = next((r for r in rulings.in_force if r.ends == ruling.ends), None)
+    if ruling.retires is not None:
+        _check_retirement(merged, known, ruling, ruling.retires)
+        return
     if not ruling.apart:
         if known is None:
             raise InvalidValue(f"nothing that people have ruled keeps {first} and {second} apart")
@@ -114,10 +119,22 @@ def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
     raise InvalidValue(f"no link joins {first} and {second}: there is nothing to undo")
 
 
+def _check_retirement(merged: MergedMap, known: Ruling | None, ruling: Ruling, which: MapId) -> None:
+    if which not in merged.maps:
+        there = ", ".join(map(str, merged.maps)) or "none"
+        raise InvalidValue(f"there is no map {which}; known are: {there}")
+    if ruling.apart and known is not None:
+        raise InvalidValue(f"map {which} is retired already: {reason_of(known)}")
+    if not ruling.apart and known is None:
+        raise InvalidValue(f"map {which} is not retired")
+
+
 def reason_of(ruling: Ruling) -> str:
     """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
     when = datetime.fromtimestamp(ruling.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
     first, second = ruling.ends
     what = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
     why = f': "{ruling.because}"' if ruling.because else ""
+    if ruling.retires is not None:
+        return f"map {ruling.retires} is retired by {ruling.who or 'somebody'} on {when}{why}"
     return f"undone{what} by {ruling.who or 'somebody'} on {when}{why}"

@@ -28,6 +28,7 @@ from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import Edge, NodeId
 from hybridmap.pose import PoseGaussian
 from hybridmap.ruling import Ruling
+from hybridmap.superseded import Superseded
 from wire.codec import MAX_BODY_BYTES, decode_body, encode_body
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import POSTURE, pack_posture, unpack_posture
@@ -73,6 +74,7 @@ class MapFile:
         postures: of a merged map's nodes: number of the component, posture in that component's frame.
         refused: of a merged map: pairs that were not linked. Edges of robots that are refused are only here.
         rulings: of people on what shall not be linked, in order.
+        superseded: of a merged map: nodes that newer ones stand for.
     """
 
     kind: Kind
@@ -81,6 +83,7 @@ class MapFile:
     postures: Mapping[NodeId, tuple[int, PoseGaussian]] = field(default_factory=dict)
     refused: tuple[RefusedPair, ...] = ()
     rulings: tuple[Ruling, ...] = ()
+    superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
 
 
 def write_map_file(path: Path, content: MapFile) -> None:
@@ -179,7 +182,15 @@ def _pack(content: MapFile) -> bytes:
         for r in content.refused
     ]
     return pack(
-        {**fields, "refused": refused, "rulings": [pack_ruling(ruling) for ruling in content.rulings]}
+        {
+            **fields,
+            "refused": refused,
+            "rulings": [pack_ruling(ruling) for ruling in content.rulings],
+            "superseded": [
+                [list(node), list(fate.by), fate.found, fate.distance, fate.turn]
+                for node, fate in content.superseded.items()
+            ],
+        }
     )
 
 
@@ -209,7 +220,12 @@ def _unpack(content: bytes) -> MapFile:
         read_ruling(reader, value)
         for value in (reader.array("rulings", MAX_ELEMENTS) if reader.has("rulings") else [])
     )
-    return MapFile(kinds[name], reader.text("title", MAX_TITLE), changes, postures, refused, rulings)
+    superseded = dict(
+        _read_superseded(reader, value)
+        for value in (reader.array("superseded", MAX_ELEMENTS) if reader.has("superseded") else [])
+    )
+    title = reader.text("title", MAX_TITLE)
+    return MapFile(kinds[name], title, changes, postures, refused, rulings, superseded)
 
 
 def _read_refused(reader: Reader, value: Any) -> RefusedPair:
@@ -225,6 +241,16 @@ def _read_refused(reader: Reader, value: Any) -> RefusedPair:
     if body is not None and not isinstance(body, EdgePut):
         raise reader.error("what was refused must be an edge")
     return RefusedPair(a, b, reason, None if body is None else body.edge)
+
+
+def _read_superseded(reader: Reader, value: Any) -> tuple[NodeId, Superseded]:
+    parts = reader.as_array(value, "superseded node", 32)
+    if len(parts) < 5:
+        raise reader.error("a superseded node must be [node, by, landmarks, distance, turn]")
+    node, by = (reader.as_node_id(part, "node") for part in parts[:2])
+    found = reader.as_integer(parts[2], "landmarks", 0, MAX_NUMBER)
+    distance, turn = (reader.as_number(part, "distance or turn", 0.0, 1e6) for part in parts[3:5])
+    return node, Superseded(by, found, distance, turn)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -32,6 +32,18 @@ def ends_of(words: list[str]) -> Ends:
     return first, second
 
 
+def map_of(word: str) -> MapId:
+    """Read a map.
+
+    Raises:
+        InvalidValue: it is none.
+    """
+    found = _read(word)
+    if isinstance(found, NodeId):
+        raise InvalidValue(f"{word} is a node: give its map, {found.map}")
+    return found
+
+
 def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: bytes) -> list[Reply]:
     """Ask every map server of the fleet.
 

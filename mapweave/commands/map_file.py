@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mapweave.commands import map_explain, map_export, map_import, map_merge, map_show, map_unmerge
+from mapweave.commands import (
+    map_explain,
+    map_export,
+    map_import,
+    map_merge,
+    map_retire,
+    map_show,
+    map_unmerge,
+)
 
 
 def add_to(commands: Any) -> None:
@@ -14,5 +22,5 @@ def add_to(commands: Any) -> None:
         "map", help="look into maps, ask why they are one, merge, export"
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    for action in (map_show, map_explain, map_unmerge, map_merge, map_export, map_import):
+    for action in (map_show, map_explain, map_unmerge, map_retire, map_merge, map_export, map_import):
         action.add_to(actions)

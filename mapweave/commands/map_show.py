@@ -55,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         "bytes": arguments.file.stat().st_size,
         "maps": sorted({str(n.map) for n in hybrid.nodes}),
         "nodes": len(hybrid.nodes),
+        "superseded": len(content.superseded),
         "edges": kinds,
         "links": sum(e.kind is EdgeKind.MERGED for e in hybrid.edges.values()),
         "refused": sum(pair.edge is not None for pair in content.refused),

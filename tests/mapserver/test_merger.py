@@ -320,7 +320,7 @@ def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
 def test_long_links_that_nobody_has_driven_are_avoided(scene: Scene, merger: Merger) -> None:
     merged = merger.merged()
     start, goal = min(scene.truth), max(scene.truth)
-    bold = RouterSettings(route=RouteSettings(per_undriven=0.0), near=0.0)
+    bold = RouterSettings(route=RouteSettings(per_undriven=0.0))
     undriven = {EdgeKind.LOOP, EdgeKind.MERGED}
 
     def longest(router: Router) -> float:

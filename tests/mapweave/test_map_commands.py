@@ -141,6 +141,27 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     assert links(tmp_path / "one.mapweave") == [other for other in links(path) if other != pair]
 
 
+def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path: Path) -> None:
+    path = tmp_path / "m.mapweave"
+    path.write_bytes(files[3].read_bytes())
+    before = read_map_file(path)
+    out = said("map", "retire", "r1.1", "--because", "rebuilt", "--by", "anna", "--map", path)
+    assert "1 retired" in out and not links(path)
+    left = read_map_file(path)
+    assert {node.map for node in left.postures} == {R0, R2}
+    assert len(left.changes) == len(before.changes) - len(links(files[3])), "nothing of the maps is lost"
+    out = said("map", "explain", "r0.1", "r1.1", "--map", path)
+    assert "not one map: map r1.1 is retired by anna on 20" in out and '"rebuilt"' in out
+    out = said("map", "explain", "r0.1.1", "r1.1.1", "--map", path)
+    assert "are not linked: map r1.1 is retired by anna" in out
+    # A later merge with others heeds it too.
+    said("map", "merge", path, "-o", path)
+    assert not links(path)
+    said("map", "retire", "r1.1", "--undo", "--map", path)
+    assert links(path) == links(files[3])
+    assert "ruled that it is in use again (map r1.1)" in said("map", "explain", "r0.1", "r1.1", "--map", path)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -153,6 +174,9 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
         (["explain", "--draw", "x.png"], "--draw needs two nodes"),
         (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo"),
         (["unmerge", "r0.1", "r0.1"], "two different maps"),
+        (["retire", "r0.1.1"], "r0.1.1 is a node: give its map, r0.1"),
+        (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
+        (["retire", "r0.1", "--undo"], "map r0.1 is not retired"),
         (["unmerge", "r0.1", "r1.1", "--undo"], "nothing that people have ruled keeps r0.1 and r1.1 apart"),
         (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line"),
     ],
@@ -215,7 +239,7 @@ def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_
     at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}", "--timeout", "60"]
     with serving(tmp_path, port):
         end = time.monotonic() + 90
-        while "r0.1 and r1.1 are one map: " not in said("map", "explain", *at):
+        while "r0.1 and r1.1 are one map: " not in said_or_refused(said, "map", "explain", *at):
             assert time.monotonic() < end, "the server has not merged"
         pair = links(files[3])[0]
         # The same numbers from the server, once it has merged all, as from the file merged without one.

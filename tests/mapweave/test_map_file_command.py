@@ -67,6 +67,7 @@ def test_the_summary_of_an_agents_map(agent_file, capfd):
         "bytes": agent_file.stat().st_size,
         "maps": ["r0.1"],
         "nodes": len(TOUR),
+        "superseded": 0,
         "edges": {"turned": len(TOUR) - 1},
         "links": 0,
         "refused": 0,

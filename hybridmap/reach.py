@@ -1,0 +1,147 @@
+"""Reachability: which edges the servo could drive, and which only say how two nodes stand to each other.
+
+An edge that a robot drove or turned along while its landmarks were followed can be driven again. One that was
+only recognised may join two views of one thing from the two sides of a room. The servo holds on to the
+landmarks that both nodes show: enough of them must stay in view all the way, and the other node must be no
+further off, and no more turned, than the servo manages from (docs/decisions/life-of-a-map.md gives figures).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeId, EdgeKind, Node
+from hybridmap.pose import Array, Pose2
+
+RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
+"""Edges that say that two nodes show the same, and not that anybody drove from one to the other."""
+
+
+@dataclass(frozen=True)
+class ReachSettings:
+    """What the servo manages.
+
+    Attributes:
+        farthest: m, between two nodes.
+        widest: rad, between their headings.
+        least: common landmarks that stay in view: a robot follows a node by as many as a look for it asks.
+        stops: postures on the way at which is counted.
+    """
+
+    farthest: float = 1.5
+    widest: float = math.radians(45.0)
+    least: int = 7
+    stops: int = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Whether the servo could drive an edge.
+
+    Attributes:
+        drivable: whether routes may use it.
+        in_view: fewest common landmarks in view on the way; -1 for an edge that was driven: nobody counts.
+        reason: in words.
+    """
+
+    drivable: bool
+    in_view: int
+    reason: str
+
+
+def reach_of(edge: Edge, a: Node, b: Node, settings: ReachSettings | None = None) -> Reach:
+    """Say whether the servo could drive an edge, in either direction: what is in view there is so back.
+
+    Args:
+        edge: between the two.
+        a: node at the edge's a.
+        b: node at its b.
+        settings: what the servo manages.
+    """
+    if edge.kind not in RECOGNISED:
+        return Reach(True, -1, f"{edge.kind} by a robot: it can be driven")
+    s = settings or ReachSettings()
+    between = edge.a_from_b.mean
+    count = int(least_in_view(edge.shared, a, b, between, s.stops))
+    distance, turn = between.distance(Pose2()), abs(between.heading)
+    lacks = []
+    if count < s.least:
+        common = "landmark stays" if count == 1 else "landmarks stay"
+        lacks.append(f"only {count} {common} in view" if count else "no landmark stays in view")
+    if distance > s.farthest:
+        lacks.append(f"{distance:.1f} m are more than the {s.farthest:g} m that the servo manages")
+    if turn > s.widest:
+        most = math.degrees(s.widest)
+        lacks.append(f"{math.degrees(turn):.0f} degrees are more than the {most:.0f} that the servo manages")
+    if lacks:
+        return Reach(False, count, f"ties postures, not driven: {'; '.join(lacks)}")
+    return Reach(True, count, f"can be driven: {count} landmarks stay in view")
+
+
+def closed_edges(hybrid_map: HybridMap, settings: ReachSettings | None = None) -> set[EdgeId]:
+    """Edges of a map that the servo could not drive."""
+    nodes = hybrid_map.nodes
+    return {
+        edge.id
+        for edge in hybrid_map.edges.values()
+        if edge.kind in RECOGNISED
+        and edge.a in nodes
+        and edge.b in nodes
+        and not reach_of(edge, nodes[edge.a], nodes[edge.b], settings).drivable
+    }
+
+
+def least_in_view(shared: NDArray[np.int64], a: Node, b: Node, a_from_b: Pose2, stops: int = 9) -> int:
+    """Fewest common landmarks that both nodes' cameras would see at postures between the two.
+
+    The postures lie on the straight line with the heading turning evenly. A landmark whose depth neither node
+    knows counts as in view, for it is at both ends.
+
+    Args:
+        shared: (K, 2) landmarks of a and of b that are the same.
+        a: one node.
+        b: the other.
+        a_from_b: how they stand.
+        stops: postures, the ends among them.
+    """
+    if not len(shared):
+        return 0
+    points = common_points(shared, a, b, a_from_b)
+    share = np.linspace(0.0, 1.0, stops)
+    postures = share[:, None] * a_from_b.vector
+    seen = _visible(postures, points, a.camera) & _visible(postures, points, b.camera)
+    # What a node sees it sees, wherever noise puts the point.
+    seen[[0, -1]] = True
+    return int((seen | np.isnan(points[:, 0])).sum(axis=1).min())
+
+
+def common_points(shared: NDArray[np.int64], a: Node, b: Node, a_from_b: Pose2) -> Array:
+    """(K, 3) m, in a, common landmarks by the depth that is known better; NaN where none is.
+
+    Args:
+        shared: (K, 2) landmarks of a and of b that are the same.
+        a: one node.
+        b: the other.
+        a_from_b: how they stand.
+    """
+    in_a, in_b = a.landmarks.take(shared[:, 0]), b.landmarks.take(shared[:, 1])
+    by_a, by_b = in_a.points_in_robot(a.camera), a_from_b.apply(in_b.points_in_robot(b.camera))
+    sigma_a = np.where(in_a.has_depth, in_a.depth_sigmas, np.inf)
+    sigma_b = np.where(in_b.has_depth, in_b.depth_sigmas, np.inf)
+    points: Array = np.where((sigma_a <= sigma_b)[:, None], by_a, by_b)
+    return points
+
+
+def _visible(postures: Array, points: Array, camera: Camera) -> NDArray[np.bool_]:
+    """(S, K) whether points (K, 3) are in the image at postures (S, 3), both in one frame."""
+    cosine, sine = np.cos(postures[:, 2:]), np.sin(postures[:, 2:])
+    dx, dy = points[:, 0] - postures[:, :1], points[:, 1] - postures[:, 1:2]
+    height = np.broadcast_to(points[:, 2], dx.shape)
+    in_robot = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx, height], axis=-1)
+    return camera.contains(camera.project(in_robot))

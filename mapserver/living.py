@@ -1,0 +1,53 @@
+"""The living places: what questions are answered from, of all that the server knows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from hybridmap.node import Node, NodeId
+from hybridmap.query import View
+from mapserver.placeindex import PlaceIndex
+from merge.merged import MergedMap
+
+
+class LivingPlaces:
+    """The place index without superseded nodes and retired maps, and nodes without what has faded.
+
+    It stands for one merged map; make another for the next. New nodes are compared with all of the index.
+    """
+
+    def __init__(
+        self, index: PlaceIndex, node_of: Callable[[NodeId], Node | None], merged: MergedMap
+    ) -> None:
+        """Take what is known.
+
+        Args:
+            index: of all nodes, also of such as are not in the merged map yet.
+            node_of: gives a node by its id as its robot told it.
+            merged: says what is superseded, retired or faded.
+        """
+        self._index, self._node_of, self._merged = index, node_of, merged
+        self._retired = frozenset(merged.rulings.retired)
+        retired = (node for one in self._retired if one in merged.maps for node in merged.maps[one].nodes)
+        self._hidden = frozenset((*merged.superseded, *retired))
+
+    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+        """At most k living nodes with how much they look like a view, best first."""
+        ranked = self._index.query(view, k, exclude=self._hidden)
+        # A retired map's robot may have mapped on.
+        return [(node, score) for node, score in ranked if node.map not in self._retired]
+
+    def node(self, node_id: NodeId) -> Node | None:
+        """A node with the landmarks that are thought to be there; None if it is gone."""
+        known = self._node_of(node_id)
+        return None if known is None else without_faded(known, self._merged)
+
+
+def without_faded(node: Node, merged: MergedMap) -> Node:
+    """A node with the landmarks that are thought to be there: the very same one if all are."""
+    faded = merged.faded.get(node.id)
+    # A node that has been put anew since then is taken as it is.
+    if faded is None or len(faded) != len(node.landmarks):
+        return node
+    return replace(node, landmarks=node.landmarks.take(~faded))

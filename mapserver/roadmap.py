@@ -1,0 +1,108 @@
+"""What routes may use of a merged map: which edges can be driven, and which nodes stand for their places."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeId, EdgeKind, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.reach import RECOGNISED, Reach, ReachSettings, reach_of
+from merge.merged import MergedMap
+
+Faded = Mapping[NodeId, NDArray[np.bool_]]
+"""Of each node which landmarks are thought to be gone."""
+
+
+class ReachBook:
+    """What was found out of edges, from merged map to merged map: an edge is looked at once."""
+
+    def __init__(self, settings: ReachSettings | None = None) -> None:
+        """Start with nothing known.
+
+        Args:
+            settings: what the servo manages.
+        """
+        self._settings = settings or ReachSettings()
+        self._known: dict[EdgeId, tuple[tuple[object, ...], Reach]] = {}
+
+    def closed(self, edges: Iterable[Edge], nodes: Mapping[NodeId, Node], faded: Faded) -> set[EdgeId]:
+        """Those of the edges that the servo could not drive; what is known of others is forgotten.
+
+        Args:
+            edges: of a merged map.
+            nodes: of it.
+            faded: which of their landmarks are thought to be gone: these hold no servo.
+        """
+        before, self._known = self._known, {}
+        for edge in edges:
+            if edge.kind not in RECOGNISED or edge.a not in nodes or edge.b not in nodes:
+                continue
+            a, b = nodes[edge.a], nodes[edge.b]
+            gone = [faded.get(end) for end in (edge.a, edge.b)]
+            behind = (edge.a_from_b, a, b, *gone)
+            known = before.get(edge.id)
+            if known is None or any(one is not other for one, other in zip(known[0], behind, strict=True)):
+                left = np.ones(len(edge.shared), np.bool_)
+                for side, mask in enumerate(gone):
+                    if mask is not None:
+                        left &= ~mask[edge.shared[:, side]]
+                known = behind, reach_of(replace(edge, shared=edge.shared[left]), a, b, self._settings)
+            self._known[edge.id] = known
+        return {edge_id for edge_id, (_, reach) in self._known.items() if not reach.drivable}
+
+
+class Roadmap:
+    """The edges of a merged map, and those that follow from where nodes are.
+
+    Attributes:
+        merged: the map.
+        union: its nodes and edges. Besides, nodes that stand in one place are joined, whatever they show: a
+            robot can turn there. And every superseded node is joined with the one that stands for it.
+        closed: edges that only tie postures.
+        postures: of all nodes.
+        living: of those that no other node stands for.
+    """
+
+    def __init__(self, merged: MergedMap, near: float, reaches: ReachBook) -> None:
+        """Take a merged map.
+
+        Args:
+            merged: the map.
+            near: nodes nearer than this to each other stand in one place, m.
+            reaches: what is known of edges.
+        """
+        self.merged = merged
+        self.union: HybridMap = merged.union()
+        self.closed = reaches.closed(self.union.edges.values(), self.union.nodes, merged.faded)
+        self.postures = {node: merged.pose(node) for node in merged.postures}
+        self.living = {node: p for node, p in self.postures.items() if node not in merged.superseded}
+        self._join_near(near)
+        for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
+            if node in self.postures and fate.by in self.postures:
+                self._join(EdgeId("superseded", 0, k), node, fate.by)
+
+    def _join_near(self, near: float) -> None:
+        for number, members in enumerate(self.merged.components):
+            nodes = sorted(node for node in members if node in self.postures)
+            if not nodes:
+                continue
+            places = np.array([[self.postures[n].x, self.postures[n].y] for n in nodes])
+            for k, (i, j) in enumerate(sorted(cKDTree(places).query_pairs(near))):
+                if not self._drivable_between(nodes[i], nodes[j]):
+                    self._join(EdgeId("near", number, k), nodes[i], nodes[j])
+
+    def _drivable_between(self, a: NodeId, b: NodeId) -> bool:
+        known = self.union.graph.get_edge_data(a, b) or {}
+        return any(edge_id not in self.closed for edge_id in known)
+
+    def _join(self, edge_id: EdgeId, a: NodeId, b: NodeId) -> None:
+        between: Pose2 = self.postures[a].inverse() @ self.postures[b]
+        edge = Edge(edge_id, a, b, PoseGaussian(between, np.zeros((3, 3))), EdgeKind.LOOP)
+        self.union.edges[edge.id] = edge
+        self.union.graph.add_edge(a, b, key=edge.id)

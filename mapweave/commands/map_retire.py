@@ -1,0 +1,33 @@
+"""`mapweave map retire`: a map takes no part in anything any more; or does again."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from mapweave.commands.map_rule import add_ruling, rule
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "retire",
+        help="retire a map: it takes no part in the merge, in routes and in answers",
+        description="Retire a map (r0.1): it takes no part in the merge any more, nobody is led through it, "
+        "and no view is recognised by it. Nothing is deleted: it is retired until that is taken back with "
+        "--undo, also when its robot maps on and the server starts again. Who did so, when and why is told "
+        "by `mapweave map explain`. What robots map anew need not be retired: newer nodes stand for the "
+        "older ones by themselves.",
+    )
+    parser.add_argument("which", metavar="MAP", help="the map, as r0.1: a robot and its epoch")
+    add_ruling(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Rule, and say what has come of it."""
+    from mapweave.commands.map_ends import map_of
+
+    which = map_of(arguments.which)
+    rule(arguments, (which, which))
+    return 0

@@ -1,0 +1,95 @@
+"""Rulings on the command line: their options, and how a server or a file is told."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapweave.commands.network import add_network
+
+if TYPE_CHECKING:
+    from hybridmap.ruling import Ends, Ruling
+
+
+def add_ruling(parser: argparse.ArgumentParser) -> None:
+    """Declare what every ruling may be given."""
+    parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
+    parser.add_argument("--by", metavar="NAME", help="who says so (default: the name you are logged in by)")
+    parser.add_argument("--undo", action="store_true", help="take it back")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="in this map file; no server is asked")
+    parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
+    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    add_network(parser)
+
+
+def rule(arguments: argparse.Namespace, ends: Ends) -> None:
+    """Rule, and say what has come of it; afterwards `arguments.map` is the file that holds it.
+
+    Raises:
+        MapweaveError: there is nothing to rule, or nobody who would keep it.
+    """
+    from hybridmap.errors import InvalidValue
+    from hybridmap.ruling import Ruling
+
+    if arguments.out is not None and arguments.map is None:
+        raise InvalidValue("--out goes with --map: what a server is told it keeps itself")
+    ruling = Ruling(ends, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because)
+    if arguments.map is None:
+        _tell_server(arguments, ruling)
+    else:
+        _rewrite(arguments, ruling)
+        arguments.map = arguments.out or arguments.map
+
+
+def _login() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # nobody of that number is known to the machine
+        return "somebody"
+
+
+def _tell_server(arguments: argparse.Namespace, ruling: Ruling) -> None:
+    from mapweave.commands.map_ends import ask
+    from wire.explanation_messages import encode_ruling
+    from wire.keys import Keys
+    from wire.log_messages import decode_record
+
+    for reply in ask(arguments, Keys.any_rule, encode_ruling(ruling)):
+        print(decode_record(reply.payload)["said"])
+    _settled(arguments)
+
+
+def _settled(arguments: argparse.Namespace) -> None:
+    """Wait until the server has merged with it, or the time is over."""
+    from mapweave.commands.map_ends import ask
+    from wire.keys import Keys
+    from wire.log_messages import decode_record
+
+    end = time.monotonic() + arguments.timeout
+    while time.monotonic() < end:
+        if all(
+            decode_record(reply.payload)["settled"] for reply in ask(arguments, Keys.server_statuses, b"")
+        ):
+            return
+        time.sleep(0.1)
+    print("it is kept; the server is still merging, ask `mapweave map explain` later")
+
+
+def _rewrite(arguments: argparse.Namespace, ruling: Ruling) -> None:
+    from hybridmap.ruling import Rulings
+    from mapserver.mapfiles import map_file_of, merged_of
+    from mapweave.commands.map_merge import merged_with_progress
+    from mapweave.offline import parts_of
+    from merge.undoing import check_ruling
+    from wire.mapfile import read_map_file, write_map_file
+
+    content = read_map_file(arguments.map, "merged")
+    check_ruling(merged_of(content), Rulings(content.rulings), ruling)
+    maps, rulings = parts_of({arguments.map: content})
+    merged = merged_with_progress(maps, rulings + Rulings([ruling]))
+    out = arguments.out or arguments.map
+    write_map_file(out, map_file_of(merged))
+    print(f"{out}: {merged.summary()}")

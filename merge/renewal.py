@@ -1,0 +1,256 @@
+"""Renewal: nodes that newer ones of the same place stand for, so that a map does not grow with every drive.
+
+A node is superseded if a robot that stood there would know itself by a newer one and could servo to it: the
+two were verified to show the same, enough common landmarks stay in view between them, and they stand within
+the servo's basin (hybridmap.reach). Besides, the newer one must know about as many depths; nothing that the
+old one stood for may be left without; and no way between its neighbours may become much longer without it.
+
+Superseded nodes stay where they are: they tie postures, and come back if what supersedes them does not stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hybridmap.matching import match
+from hybridmap.node import Node, NodeId
+from hybridmap.pose import Pose2, wrap_angle
+from hybridmap.reach import ReachSettings, least_in_view
+from hybridmap.superseded import Superseded
+from merge.ages import is_older
+from merge.links import Link
+from merge.merged import MergedMap
+from merge.passages import ForeignEdges, Passages
+from merge.posegraph import PoseGraph
+from merge.verification import VerificationSettings, verify
+
+SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class RenewalSettings:
+    """When a newer node stands for an older one.
+
+    Attributes:
+        reach: the servo's basin.
+        found: landmarks that both show and that stay in view between them.
+        depths: the newer one knows at least this share of the number of depths that the older one knows.
+        again: s, that lie between them if both belong to one map: views of one visit complete each other.
+        detour: m, by which a way between neighbours may become longer.
+        near: m, nodes nearer than this to each other stand in one place, as for routes.
+        tries: pairs that are compared for this alone, of each new node.
+        gate: chi-square with 3 degrees of freedom within which such a comparison bears out the merged map.
+        floor: m, m and rad, error of both that no covariance tells of.
+    """
+
+    reach: ReachSettings = field(default_factory=ReachSettings)
+    found: int = 20
+    depths: float = 0.7
+    again: float = 120.0
+    detour: float = 1.5
+    near: float = 0.5
+    tries: int = 6
+    gate: float = 16.3
+    floor: tuple[float, float, float] = (0.05, 0.05, 0.03)
+
+
+class Renewer:
+    """Goes from merged map to merged map with what was superseded: only what is new is looked at."""
+
+    def __init__(
+        self, settings: RenewalSettings | None = None, verification: VerificationSettings | None = None
+    ) -> None:
+        """Begin with nothing superseded.
+
+        Args:
+            settings: when a node is.
+            verification: as in the merge.
+        """
+        self._settings = settings or RenewalSettings()
+        self._verification = verification
+        self._fates: dict[NodeId, Superseded] = {}
+        self._seen: dict[NodeId, Node] = {}
+        self._linked: set[tuple[NodeId, NodeId]] = set()
+        self._graphs: tuple[PoseGraph, ...] = ()
+        self._foreign = ForeignEdges()
+
+    def renewed(self, merged: MergedMap) -> MergedMap:
+        """The same map with the nodes that are superseded.
+
+        Args:
+            merged: the next merged map of the same fleet.
+        """
+        nodes = self._changed(merged)
+        fresh = {node for node, one in nodes.items() if self._seen.get(node) is not one}
+        self._seen |= nodes
+        links = [link for link in merged.links if link.a in nodes]
+        fresh |= {node for link in links if link.pair not in self._linked for node in link.pair}
+        self._linked = {link.pair for link in merged.links}
+        # One that is known better is judged anew, as are those that it stood for.
+        for node, fate in tuple(self._fates.items()):
+            if node not in self._seen or fate.by not in self._seen or {node, fate.by} & fresh:
+                del self._fates[node]
+                fresh |= {node} & nodes.keys()
+        if nodes:
+            s = self._settings
+            passages = Passages(merged, links, s.reach, s.near, self._foreign.of(merged.maps), self._fates)
+            this = _Round(merged, nodes, links, self._fates, passages, s, self._verification)
+            this.look_at(fresh | this.revive())
+        return replace(merged, superseded=dict(sorted(self._fates.items())))
+
+    def _changed(self, merged: MergedMap) -> dict[NodeId, Node]:
+        """Nodes of components that were solved anew; those that are gone are forgotten."""
+        known = {id(graph) for graph in self._graphs}
+        left = {id(graph) for graph in merged.graphs}
+        for graph in self._graphs:
+            if id(graph) not in left:
+                for node in graph.nodes:
+                    # Known still, if it is in another component now.
+                    if merged.component_of(node) is None:
+                        self._seen.pop(node, None)
+        self._graphs = merged.graphs
+        return {
+            node: merged.maps[node.map].nodes[node]
+            for graph in merged.graphs
+            if id(graph) not in known
+            for node in graph.nodes
+        }
+
+
+class _Round:
+    """One merged map's worth of work on the table of what is superseded."""
+
+    def __init__(
+        self,
+        merged: MergedMap,
+        nodes: dict[NodeId, Node],
+        links: Iterable[Link],
+        fates: dict[NodeId, Superseded],
+        passages: Passages,
+        settings: RenewalSettings,
+        verification: VerificationSettings | None,
+    ) -> None:
+        self._merged, self._nodes, self._fates = merged, nodes, fates
+        self._settings, self._verification = settings, verification
+        self._links = {link.pair: link for link in links}
+        self._refused = {refusal.pair for refusal in merged.refused if refusal.edge is None}
+        self._stands_for: dict[NodeId, set[NodeId]] = {}
+        for node, fate in fates.items():
+            self._stands_for.setdefault(fate.by, set()).add(node)
+        self._passages = passages
+        self._compared: dict[NodeId, int] = {}
+
+    def revive(self) -> set[NodeId]:
+        """Give life back to nodes whose successor is too far off now, or shown to be wrong."""
+        s = self._settings.reach
+        gone = set()
+        for node, fate in self._fates.items():
+            if node not in self._nodes and fate.by not in self._nodes:
+                continue
+            if self._merged.component_of(node) == self._merged.component_of(fate.by):
+                between = self._between(node, fate.by)
+                near = between.distance(Pose2()) < 1.1 * s.farthest and abs(between.heading) < 1.1 * s.widest
+                if near and _ordered(node, fate.by) not in self._refused:
+                    continue
+            gone.add(node)
+        for node in gone:
+            self._stands_for[self._fates.pop(node).by].discard(node)
+            self._passages.add(node)
+        return gone
+
+    def look_at(self, fresh: Iterable[NodeId]) -> None:
+        """See what new nodes stand for, the oldest first, and whether they are needed themselves."""
+        for node in sorted(fresh, key=lambda one: (self._nodes[one].stamp_ns, one)):
+            if node in self._fates:
+                continue
+            near = self._passages.around(node, self._settings.reach.farthest)
+            for other in sorted(near, key=lambda one: (self._unlikeness(node, one), one)):
+                old, new = self._by_age(node, other)
+                if old not in self._fates and new not in self._fates:
+                    self._try(old, new)
+
+    def _try(self, old: NodeId, new: NodeId) -> None:
+        fate = self._covers(old, new)
+        if fate is None:
+            return
+        heirs = {}
+        for orphan in sorted(self._stands_for.get(old, ())):
+            heir = self._heir(orphan, old, new)
+            if heir is None:
+                return
+            heirs[orphan] = heir
+        if not self._passages.spare(old, new, self._settings.detour):
+            return
+        self._passages.remove(old)
+        self._stands_for.pop(old, None)
+        for node, one in ((old, fate), *heirs.items()):
+            self._fates[node] = one
+            self._stands_for.setdefault(one.by, set()).add(node)
+
+    def _heir(self, orphan: NodeId, old: NodeId, new: NodeId) -> Superseded | None:
+        """Who stands for a node from now on that an old one stood for."""
+        fate = self._covers(orphan, new)
+        if fate is not None:
+            return fate
+        around = self._passages.around(orphan, self._settings.reach.farthest)
+        for other in sorted(around, key=lambda one: (self._unlikeness(orphan, one), one)):
+            if other not in (old, new) and self._by_age(orphan, other) == (orphan, other):
+                fate = self._covers(orphan, other)
+                if fate is not None:
+                    return fate
+        return None
+
+    def _covers(self, old: NodeId, new: NodeId) -> Superseded | None:
+        """Whether the one stands for the other."""
+        s, a, b = self._settings, self._nodes[old], self._nodes[new]
+        between = self._between(old, new)
+        distance, turn = between.distance(Pose2()), abs(between.heading)
+        if distance > s.reach.farthest or turn > s.reach.widest:
+            return None
+        if old.map == new.map and abs(a.stamp_ns - b.stamp_ns) < s.again * SECOND:
+            return None
+        if b.landmarks.has_depth.sum() < s.depths * a.landmarks.has_depth.sum():
+            return None
+        link = self._links.get(_ordered(old, new)) or self._compare(a, b)
+        if link is None:
+            return None
+        link = link if link.a == old else link.turned()
+        found = least_in_view(link.shared, a, b, between, s.reach.stops)
+        return Superseded(new, found, distance, turn) if found >= s.found else None
+
+    def _compare(self, a: Node, b: Node) -> Link | None:
+        """A link between two nodes that the merge had no need to compare."""
+        s, pair = self._settings, _ordered(a.id, b.id)
+        tried = max(self._compared.get(node, 0) for node in pair)
+        if pair in self._refused or tried >= s.tries:
+            return None
+        recognition = (self._verification or VerificationSettings()).recognition
+        if len(match(a.landmarks.codes, b.landmarks.codes, recognition.matching)) < s.found:
+            return None
+        for node in pair:
+            self._compared[node] = self._compared.get(node, 0) + 1
+        verdict = verify(a, b, self._verification)
+        if not isinstance(verdict, Link):
+            return None
+        there = self._merged.relative(*verdict.pair)
+        assert there is not None, "nodes of one component"
+        off = (verdict.a_from_b.mean.inverse() @ there.mean).vector
+        spread = verdict.a_from_b.covariance + there.covariance + np.diag(np.square(s.floor))
+        return verdict if float(off @ np.linalg.solve(spread, off)) < s.gate else None
+
+    def _by_age(self, one: NodeId, other: NodeId) -> tuple[NodeId, NodeId]:
+        return (one, other) if is_older(self._nodes[one], self._nodes[other]) else (other, one)
+
+    def _between(self, a: NodeId, b: NodeId) -> Pose2:
+        return self._merged.pose(a).inverse() @ self._merged.pose(b)
+
+    def _unlikeness(self, a: NodeId, b: NodeId) -> float:
+        between, s = self._between(a, b), self._settings.reach
+        return between.distance(Pose2()) / s.farthest + abs(wrap_angle(between.heading)) / s.widest
+
+
+def _ordered(a: NodeId, b: NodeId) -> tuple[NodeId, NodeId]:
+    return (a, b) if a <= b else (b, a)
