@@ -69,12 +69,13 @@ def images_of(folder: Path) -> list[Path]:
 class Replay:
     """The Robot protocol over a recording. It takes no commands."""
 
-    def __init__(self, folder: Path, robot: str | None = None) -> None:
+    def __init__(self, folder: Path, robot: str | None = None, frames: range | None = None) -> None:
         """Open a recording.
 
         Args:
             folder: the recording.
             robot: which robot of its `splits.toml`; None plays all frames.
+            frames: these alone, whatever `splits.toml` says; ascending.
 
         Raises:
             DeviceError: something is missing or wrong, in one line.
@@ -87,7 +88,9 @@ class Replay:
         self._images = images_of(folder)
         self._times = _read_times(folder / "times.txt", len(self._images))
         self._odometry = _read_odometry(folder / "odometry.csv", len(self._images))
-        self._frames = _read_split(folder / "splits.toml", robot, len(self._images))
+        self._frames = frames or _read_split(folder / "splits.toml", robot, len(self._images))
+        if not 0 <= self._frames[0] <= self._frames[-1] < len(self._images):
+            raise DeviceError(f"{folder}: {self._frames} is not within the {len(self._images)} images")
         self._position = 0
 
     def __len__(self) -> int:

@@ -39,6 +39,26 @@ def add_to(commands: Any) -> None:
         "--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline"
     )
     relocalize.set_defaults(run=run)
+    merge: argparse.ArgumentParser = kinds.add_parser(
+        "merge",
+        help="cut a recording into robots, map, and merge",
+        description="Cut a recording into robots, let each map its piece as if carried along, merge the maps "
+        "as the server does, and print links, components and error. Without --robots it is cut as its "
+        "splits.toml says. truth.csv tells what is right; without it nothing is scored.",
+    )
+    merge.add_argument(
+        "folder", type=Path, help="recording: images/, camera.toml, odometry.csv; times.txt, truth.csv"
+    )
+    merge.add_argument(
+        "--robots", type=int, metavar="N",
+        help="cut it into N consecutive pieces instead, which overlap by 30 %% (even images, odd images)",
+    )  # fmt: skip
+    merge.add_argument(
+        "--out", type=Path, metavar="DIR", help="map, links and picture (default: out/eval-merge/FOLDER)"
+    )
+    merge.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    merge.add_argument("--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline")
+    merge.set_defaults(run=run_merge)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -65,6 +85,33 @@ def run(arguments: argparse.Namespace) -> int:
     for name, value in flat.items():
         if name != "verified":
             table.add_row(name, _shown(value), *(_shown(other.get(name, "")) for other in others.values()))
+    Console(file=sys.stdout).print(table)
+    return 0
+
+
+def run_merge(arguments: argparse.Namespace) -> int:
+    """Cut, map, merge and print."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapweave.commands.network import settings_of
+    from mapweave.examination.merging import examine_merging
+
+    pipeline = settings_of(arguments).pipeline
+    console = Console(stderr=True)
+    examination = examine_merging(arguments.folder, arguments.robots, pipeline, console)
+    report = examination.report()
+    out = arguments.out or Path("out/eval-merge") / examination.name
+    for path in examination.write(out):
+        console.print(f"{path}", highlight=False)
+    if arguments.json:
+        print(json.dumps(report, allow_nan=False))
+        return 0
+    table = Table("", "", title=f"{arguments.folder}")
+    for name, value in report.items():
+        inner = value.items() if isinstance(value, dict) else ()
+        words = ", ".join(f"{key} {_shown(one)}" for key, one in inner)
+        table.add_row(name, words or _shown(value))
     Console(file=sys.stdout).print(table)
     return 0
 

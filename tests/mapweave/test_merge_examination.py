@@ -1,0 +1,149 @@
+"""Merging on a recording that is made here: a drive past photographs, cut into robots."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridmap.pose import Pose2
+from mapweave.cli import main
+from mapweave.examination.pieces import OVERLAP, cut
+from sim.camera import WEBCAM
+from sim.renderer import Renderer
+from sim.scene import Scene
+from sim.world import PanelSet
+from sim.worlds.catalog import make_world
+from wire.mapfile import read_map_file
+
+CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+
+
+def poses() -> list[Pose2]:
+    """Ahead through the corridor of an office, weaving a little, 3 cm an image."""
+    return [Pose2(0.7 + 0.03 * k, 0.1 * np.sin(0.05 * k), 0.15 * np.cos(0.05 * k)) for k in range(150)]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images by the simulator's renderer, odometry that is 1 % too long, truth, two robots in splits.toml."""
+    folder = tmp_path_factory.mktemp("recordings") / "office walk"
+    (folder / "images").mkdir(parents=True)
+    world = make_world("office", 5)
+    corridor = next(room for room in world.plan.rooms if "corridor" in room.name)
+    middle = Pose2(float(corridor.corners[:, 0].min()), float(corridor.corners[:, 1].mean()), 0.0)
+    way = [middle @ pose for pose in poses()]
+    renderer, scene = Renderer(WEBCAM, world.background), Scene([PanelSet.of(world.panels)])
+    rng = np.random.default_rng(1)
+    before = way[0]
+    with (folder / "odometry.csv").open("w") as odometry, (folder / "truth.csv").open("w") as truth:
+        odometry.write("forward_m,turn_rad\n")
+        truth.write("stamp_s,x_m,y_m,heading_rad\n")
+        for k, pose in enumerate(way):
+            turn = np.eye(3)
+            turn[:2, :2] = pose.rotation
+            image = renderer.render(scene, turn, np.array([pose.x, pose.y, 0.0])).astype(float)
+            noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
+            cv2.imwrite(str(folder / "images" / f"{k}.png"), noisy)
+            moved = before.inverse() @ pose
+            odometry.write(f"{1.01 * moved.x},{moved.heading}\n")
+            truth.write(f"{0.1 * k:.3f},{pose.x},{pose.y},{pose.heading}\n")
+            before = pose
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.3f}\n" for k in range(len(way))))
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+    (folder / "splits.toml").write_text(
+        '[[robot]]\nname = "One"\nfirst = 0\nlast = 99\n[[robot]]\nname = "two"\nfirst = 50\nlast = 149\n'
+    )
+    return folder
+
+
+def evaluate(folder: Path, out: Path, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, object]:
+    assert main(["eval", "merge", str(folder), "--out", str(out), "--json", *more]) == 0
+    report: dict[str, object] = json.loads(capsys.readouterr().out.splitlines()[-1])
+    return report
+
+
+def test_two_robots_of_one_walk_become_one_map(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = evaluate(recording, tmp_path / "out", capsys)
+    assert report["robots"] == {"one": 100, "two": 100} and report["truth"] is True
+    assert report["components"] == 1 and int(str(report["links"])) >= 2
+    assert report["false_links"] == 0 and report["link_precision"] == 1.0
+    assert float(str(report["merged_ate_m"])) < 0.1
+    content = read_map_file(tmp_path / "out" / "merged.mapweave")
+    assert {node.agent for node in content.postures} == {"one", "two"}
+    picture = cv2.imread(str(tmp_path / "out" / "map.png"))
+    assert picture is not None and picture.std() > 5.0
+    with (tmp_path / "out" / "links.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sum(row["kept"] == "yes" for row in rows) == report["links"]
+
+
+def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(recording, bare)
+    for name in ("truth.csv", "splits.toml"):
+        (bare / name).unlink()
+    report = evaluate(bare, tmp_path / "out", capsys, "--robots", "2")
+    assert list(report["robots"]) == ["r0", "r1"]  # type: ignore[call-overload]
+    assert report["truth"] is False and report["merged_ate_m"] is None and report["false_links"] is None
+    assert int(str(report["nodes"])) >= 4
+
+
+@pytest.mark.parametrize("robots", [2, 3, 5])
+def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
+    cuts = cut(1000, robots)
+    assert cuts[0].start == 0 and cuts[-1][-1] >= 998
+    for one, other in pairwise(cuts):
+        assert not set(one) & set(other)
+        shared = one[-1] - other[0]
+        assert shared == pytest.approx(OVERLAP * (one[-1] - one[0]), abs=4)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "more", "words"),
+    [
+        (lambda folder: shutil.rmtree(folder), (), "no such folder"),
+        (lambda folder: (folder / "splits.toml").unlink(), (), "give --robots"),
+        (lambda folder: (folder / "odometry.csv").unlink(), (), "without odometry nothing tells"),
+        (lambda folder: (folder / "camera.toml").unlink(), (), "it must give the camera's intrinsics"),
+        (lambda folder: shutil.rmtree(folder / "images"), ("--robots", "2"), "no images"),
+        (lambda folder: (folder / "truth.csv").write_text("x\n1\n"), (), "no column"),
+        (
+            lambda folder: (folder / "splits.toml").write_text('[[robot]]\nname="a"\nfirst=0\nlast=9\n'),
+            (), "two robots or more",
+        ),
+        (
+            lambda folder: (folder / "splits.toml").write_text(
+                '[[robot]]\nname="a"\nfirst=0\nlast=9\n[[robot]]\nname="A"\nfirst=0\nlast=9\n'
+            ),
+            (), "called alike",
+        ),
+        (lambda folder: None, ("--robots", "1"), "use 2 to"),
+        (lambda folder: None, ("--robots", "20"), "too few"),
+    ],
+)  # fmt: skip
+def test_a_recording_that_cannot_be_used_is_one_line(
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    break_it,
+    more: tuple[str, ...],
+    words: str,
+) -> None:
+    folder = tmp_path / "broken"
+    shutil.copytree(recording, folder)
+    break_it(folder)
+    assert main(["eval", "merge", str(folder), "--out", str(tmp_path / "out"), *more]) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mapweave: ")]
+    assert len(said) == 1 and words in said[0]
+    assert not (tmp_path / "out").exists()
