@@ -2,7 +2,7 @@
 
 Rooms with landmarks of their own stand in a square. Each robot walks from room to room and looks around in
 each; several robots come through every room, and one robot may come back. Landmarks are drawn as in
-`hybridmap.synthetic`, so search, verification and merging do on them what they do on real ones.
+`benchmarks.synthetic`, so search, verification and merging do on them what they do on real ones.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.synthetic import Sensing, World, room, take_node
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.synthetic import Sensing, World, room, take_node
 from merge.candidates import Pair
 from merge.links import Link
 

@@ -32,11 +32,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from benchmarks.synthetic import World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import View
-from hybridmap.synthetic import World, room, take_map, take_view
 from mapserver.entry import Entry
 from mapserver.store import Store
 from mapweave.trial.children import Children, free_port

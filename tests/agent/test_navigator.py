@@ -13,11 +13,11 @@ from agent.mission import Answer, Question, WhereAmI, WhichWay
 from agent.navigator import NavigatorSettings, Stage
 from agent.own_route import own_route
 from agent.tally import Tally
+from benchmarks.synthetic import World
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
-from hybridmap.synthetic import World
 from tests.agent.scripted_fleet import (
     BODY,
     EXACT,

@@ -20,12 +20,12 @@ from benchmarks.navigate_drives import PATIENCE, Outcome, _reason, drive
 from benchmarks.navigate_floor import Floor
 from benchmarks.navigate_office import Mapped
 from benchmarks.navigate_plots import LEAST_EDGES, Plot, draw_plot
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, wrap_angle
-from hybridmap.synthetic import room, take_map
 from mapweave.scoring import crossed
 from sim.control import RobotStatus, SimStatus
 from sim.floorplan import FloorPlan, Rectangle

@@ -17,12 +17,12 @@ from benchmarks.relocalize_pictures import Disturbance, Photographer, Picture, W
 from benchmarks.relocalize_places import Place, placed, spread_out, twin_lookouts
 from benchmarks.relocalize_queries import Query, beside
 from benchmarks.relocalize_score import ask, figures, judged, spent
+from benchmarks.synthetic import CAMERA, room, take_map, take_view
 from hybridmap.descriptor import decode, root_sift
 from hybridmap.matching import MatchSettings, match_vectors
 from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
-from hybridmap.synthetic import CAMERA, room, take_map, take_view
 from mapserver.belief import Support
 from mapserver.placeindex import PlaceIndex
 from mapserver.relocalization import Relocalizer

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from benchmarks.synthetic import Sensing, room, take_node, take_view
 from hybridmap.closer import look_closer
 from hybridmap.node import NodeId
 from hybridmap.planar_pose import PlanarPoseSettings
 from hybridmap.pose import Pose2, PoseGaussian, averaged
 from hybridmap.recognition import recognise
-from hybridmap.synthetic import Sensing, room, take_node, take_view
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 WORLD = room(0, 0, 5, 4, 700, np.random.default_rng(1))

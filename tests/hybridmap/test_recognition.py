@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import Sensing, World, room, take_node, take_view
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.recognition import (
@@ -16,7 +17,6 @@ from hybridmap.recognition import (
     recognise,
     register,
 )
-from hybridmap.synthetic import Sensing, World, room, take_node, take_view
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
-from hybridmap.synthetic import World, room, take_map, take_view
 from mapserver.entry import Entry
 from mapserver.store import Store
 from tests.mapserver.played import HandAgent, Server

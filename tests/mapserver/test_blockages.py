@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
-from hybridmap.synthetic import room, take_map
 from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.merger import Merger
 from mapserver.routes import Router

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.synthetic import random_vectors
 from hybridmap.descriptor import decode, quantise
 from hybridmap.matching import squared_distances
-from hybridmap.synthetic import random_vectors
 from mapserver.cells import Cells
 from mapserver.means import Means
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidFile
 from hybridmap.explanation import MapsExplanation, Standing
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ends, Ruling
-from hybridmap.synthetic import room, take_map
 from mapserver.entry import Entry
 from mapserver.explainer import RulingBook
 from mapserver.mapfiles import map_file_of, maps_of, merged_of

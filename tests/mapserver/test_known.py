@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from hybridmap.query import KnownAnswer
-from hybridmap.synthetic import room, take_map
 from mapserver.known import Known
 from mapserver.merger import Merger
 from mapserver.server import MapServer, ServerSettings

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.synthetic import random_vectors
 from hybridmap.descriptor import quantise
-from hybridmap.synthetic import random_vectors
 from mapserver import means as module
 from mapserver.means import Means
 

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import Sensing, World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
 from hybridmap.recognition import examine_matches
 from hybridmap.route import RouteSettings
-from hybridmap.synthetic import Sensing, World, room, take_map, take_view
 from mapserver.belief import Support, probabilities
 from mapserver.merger import Merger
 from mapserver.relocalization import RelocalizationSettings, Relocalizer

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import CAMERA, World, room, take_map, take_view
 from hybridmap.descriptor import decode
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
-from hybridmap.synthetic import CAMERA, World, room, take_map, take_view
 from mapserver.landmarkindex import LandmarkIndexSettings
 from mapserver.placeindex import PlaceIndex, PlaceIndexSettings
 from merge.candidates import overlaps

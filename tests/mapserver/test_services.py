@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import take_node
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View
-from hybridmap.synthetic import take_node
 from mapserver.desk import DeskSettings
 from mapserver.merger import Merger
 from mapserver.placeindex import PlaceIndex

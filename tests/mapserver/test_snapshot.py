@@ -10,12 +10,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.synthetic import CAMERA, random_vectors, room, take_map, take_view
 from hybridmap.change import Change, NodePut, NodeRetired
 from hybridmap.errors import InvalidFile
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
-from hybridmap.synthetic import CAMERA, random_vectors, room, take_map, take_view
 from mapserver import snapshot
 from mapserver.entry import Entry, Position
 from mapserver.fingerprint import fingerprint, landmark_prints

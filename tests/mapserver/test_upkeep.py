@@ -8,11 +8,11 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ruling, Rulings
-from hybridmap.synthetic import room, take_map
 from mapserver.merger import Merger
 from mapserver.upkeep import Upkeep
 from merge.merged import MergedMap

@@ -14,11 +14,11 @@ from evo.tools import file_interface
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import InvalidFile, InvalidValue
 from hybridmap.node import EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
-from hybridmap.synthetic import room, take_map
 from mapserver.mapfiles import map_file_of
 from mapserver.merger import Merger
 from mapweave.cli import main

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
-from hybridmap.synthetic import room, take_map
 from mapserver.entry import Entry
 from mapserver.mapfiles import merged_of
 from mapserver.store import Store

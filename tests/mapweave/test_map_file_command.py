@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.synthetic import room, take_map
 from mapweave.cli import main
 from wire.mapfile import MapFile, write_map_file
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_node
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.synthetic import room, take_node
 from merge.links import Link, RefusedLink
 from merge.verification import verify
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from benchmarks.synthetic import room, take_map, take_node
 from hybridmap.descriptor import decode
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.synthetic import room, take_map, take_node
 from merge.candidates import CandidateSettings, choose_pairs, overlap, overlaps
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.synthetic import room, take_map
 from mapserver.merger import Merger
 from mapserver.routes import Router
 from merge.links import Link

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut, NodeRetired
 from hybridmap.errors import InvalidValue
 from hybridmap.explanation import Standing
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ruling import Ruling, Rulings
-from hybridmap.synthetic import room, take_map
 from mapserver.merger import Merger
 from merge.consistency import ConsistencySettings
 from merge.credence import FLOOR, LEAST_AREA, credences, prior_odds, standpoints

@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import World, room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.synthetic import World, room, take_map
 from merge.candidates import choose_pairs, overlaps
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap

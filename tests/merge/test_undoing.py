@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ruling, Rulings
-from hybridmap.synthetic import room, take_map
 from mapserver.merger import Merger
 from merge.merged import MergedMap
 
