@@ -28,12 +28,12 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.life_house import House
+from benchmarks.synthetic import take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty, View
 from hybridmap.superseded import Superseded
-from hybridmap.synthetic import take_map
 from mapserver.living import LivingPlaces
 from mapserver.merger import Merger
 from mapserver.relocalization import Relocalizer

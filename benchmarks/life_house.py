@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.synthetic import World, room, take_view
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2
 from hybridmap.query import View
-from hybridmap.synthetic import World, room, take_view
 
 ROOMS = ((0.0, 0.0, 5.0, 4.0), (5.2, 0.0, 5.0, 4.0))
 """x, y, width, depth, m; their common wall has a door that hides nothing and shows nothing."""

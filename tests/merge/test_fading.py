@@ -8,11 +8,11 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.synthetic import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
 from mapserver.living import without_faded
 from mapserver.merger import Merger
 from merge.fading import Fader, FadingSettings, Look, expected, presence

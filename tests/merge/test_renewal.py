@@ -8,13 +8,13 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import room, take_map, take_view
 from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
 from hybridmap.reach import ReachSettings
 from hybridmap.ruling import Ruling, Rulings
-from hybridmap.synthetic import room, take_map, take_view
 from mapserver.living import LivingPlaces
 from mapserver.mapfiles import map_file_of, merged_of
 from mapserver.merger import Merger
