@@ -80,18 +80,6 @@ class Cells:
         squared, ids = self._index.search(codes.astype(np.float32), k, params=self._searching(probes))
         return squared * STEP2, ids
 
-    def within(self, codes: Codes, reach: float, probes: int) -> tuple[Ids, Vectors, Ids]:
-        """All landmarks in the nearest cells within a distance of decoded descriptors.
-
-        Returns:
-            (M,) row of the code, squared distance, id.
-        """
-        limits, squared, ids = self._index.range_search(
-            codes.astype(np.float32), reach**2 / STEP2, params=self._searching(probes)
-        )
-        rows = np.repeat(np.arange(len(codes)), np.diff(limits.astype(np.int64)))
-        return rows, squared * STEP2, ids
-
     def blocks(self, size: int) -> Iterator[Block]:
         """All landmarks, cell by cell, about `size` at once: a copy of all would take the memory twice."""
         lists: Any = self._index.invlists

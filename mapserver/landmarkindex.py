@@ -32,22 +32,20 @@ class LandmarkIndexSettings:
 
     Attributes:
         small: up to as many every one is compared; beyond, those of some cells.
-        exact: up to as many `within` is exact.
+        exact: up to as many `within` works.
         growth: cells are learned anew when there are so many times as many landmarks.
         fill: landmarks in a cell when it is learned, on average.
         most_cells: with as many, cells are not learned again: filling new ones takes the memory twice.
         probes: cells that are searched for a feature of a view.
-        within_probes: cells that are searched for all that is alike.
         patience: landmarks beyond which cells are learned beside the questions, not between them.
     """
 
     small: int = 10_000
-    exact: int = 300_000
+    exact: int = 30_000
     growth: float = 4.0
     fill: int = 100
     most_cells: int = 1 << 16
     probes: int = 8
-    within_probes: int = 64
     patience: int = 1_000_000
 
 
@@ -125,12 +123,11 @@ class LandmarkIndex:
             squared, ids = self._flat.search(decode(codes), k)
             return squared, ids
 
-    def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids]:
-        """(M,) row of the code, squared distance and id of the landmarks that are within reach."""
+    def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids] | None:
+        """(M,) row of the code, squared distance and id of all landmarks within reach; None if too many."""
         with self.lock:
             if self._flat is None:
-                assert self._cells is not None
-                return self._cells.within(codes, reach, self._settings.within_probes)
+                return None
             limits, squared, ids = self._flat.range_search(decode(codes), reach**2)
         return np.repeat(np.arange(len(codes)), np.diff(limits.astype(np.int64))), squared, ids
 

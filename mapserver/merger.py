@@ -108,7 +108,7 @@ class Merger:
         self._replay(map_id, body)
         if isinstance(body, NodePut):
             self.index.add(body.node)
-            self._pairs.put(body.node.id, self.index.overlaps(body.node))
+            self._pairs.put(body.node.id, self.index.overlaps(body.node, self.node))
 
     def read(
         self,
@@ -133,7 +133,7 @@ class Merger:
         self.index.extend(fresh)
         if overlaps is None:
             for node in fresh:
-                self._pairs.put(node.id, self.index.overlaps(node))
+                self._pairs.put(node.id, self.index.overlaps(node, self.node))
         for (a, b), value in (overlaps or {}).items():
             self._pairs.put(a, {b: value})
         for pair, link in (links or {}).items():

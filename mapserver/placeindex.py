@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -31,12 +31,14 @@ class PlaceIndexSettings:
         landmarks: how landmarks are found.
         votes: descriptors of the fleet that each feature of a view votes for.
         reach: distance of two decoded descriptors at which a vote counts nothing.
+        compared: nodes of a large fleet that are compared with one whose overlaps are wanted.
     """
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     landmarks: LandmarkIndexSettings = field(default_factory=LandmarkIndexSettings)
     votes: int = 16
     reach: float = 0.6
+    compared: int = 64
 
 
 class PlaceIndex:
@@ -127,10 +129,15 @@ class PlaceIndex:
         Returns:
             Nodes with a positive score, best first.
         """
+        return self._ranked(view.codes, k, exclude)
+
+    def _ranked(
+        self, codes: NDArray[np.uint8], k: int, exclude: Collection[NodeId]
+    ) -> list[tuple[NodeId, float]]:
         with self._lock:
-            if len(view) == 0 or len(self._landmarks) == 0:
+            if len(codes) == 0 or len(self._landmarks) == 0:
                 return []
-            squared, ids = self._landmarks.nearest(view.codes, self._settings.votes)
+            squared, ids = self._landmarks.nearest(codes, self._settings.votes)
             # -1 is nobody's, shifted too.
             found, scores = tally.votes(squared, ids >> SLOT_BITS, self._settings.reach)
             if len(exclude):
@@ -142,27 +149,41 @@ class PlaceIndex:
             ranked = [(self._nodes[int(found[i])], float(scores[i])) for i in best]
         return sorted(ranked, key=lambda item: (-item[1], item[0]))[:k]
 
-    def overlaps(self, node: Node) -> dict[NodeId, float]:
+    def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
         """Which nodes share how many alike descriptors with a node, see merge.candidates.
+
+        Every overlap is exact. Up to `exact` landmarks all nodes are compared; of a larger fleet those that
+        most landmarks vote for, see `query`.
 
         Args:
             node: may be in the index itself; it does not overlap with itself.
+            node_of: gives another node by its id; one that it does not give is left out.
 
         Returns:
-            Overlaps of at least `least_overlap`, exact as long as there are at most `exact` landmarks.
+            Overlaps of at least `least_overlap`.
         """
         s = self._settings.candidates
+        if len(node.landmarks) == 0 or len(self._landmarks) == 0:
+            return {}
         with self._lock:
-            if len(node.landmarks) == 0 or len(self._landmarks) == 0:
-                return {}
-            rows, squared, ids = self._landmarks.within(node.landmarks.codes, s.alike)
+            alike = self._landmarks.within(node.landmarks.codes, s.alike)
+            if alike is None:
+                return self._voted(node, node_of)
+            rows, squared, ids = alike
             columns, slots = ids & ((1 << SLOT_BITS) - 1), ids >> SLOT_BITS
             found, values = tally.overlaps(rows, columns, squared, slots, s.alike, s.least_overlap)
-            told = {
-                self._nodes[slot]: value for slot, value in zip(found.tolist(), values.tolist(), strict=True)
-            }
-        told.pop(node.id, None)
-        return told
+            told = zip(found.tolist(), values.tolist(), strict=True)
+            others = [(self._nodes[slot], value) for slot, value in told]
+        return {other: value for other, value in others if other != node.id}
+
+    def _voted(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
+        s, codes = self._settings, node.landmarks.codes
+        told: dict[NodeId, float] = {}
+        for other_id, _ in self._ranked(codes, s.compared, [node.id]):
+            other = node_of(other_id)
+            if other is not None:
+                told[other_id] = tally.pair_overlap(codes, other.landmarks.codes, s.candidates.alike)
+        return {other: value for other, value in told.items() if value >= s.candidates.least_overlap}
 
     def settle(self) -> None:
         """Wait until cells that are being learned are in use."""

@@ -7,6 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.kernels import kernels
+from hybridmap.landmark_tables import landmark_tables
+from merge.candidates import overlap
+
 Whole = NDArray[np.int64]
 Real = NDArray[np.float64]
 
@@ -62,6 +66,13 @@ def overlaps(
     sums = np.minimum(*(_best(which, side, weights, len(found)) for side in (rows, columns)))
     told = np.flatnonzero(sums >= least)
     return found[told], sums[told]
+
+
+def pair_overlap(codes: NDArray[np.uint8], others: NDArray[np.uint8], alike: float) -> float:
+    """The same of two nodes' (N, 32) and (M, 32) codes, all compared with all."""
+    squared = kernels().squared_steps(codes, others) * np.float32(landmark_tables().step ** 2)
+    rows, columns = np.nonzero(squared < alike**2)
+    return overlap(rows, columns, squared[rows, columns], alike)
 
 
 def _best(which: Whole, side: Whole, weights: Real, count: int) -> Real:

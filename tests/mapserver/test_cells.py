@@ -54,9 +54,6 @@ def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
     column = {int(number): k for k, number in enumerate(ids)}
     again = np.array([[every[r, column[int(number)]] for number in row] for r, row in enumerate(found)])
     assert np.allclose(again, squared, atol=1e-4)
-    rows, near, who = cells.within(questions, 0.5, probes=1000)
-    assert len(rows) == (every < 0.25).sum()
-    assert np.allclose([every[r, column[int(n)]] for r, n in zip(rows, who, strict=True)], near, atol=1e-4)
 
 
 def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes, Ids]) -> None:

@@ -79,10 +79,32 @@ def test_overlaps_are_those_of_the_exhaustive_table(building: tuple[World, list[
     assert len(table) > 10
     for node in nodes:
         expected = {(a if b == node.id else b): v for (a, b), v in table.items() if node.id in (a, b)}
-        found = index.overlaps(node)
+        found = index.overlaps(node, {}.get)
         assert set(found) == set(expected)
         for other, value in found.items():
             assert value == pytest.approx(expected[other], rel=1e-3)
+
+
+def test_overlaps_in_a_large_fleet_are_exact_of_those_that_are_compared(
+    building: tuple[World, list[Node], list[Pose2]],
+) -> None:
+    _, nodes, _ = building
+    table, known = overlaps(nodes), {node.id: node for node in nodes}
+    landmarks = LandmarkIndexSettings(small=300, exact=600)
+    few, all_of_them = (
+        filled(nodes, PlaceIndexSettings(landmarks=landmarks, compared=compared)) for compared in (3, 99)
+    )
+    assert few.landmarks.within(nodes[0].landmarks.codes, 0.5) is None
+    missed = 0
+    for node in nodes:
+        expected = {(a if b == node.id else b): v for (a, b), v in table.items() if node.id in (a, b)}
+        found = all_of_them.overlaps(node, known.get)
+        assert all(found[other] == pytest.approx(expected[other], rel=1e-3) for other in found)
+        missed += len(expected) - len(found)
+        best = few.overlaps(node, known.get)
+        assert len(best) <= 3 and best.items() <= found.items() and node.id not in best
+    assert missed <= 0.1 * 2 * len(table)
+    assert few.overlaps(nodes[0], {}.get) == {}
 
 
 def test_added_is_found_at_once_and_removed_never(building: tuple[World, list[Node], list[Pose2]]) -> None:
@@ -130,14 +152,14 @@ def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pos
     assert PlaceIndex().query(view) == [] and filled(nodes[:1]).query(empty) == []
     bare = Node(NodeId("a", 1, 99), 0, nodes[0].map_from_robot, CAMERA, Landmarks.empty())
     index = filled([bare])
-    assert index.query(view) == [] and index.overlaps(bare) == {} and len(index) == 1
+    assert index.query(view) == [] and index.overlaps(bare, {}.get) == {} and len(index) == 1
     index.remove(bare.id)
     assert len(index) == 0
 
 
 def everywhere() -> PlaceIndexSettings:
     """Cells, of which all are searched: then nothing may be missing."""
-    landmarks = LandmarkIndexSettings(small=300, growth=2.0, probes=10_000, within_probes=10_000)
+    landmarks = LandmarkIndexSettings(small=300, growth=2.0, probes=10_000)
     return PlaceIndexSettings(landmarks=landmarks)
 
 
