@@ -25,16 +25,17 @@ RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
 
 @dataclass(frozen=True)
 class ReachSettings:
-    """What the servo manages.
+    """What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`.
 
     Attributes:
         farthest: m, between two nodes.
         widest: rad, between their headings.
-        least: common landmarks that stay in view: a robot follows a node by as many as a look for it asks.
+        least: common landmarks that stay in view: as many as a look for the next node asks for; the servo
+            itself holds on to four.
         stops: postures on the way at which is counted.
     """
 
-    farthest: float = 1.5
+    farthest: float = 2.5
     widest: float = math.radians(45.0)
     least: int = 7
     stops: int = 9

@@ -13,7 +13,6 @@ from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
-from hybridmap.reach import ReachSettings
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.living import LivingPlaces
 from mapserver.mapfiles import map_file_of, merged_of
@@ -80,8 +79,8 @@ def test_the_second_drive_stands_for_the_first(drives: Drives, merger: Merger) -
     for node, fate in merged.superseded.items():
         assert fate.by in living(merged) and fate.by.map == NEW
         between = drives.truth[node].inverse() @ drives.truth[fate.by]
-        assert math.hypot(between.x, between.y) < ReachSettings().farthest + 0.1
-        assert abs(between.heading) < ReachSettings().widest + 0.1
+        assert math.hypot(between.x, between.y) < s.reach.farthest + 0.1
+        assert abs(between.heading) < s.reach.widest + 0.1
         link = verify(merger.maps[OLD].nodes[node], merger.maps[NEW].nodes[fate.by])
         assert isinstance(link, Link) and s.found <= fate.found <= link.weight
         assert str(fate.by) in str(fate)
