@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import networkx as nx
 
@@ -69,16 +70,16 @@ class Ways:
         self._graph: nx.Graph = nx.Graph()
         # In the order of ids, so that among ways of equal cost the same one is found whatever came first.
         for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
-            if edge.a == edge.b or edge.id in closed or frozenset((edge.a, edge.b)) in self._barred:
+            if edge.a == edge.b or frozenset((edge.a, edge.b)) in self._barred:
                 continue
             if edge.a not in self._places or edge.b not in self._places:
                 continue
             cost = edge_cost(edge, self._places, postures is not None, s) + max(
                 (penalties or {}).get(edge.id, 0.0), 0.0
             )
-            known = self._graph.get_edge_data(edge.a, edge.b)
-            if known is None or cost < known["weight"]:
-                self._graph.add_edge(edge.a, edge.b, weight=cost, edge=edge.id)
+            if not self._graph.has_edge(edge.a, edge.b):
+                self._graph.add_edge(edge.a, edge.b, choices=[])
+            self._graph.edges[edge.a, edge.b]["choices"].append((cost, edge.id))
         self._comparable = postures is not None or len({node_id.map for node_id in self._graph}) <= 1
 
     def find(self, start: NodeId, goal: NodeId) -> Route:
@@ -91,14 +92,23 @@ class Ways:
         if start == goal:
             return Route((start,), (), 0.0, "already there")
         try:
-            nodes = nx.astar_path(self._graph, start, goal, heuristic=self._distance, weight="weight")
+            nodes = nx.astar_path(self._graph, start, goal, heuristic=self._distance, weight=self._weight)
         except (nx.NetworkXNoPath, nx.NodeNotFound):
             return Route((), (), 0.0, self._why_not(start, goal))
-        hops = [self._graph.edges[pair] for pair in pairwise(nodes)]
-        cost = sum(hop["weight"] for hop in hops)
-        return Route(
-            tuple(nodes), tuple(hop["edge"] for hop in hops), cost, f"{len(hops)} edges, {cost:.1f} m"
-        )
+        hops = [self._cheapest(self._graph.edges[pair]) for pair in pairwise(nodes)]
+        cost = sum(hop[0] for hop in hops if hop is not None)
+        edges = tuple(hop[1] for hop in hops if hop is not None)
+        return Route(tuple(nodes), edges, cost, f"{len(edges)} edges, {cost:.1f} m")
+
+    def _cheapest(self, hop: Mapping[str, Any]) -> tuple[float, EdgeId] | None:
+        """The cheapest open edge between two nodes; whether one is closed is asked only on the way."""
+        choices = sorted(hop["choices"], key=lambda choice: choice[0])
+        return next((choice for choice in choices if choice[1] not in self._closed), None)
+
+    def _weight(self, _: NodeId, __: NodeId, hop: Mapping[str, Any]) -> float | None:
+        """What it costs from node to node; None, as networkx wants it, if nothing there can be driven."""
+        best = self._cheapest(hop)
+        return None if best is None else best[0]
 
     def _distance(self, node: NodeId, target: NodeId) -> float:
         return self._places[node].distance(self._places[target]) if self._comparable else 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,8 @@ from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.reach import RECOGNISED, Reach, ReachSettings, reach_of
 from merge.merged import MergedMap
 
+NEAR, SUCCESSION = IMPLIED = ("near", "superseded")
+"""Stand for the agents in the ids of edges that follow from where nodes are."""
 Faded = Mapping[NodeId, NDArray[np.bool_]]
 """Of each node which landmarks are thought to be gone."""
 
@@ -31,30 +33,62 @@ class ReachBook:
         self._settings = settings or ReachSettings()
         self._known: dict[EdgeId, tuple[tuple[object, ...], Reach]] = {}
 
-    def closed(self, edges: Iterable[Edge], nodes: Mapping[NodeId, Node], faded: Faded) -> set[EdgeId]:
-        """Those of the edges that the servo could not drive; what is known of others is forgotten.
+    def reach(self, edge: Edge, a: Node, b: Node, gone: Sequence[NDArray[np.bool_] | None]) -> Reach:
+        """Whether the servo could drive an edge.
 
         Args:
-            edges: of a merged map.
-            nodes: of it.
-            faded: which of their landmarks are thought to be gone: these hold no servo.
+            edge: between the two.
+            a: node at the edge's a.
+            b: node at its b.
+            gone: which landmarks of a and of b are thought to be gone: these hold no servo.
         """
-        before, self._known = self._known, {}
-        for edge in edges:
-            if edge.kind not in RECOGNISED or edge.a not in nodes or edge.b not in nodes:
-                continue
-            a, b = nodes[edge.a], nodes[edge.b]
-            gone = [faded.get(end) for end in (edge.a, edge.b)]
-            behind = (edge.a_from_b, a, b, *gone)
-            known = before.get(edge.id)
-            if known is None or any(one is not other for one, other in zip(known[0], behind, strict=True)):
-                left = np.ones(len(edge.shared), np.bool_)
-                for side, mask in enumerate(gone):
-                    if mask is not None:
-                        left &= ~mask[edge.shared[:, side]]
-                known = behind, reach_of(replace(edge, shared=edge.shared[left]), a, b, self._settings)
+        behind = (edge.a_from_b, a, b, *gone)
+        known = self._known.get(edge.id)
+        if known is None or any(one is not other for one, other in zip(known[0], behind, strict=True)):
+            left = np.ones(len(edge.shared), np.bool_)
+            for side, mask in enumerate(gone):
+                if mask is not None:
+                    left &= ~mask[edge.shared[:, side]]
+            known = behind, reach_of(replace(edge, shared=edge.shared[left]), a, b, self._settings)
             self._known[edge.id] = known
-        return {edge_id for edge_id, (_, reach) in self._known.items() if not reach.drivable}
+        return known[1]
+
+    def forget(self, but: Container[EdgeId]) -> None:
+        """Forget what is known of all edges but some."""
+        self._known = {edge_id: known for edge_id, known in self._known.items() if edge_id in but}
+
+
+class ClosedEdges(Collection[EdgeId]):
+    """Edges of a map that the servo could not drive; each is looked at when it is asked about."""
+
+    def __init__(self, union: HybridMap, faded: Faded, book: ReachBook) -> None:
+        """Take a map.
+
+        Args:
+            union: nodes and edges.
+            faded: landmarks that are thought to be gone.
+            book: what is known already.
+        """
+        self._union, self._faded, self._book = union, faded, book
+
+    def __contains__(self, edge_id: object) -> bool:
+        """Whether the servo could not drive an edge of the map."""
+        edge = self._union.edges.get(edge_id) if isinstance(edge_id, NodeId) else None
+        if edge is None or edge.kind not in RECOGNISED or edge.id.agent in IMPLIED:
+            return False
+        nodes = self._union.nodes
+        if edge.a not in nodes or edge.b not in nodes:
+            return False
+        gone = self._faded.get(edge.a), self._faded.get(edge.b)
+        return not self._book.reach(edge, nodes[edge.a], nodes[edge.b], gone).drivable
+
+    def __iter__(self) -> Iterator[EdgeId]:
+        """All of them: looks at every edge."""
+        return (edge_id for edge_id in self._union.edges if edge_id in self)
+
+    def __len__(self) -> int:
+        """How many: looks at every edge."""
+        return sum(1 for _ in self)
 
 
 class Roadmap:
@@ -79,13 +113,14 @@ class Roadmap:
         """
         self.merged = merged
         self.union: HybridMap = merged.union()
-        self.closed = reaches.closed(self.union.edges.values(), self.union.nodes, merged.faded)
+        self.closed = ClosedEdges(self.union, merged.faded, reaches)
+        reaches.forget(self.union.edges)
         self.postures = {node: merged.pose(node) for node in merged.postures}
         self.living = {node: p for node, p in self.postures.items() if node not in merged.superseded}
         self._join_near(near)
         for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
             if node in self.postures and fate.by in self.postures:
-                self._join(EdgeId("superseded", 0, k), node, fate.by)
+                self._join(EdgeId(SUCCESSION, 0, k), node, fate.by)
 
     def _join_near(self, near: float) -> None:
         for number, members in enumerate(self.merged.components):
@@ -95,7 +130,7 @@ class Roadmap:
             places = np.array([[self.postures[n].x, self.postures[n].y] for n in nodes])
             for k, (i, j) in enumerate(sorted(cKDTree(places).query_pairs(near))):
                 if not self._drivable_between(nodes[i], nodes[j]):
-                    self._join(EdgeId("near", number, k), nodes[i], nodes[j])
+                    self._join(EdgeId(NEAR, number, k), nodes[i], nodes[j])
 
     def _drivable_between(self, a: NodeId, b: NodeId) -> bool:
         known = self.union.graph.get_edge_data(a, b) or {}

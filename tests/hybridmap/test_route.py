@@ -125,3 +125,19 @@ def test_reasons() -> None:
     assert "nothing joins" in find_route(one, nodes[0].id, lonely.id).reason
     assert "not in the map" in find_route(one, nodes[0].id, NodeId("r9", 1, 1)).reason
     assert "no posture" in find_route(one, nodes[0].id, nodes[1].id, postures={nodes[0].id: Pose2()}).reason
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6))
+def test_closed_edges_are_as_if_they_were_not_there(seed: int) -> None:
+    one, rng = random_map(seed), np.random.default_rng(seed)
+    closed = {edge_id for edge_id in one.edges if rng.random() < 0.3}
+    left = HybridMap(
+        body for body in one.contents() if not (isinstance(body, EdgePut) and body.edge.id in closed)
+    )
+    start, goal = NodeId("r0", 1, 0), NodeId("r0", 1, 13)
+    found, expected = find_route(one, start, goal, closed=closed), find_route(left, start, goal)
+    assert (found.nodes, found.edges) == (expected.nodes, expected.edges)
+    assert found.cost == pytest.approx(expected.cost)
+    if not found.nodes and find_route(one, start, goal).nodes:
+        assert "only ties postures" in found.reason

@@ -7,15 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
+from benchmarks.synthetic import Sensing, room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
-from hybridmap.node import MapId, NodeId
+from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
 from mapserver.merger import Merger
 from mapserver.routes import Router
+from merge.explanation import explain_nodes
+from merge.explanation_maps import explain_maps
 
 ME = MapId("a", 1)
 STEP = 0.8
+SHARP = Sensing(most=150, clutter=5, unknown_depth=0.0, reach=9.0)
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +61,29 @@ def test_the_first_leg_leads_from_the_node_that_the_robot_knows(row: tuple[Route
     assert first.node.id == nodes[2]
     relative = first.previous_from_node.mean
     assert math.hypot(relative.x - STEP, relative.y) < 0.03
+
+
+def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> None:
+    """Two robots see one wall from three metres apart; then somebody drives from the one to the other."""
+    rng = np.random.default_rng(1)
+    world, other = room(0, 0, 9, 4, 1400, rng), MapId("b", 1)
+    merger, ends = Merger(), []
+    for map_id, x in ((ME, 1.6), (other, 4.6)):
+        nodes, edges = take_map(world, map_id, [Pose2(x + 0.2 * k, 2.0) for k in range(2)], rng, SHARP)
+        for number, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
+            merger.on_change(Change(map_id, number, 0, body))
+        ends.append([node.id for node in nodes])
+    merged = merger.merged()
+    assert len(merged.components) == 1 and merged.links, "the postures are tied"
+    answer = Router(merged).route(ends[0][0], ends[1][1])
+    assert not answer.legs and "only ties postures" in answer.reason
+    told = explain_nodes(merged, *merged.links[0].pair)
+    assert any("ties postures, not driven" in claim and "2.5 m" in claim for claim in told.claims)
+    joined = explain_maps(merged, ME, other)
+    assert joined.joined and "none can be driven" in joined.reason
+    between = merged.relative(ends[0][1], ends[1][0])
+    assert between is not None
+    driven = Edge(NodeId(*ME, 99), ends[0][1], ends[1][0], between, EdgeKind.DRIVEN)
+    merger.on_change(Change(ME, 99, 0, EdgePut(driven)))
+    legs = Router(merger.merged()).route(ends[0][0], ends[1][1]).legs
+    assert [leg.node.id for leg in legs] == [*ends[0], *ends[1]]
