@@ -11,7 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from hybridmap.node import NodeId
+import networkx as nx
+
+from hybridmap.node import MapId, NodeId
 from merge.consistency import ConsistencySettings, Sorted, group_links, sort_links
 from merge.credence import standpoints
 from merge.fragments import Fragment, fragment_by_node
@@ -19,6 +21,7 @@ from merge.groups import LinkGroup
 from merge.joining import Solver, misfits
 from merge.links import Link, RefusedLink, refuse
 from merge.posegraph import PoseGraph
+from merge.witnesses import FalseWitnesses
 
 Key = tuple[NodeId, NodeId]
 """Names of two pieces of map, smaller first."""
@@ -44,19 +47,29 @@ def agglomerate(
         return [link for group in groups.values() for link in group.sorted.kept], []
     refused = {r.pair: r for group in groups.values() for r in group.sorted.refused}
     waiting = [link for group in groups.values() for link in group.links if group.first is not group.second]
-    agreed = {link.canonical().pair for group in groups.values() for link in group.sorted.kept}
+    between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
+    heard = _heard(groups)
+    agreed = {
+        link.canonical().pair
+        for key, found in between.items()
+        for link in _beyond_chance(found, [found], heard[key[0].map], s).kept
+    }
     while True:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in waiting if by_node[link.a] is by_node[link.b]]
         waiting = [link for link in waiting if by_node[link.a] is not by_node[link.b]]
-        borne_out = _borne_out(inside, by_node, agreed, s)
+        borne_out = _borne_out(inside, by_node, agreed, heard, s)
         kept += borne_out
         fits = {link.pair for link in borne_out}
         for link in inside:
             if link.pair not in fits:
                 refused.setdefault(link.canonical().pair, refuse(link, CONTRADICTION))
+        own: dict[Key, list[Sorted]] = {}
+        for (a, b), found in between.items():
+            first, second = sorted((by_node[a].name, by_node[b].name))
+            own.setdefault((first, second), []).append(found)
         pooled = {
-            key: _sorted(links, key, groups, by_node, s)
+            key: _beyond_chance(_sorted(links, key, groups, by_node, s), own[key], heard[key[0].map], s)
             for key, links in group_links(waiting, by_node).items()
         }
         joined = _joined(pooled)
@@ -68,7 +81,35 @@ def agglomerate(
     for found in pooled.values():
         refused |= {r.pair: r for r in found.refused if r.pair not in refused}
     told = {link.canonical().pair for link in kept}
+    every = [link for group in groups.values() for link in group.links]
+    kept = _heard_again(solver, kept, [k for k in every if k.canonical().pair not in told], agreed, heard, s)
+    told = {link.canonical().pair for link in kept}
     return kept, [r for pair, r in refused.items() if pair not in told]
+
+
+def _heard_again(
+    solver: Solver,
+    kept: Sequence[Link],
+    refused: Sequence[Link],
+    agreed: set[tuple[NodeId, NodeId]],
+    heard: Mapping[MapId, FalseWitnesses],
+    s: ConsistencySettings,
+) -> list[Link]:
+    """Refused links that the joined map bears out after all, until there is none.
+
+    Of hundreds of links that are right some two will miss each other's gate by chance, and a clique keeps but
+    one of them. What all others make of the map is a better judge than any one of them.
+    """
+    kept, refused = list(kept), list(refused)
+    while True:
+        by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
+        inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
+        back = _borne_out(inside, by_node, agreed, heard, s)
+        if not back:
+            return kept
+        kept += back
+        pairs = {link.pair for link in back}
+        refused = [link for link in refused if link.pair not in pairs]
 
 
 def _sorted(
@@ -86,6 +127,28 @@ def _sorted(
     return sort_links(links, first, second, s)
 
 
+def _heard(groups: Mapping[Key, LinkGroup]) -> dict[MapId, FalseWitnesses]:
+    """What false witnesses are like, by map: read off all maps that links tie to it, directly or not."""
+    ties: nx.Graph = nx.Graph()
+    ties.add_edges_from((group.first.name.map, group.second.name.map) for group in groups.values())
+    out: dict[MapId, FalseWitnesses] = {}
+    for island in nx.connected_components(ties):
+        supports = [
+            group.sorted.supports[0]
+            for group in groups.values()
+            if group.first is not group.second and group.first.name.map in island
+        ]
+        out |= dict.fromkeys(island, FalseWitnesses.of(supports))
+    return out
+
+
+def _beyond_chance(
+    found: Sorted, own: Sequence[Sorted], heard: FalseWitnesses, s: ConsistencySettings
+) -> Sorted:
+    """What chance does is read off all pieces but the two that are judged."""
+    return found.beyond_chance(heard.without(FalseWitnesses.of(one.supports[0] for one in own)), s)
+
+
 def _joined(pooled: Mapping[Key, Sorted]) -> list[Key]:
     """Which pieces are joined in this round: those of which each is the other's best supported one."""
     ranked = [key for key, found in sorted(pooled.items(), key=lambda x: (-x[1].weight, x[0])) if found.kept]
@@ -100,10 +163,11 @@ def _borne_out(
     links: Sequence[Link],
     by_node: Mapping[NodeId, Fragment],
     agreed: set[tuple[NodeId, NodeId]],
+    heard: Mapping[MapId, FalseWitnesses],
     s: ConsistencySettings,
 ) -> list[Link]:
-    """The links within pieces that these bear out: they fit, and unless others of their group agree with
-    them, that they fit is more than chance.
+    """The links within pieces that these bear out: others of their group agree with them and they fit, or how
+    well they fit makes it likely enough that they are true.
     """
     inside: dict[NodeId, tuple[PoseGraph, list[Link]]] = {}
     for link in links:
@@ -116,6 +180,7 @@ def _borne_out(
         out += [
             link
             for link, good, found in zip(here, fits, known, strict=True)
-            if good and (link.canonical().pair in agreed or found.log_factor > s.least_evidence)
+            if found.log_factor > max(0.0, s.least_evidence - heard[link.a.map].log_odds)
+            or (good and link.canonical().pair in agreed)
         ]
     return out

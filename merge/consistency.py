@@ -5,12 +5,13 @@ the other link, through the other piece. If both are right the loop comes back t
 uncertainty (pairwise consistent measurement set maximisation, Mangelson et al., ICRA 2018). A false link, or
 a set of links into a room that merely looks alike, closes no loop with the true ones. The set that is kept is
 the clique with the most landmarks behind it, and it has to be clearly better than any that contradicts it.
+Links between the same two places are no independent witnesses and count for less (see merge.witnesses).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import networkx as nx
 import numpy as np
@@ -21,6 +22,10 @@ from hybridmap.pose import Array
 from hybridmap.pose_arrays import PoseGaussians
 from merge.fragments import Fragment
 from merge.links import Link, RefusedLink, place_told, refuse
+from merge.witnesses import NOTHING, FalseWitnesses, Support, chances, crowds, neighbours, support_of
+
+HUNDREDTHS = 100.0
+"""Cliques are weighed in whole hundredths of a landmark."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +40,14 @@ class ConsistencySettings:
         least_links: independent links (no node in common) that join two pieces.
         overwhelming_inliers: a single link with as many landmarks ...
         overwhelming_share: ... and this share of its matches joins them alone.
+        place: nodes of a map that are nearer to each other see the same landmarks, m.
+        chance: so many false sets at most may be expected between two pieces that are as good as the one
+            that is kept.
         dominance: how many times the landmarks of a contradicting set the kept set must have.
         exact: up to as many links the best clique is searched exhaustively, beyond greedily.
-        least_evidence: natural logarithm of Bayes' factor (see merge.credence) from which a link that is too
-            little alone, or was contradicted, is believed where other maps join its two ends.
+        least_evidence: natural logarithm of the odds from which a link that is too little alone, or was
+            contradicted, is believed where others join its two ends: how many witnesses are true for one that
+            is false, times Bayes' factor (see merge.credence), which must speak for it.
         cliques: whether links must agree with each other at all; without, all are believed for now.
     """
 
@@ -48,9 +57,11 @@ class ConsistencySettings:
     least_links: int = 2
     overwhelming_inliers: int = 45
     overwhelming_share: float = 0.7
+    place: float = 2.0
+    chance: float = 0.02
     dominance: float = 1.5
     exact: int = 40
-    least_evidence: float = 7.0
+    least_evidence: float = 4.6
     cliques: bool = True
 
 
@@ -62,16 +73,43 @@ class Sorted:
         kept: mutually consistent and enough, or nothing.
         refused: the others, with reasons.
         rivals: two sets that contradict each other and are supported alike, if that is why nothing is kept.
+        weight: landmarks behind the best set; links of one place count by the root of their number.
+        sets: the best set, kept or not, and the best of those that contradict it.
+        supports: behind these two.
     """
 
     kept: tuple[Link, ...]
     refused: tuple[RefusedLink, ...]
     rivals: tuple[tuple[Link, ...], ...] = ()
+    weight: float = 0.0
+    sets: tuple[tuple[Link, ...], tuple[Link, ...]] = ((), ())
+    supports: tuple[Support, Support] = (NOTHING, NOTHING)
 
-    @property
-    def weight(self) -> int:
-        """Landmarks behind the kept links."""
-        return sum(link.weight for link in self.kept)
+    def beyond_chance(self, false: FalseWitnesses, s: ConsistencySettings) -> Sorted:
+        """The same between two pieces that differ, knowing what false links are like.
+
+        What is no more than chance makes is not kept, and contradicts nothing.
+
+        Args:
+            false: what false witnesses are like.
+            s: when links are believed.
+        """
+        real = [k for k in (0, 1) if self.supports[k].by_chance(false) < s.chance]
+        if len(real) == 2 or (self.kept and 0 in real):
+            return self
+        story = self.sets[real[0]] if real and not _too_little(self.sets[real[0]], s) else ()
+        if not self.kept and not story:
+            return self
+        reason = (
+            f"contradicts {len(story)} links, and what agrees with it is no more than chance makes"
+            if story
+            else f"as many agree by chance where {100.0 * false.share:.0f} % of the links are false"
+        )
+        told = {link.canonical().pair for link in story}
+        every = [*self.kept, *(r.link for r in self.refused if r.link is not None)]
+        refused = [refuse(link, reason) for link in every if link.canonical().pair not in told]
+        refused.sort(key=lambda refusal: refusal.pair)
+        return replace(self, kept=story, refused=tuple(refused), rivals=())
 
 
 def loop_distances2(
@@ -85,11 +123,18 @@ def loop_distances2(
         second: piece of map; may be the same, then the links are loops within it.
         s: the floor of uncertainty.
     """
+    return _loops(links, first, second, s)[0]
+
+
+def _loops(
+    links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings
+) -> tuple[Array, Array]:
+    """(N, N) see `loop_distances2`; (N, N) m^2 rad, square roots of the determinants of their covariances."""
     n = len(links)
     i, j = np.triu_indices(n, 1)
-    out = np.zeros((n, n))
+    out, spreads = np.zeros((n, n)), np.ones((n, n))
     if len(i) == 0:
-        return out
+        return out, spreads
     across = PoseGaussians(
         np.stack([link.a_from_b.mean.vector for link in links]),
         np.stack([link.a_from_b.covariance for link in links]),
@@ -99,8 +144,10 @@ def loop_distances2(
     through_first = first.graph.relative([a[k] for k in j], [a[k] for k in i])
     loop = across.take(i) @ through_second @ across.take(j).inverse() @ through_first
     floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
-    out[i, j] = out[j, i] = PoseGaussians(loop.means, loop.covariances + floor).distances2()
-    return out
+    loop = PoseGaussians(loop.means, loop.covariances + floor)
+    out[i, j] = out[j, i] = loop.distances2()
+    spreads[i, j] = spreads[j, i] = np.sqrt(np.linalg.det(loop.covariances))
+    return out, spreads
 
 
 def sort_links(
@@ -120,31 +167,44 @@ def sort_links(
     s = settings or ConsistencySettings()
     links = sorted(links, key=lambda link: link.pair)
     if not s.cliques:
-        return Sorted(tuple(links), ())
+        return Sorted(tuple(links), (), weight=float(sum(link.weight for link in links)))
     refused: list[RefusedLink] = []
     if first is second:
         links, refused = _against_odometry(links, first, s)
-    agree = loop_distances2(links, first, second, s) < s.gate
-    weights = np.array([link.weight for link in links], dtype=np.int64)
-    best = best_clique(agree, weights, s.exact)
+    if not links:
+        return Sorted((), tuple(refused))
+    distances2, spreads = _loops(links, first, second, s)
+    agree, near = distances2 < s.gate, neighbours(links, first, second, s.place)
+    landmarks = np.array([link.weight for link in links])
+    # Witnesses that depend on each other count by the root of their number.
+    weights = landmarks / np.sqrt(crowds(agree, near))
+    hundredths = np.maximum(np.rint(HUNDREDTHS * weights), 1).astype(np.int64)
+    best = best_clique(agree, hundredths, s.exact)
     kept = [links[k] for k in best]
     reason = _too_little(kept, s)
-    rival = _rival(agree, weights, best, s)
-    support, against_it = int(weights[best].sum()), int(weights[rival].sum())
+    rival = _rival(agree, hundredths, best, s)
+    support, against_it = int(landmarks[best].sum()), int(landmarks[rival].sum())
+    weight, against = float(weights[best].sum()), float(weights[rival].sum())
+    sets = tuple(kept), tuple(links[k] for k in rival)
     rivals: tuple[tuple[Link, ...], ...] = ()
-    if not reason and against_it * s.dominance > support:
+    # In number and in places: a single place may bring many links however false they are.
+    if not reason and (against_it * s.dominance > support or against * s.dominance > weight):
         reason = f"ambiguous: {support} landmarks support one way of joining, {against_it} another"
-        rivals = tuple(kept), tuple(links[k] for k in rival)
+        rivals = sets
+    chance = chances(distances2, spreads, first, second)
     for k, link in enumerate(links):
         if k not in best:
-            against = f"contradicts {len(best)} links with {support} landmarks between the same maps"
-            refused.append(refuse(link, reason or against))
+            contradicts = f"contradicts {len(best)} links with {support} landmarks between the same maps"
+            refused.append(refuse(link, reason or contradicts))
         elif reason:
             refused.append(refuse(link, reason))
     return Sorted(
         () if reason else tuple(kept),
         tuple(sorted(refused, key=lambda refusal: refusal.pair)),
         rivals,
+        weight,
+        sets,
+        (support_of(best, agree, near, chance), support_of(rival, agree, near, chance)),
     )
 
 

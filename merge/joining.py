@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 
@@ -35,16 +36,17 @@ class Solver:
         self._huber = huber
         self.by_node = fragment_by_node(fragments)
         self._by_name = {fragment.name: fragment for fragment in fragments}
-        self._solved: dict[tuple[tuple[NodeId, NodeId], ...], PoseGraph] = {}
+        self._solved: dict[tuple[bool, tuple[tuple[NodeId, NodeId], ...]], PoseGraph] = {}
 
-    def solve(self, links: Sequence[Link]) -> list[PoseGraph]:
+    def solve(self, links: Sequence[Link], *, believed: bool = False) -> list[PoseGraph]:
         """Each component, largest first, then by name.
 
         Args:
             links: at most one between two nodes.
+            believed: whether all of them are, and none is held back: plain least squares.
         """
         solved = [
-            self._component(names, here) if here else self._by_name[names[0]].graph
+            self._component(names, here, believed) if here else self._by_name[names[0]].graph
             for names, here in self._components(links)
         ]
         return sorted(solved, key=lambda graph: (-len(graph.nodes), graph.anchor))
@@ -80,13 +82,19 @@ class Solver:
         own = [m for name in names for m in self._by_name[name].measurements]
         return own + [Measurement(link.a, link.b, link.a_from_b, robust=True) for link in links]
 
-    def _component(self, names: Sequence[NodeId], links: Sequence[Link]) -> PoseGraph:
-        key = tuple(sorted(link.canonical().pair for link in links))
+    def _component(self, names: Sequence[NodeId], links: Sequence[Link], believed: bool) -> PoseGraph:
+        pairs = tuple(sorted(link.canonical().pair for link in links))
+        believed = believed or math.isinf(self._huber)
+        key = believed, pairs
         if key not in self._solved:
             anchor = names[0]
             measurements = self._measurements(names, links)
             start = self._by_name[anchor].graph.pose(anchor)
-            self._solved[key] = solve_graph(anchor, start, measurements, huber=self._huber)
+            # The least squares of links that are believed are near where these were tried.
+            tried = self._solved.get((False, pairs))
+            guesses = {node: tried.pose(node) for node in tried.nodes} if tried is not None else None
+            huber = math.inf if believed else self._huber
+            self._solved[key] = solve_graph(anchor, start, measurements, guesses, huber)
         return self._solved[key]
 
 
@@ -137,8 +145,8 @@ class Outliers(StrEnum):
     """What becomes of links that the joined map does not bear out.
 
     All are believed (`none`, plain least squares). Or their pull is limited and the worst is refused, as long
-    as one strains too much (`worst_first`). Or those that graduated non-convexity leaves out are refused at
-    once (`graduated`).
+    as one strains too much; the others then pull as hard as they were measured (`worst_first`). Or those that
+    graduated non-convexity leaves out are refused at once (`graduated`).
     """
 
     NONE = "none"
@@ -172,9 +180,13 @@ def optimise(
         refusals = [refuse(link, reason) for link in left if link.pair in wrong]
         left = [link for link in left if link.pair not in wrong]
     while True:
-        solved = solver.solve(left)
-        strains = _strains(left, solved)
-        if strains.max(initial=0.0) <= strain:
+        # Limited pull lets the wrong ones stand out; where all are right it is not the best estimate.
+        for believed in (False, True):
+            solved = solver.solve(left, believed=believed)
+            strains = _strains(left, solved)
+            if strains.max(initial=0.0) > strain:
+                break
+        else:
             return solved, left, refusals
         worst = int(strains.argmax())
         off = float(strains[worst]) ** 0.5
