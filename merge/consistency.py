@@ -13,13 +13,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array
 from hybridmap.pose_arrays import PoseGaussians
+from merge.cliques import best_clique, independent_links
 from merge.fragments import Fragment
 from merge.links import Link, RefusedLink, place_told, refuse
 from merge.witnesses import NOTHING, FalseWitnesses, Support, chances, crowds, neighbours, support_of
@@ -229,40 +229,6 @@ def _against_odometry(
     return [link for link, good in zip(links, fits, strict=True) if good], refusals
 
 
-def best_clique(agree: NDArray[np.bool_], weights: NDArray[np.int64], exact: int = 40) -> list[int]:
-    """Indices, ascending, of the set in which all agree that has the greatest weight.
-
-    Args:
-        agree: (N, N) symmetric.
-        weights: (N,) positive.
-        exact: up to this N the answer is the best; beyond, grown greedily from each link.
-    """
-    n = len(weights)
-    if agree[np.triu_indices(n, 1)].all():
-        return list(range(n))
-    if n <= exact:
-        graph: nx.Graph = nx.Graph()
-        for k in range(n):
-            graph.add_node(k, weight=int(weights[k]))
-        graph.add_edges_from((i, j) for i in range(n) for j in range(i) if agree[i, j])
-        clique, _ = nx.max_weight_clique(graph, weight="weight")
-        return sorted(clique)
-    best: list[int] = []
-    support = (agree * weights).sum(axis=1) + weights
-    order = np.argsort(-support, kind="stable")
-    for seed in order:
-        grown, open_ = [int(seed)], agree[seed].copy()
-        open_[seed] = False
-        for k in order:
-            if open_[k]:
-                grown.append(int(k))
-                open_ &= agree[k]
-                open_[k] = False
-        if weights[grown].sum() > (weights[best].sum() if best else 0):
-            best = sorted(grown)
-    return best
-
-
 def _rival(
     agree: NDArray[np.bool_], weights: NDArray[np.int64], best: list[int], s: ConsistencySettings
 ) -> list[int]:
@@ -288,13 +254,6 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
         if link.weight >= s.overwhelming_inliers and share >= s.overwhelming_share:
             return ""
     return f"only {independent} independent link of {len(kept)}, {s.least_links} must agree"
-
-
-def independent_links(links: Sequence[Link]) -> int:
-    """How many links can be chosen of which no two have a node in common."""
-    graph: nx.Graph = nx.Graph()
-    graph.add_edges_from(link.pair for link in links)
-    return len(nx.max_weight_matching(graph, maxcardinality=True))
 
 
 def group_links(

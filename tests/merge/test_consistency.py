@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from merge.consistency import ConsistencySettings, best_clique, independent_links, loop_distances2, sort_links
+from merge.cliques import best_clique, independent_links
+from merge.consistency import ConsistencySettings, loop_distances2, sort_links
 from merge.fragments import Fragment
 from merge.links import Link
 from merge.posegraph import Measurement, solve_graph
