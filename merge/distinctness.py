@@ -17,7 +17,7 @@ with it: what is found out at one node holds for all that show the same thing.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -26,10 +26,12 @@ from numpy.typing import NDArray
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeKind, MapId, NodeId
+from hybridmap.pose import Array
 from hybridmap.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 from merge.consistency import ConsistencySettings
 from merge.fragments import Fragment
 from merge.links import DOUBLES, Link, link_of
+from merge.posegraph import PoseGraph
 
 FOLLOWED = (EdgeKind.MAPPED, EdgeKind.TURNED)
 """Edges whose two nodes share landmarks that were tracked from image to image."""
@@ -47,8 +49,8 @@ class DistinctnessSettings:
         apart_heading: by more than this, rad. Less is how well places are measured, not another place.
     """
 
-    apart_xy: float = 0.25
-    apart_heading: float = 0.17
+    apart_xy: float = 0.5
+    apart_heading: float = 0.26
 
 
 def weigh(
@@ -75,82 +77,136 @@ def weigh(
     claims = [link_of(e) for one in maps.values() for e in one.edges.values() if e.kind is EdgeKind.LOOP]
     told = (link for link in (*links, *claims) if len(link.shared))
     known = [link for link in told if link.a in by_node and link.b in by_node]
-    loops = [link for link in known if by_node[link.a] is by_node[link.b]]
-    astray = _contradictions([(link, None) for link in loops], by_node, c, s)
     doubles: set[Landmark] = set()
-    for link, wrong in zip(loops, astray, strict=True):
-        if wrong:
-            doubles |= _ends(link)
-    pairs = list(_pairs(known, by_node))
-    for (one, other), wrong in zip(pairs, _contradictions(pairs, by_node, c, s), strict=True):
-        if wrong:
-            both = np.intersect1d(one.shared[:, 0], other.shared[:, 0])
-            doubles |= {(one.a, int(landmark)) for landmark in both}
-    agreeing = [link for link, wrong in zip(loops, astray, strict=True) if not wrong]
-    doubles = _followed(doubles, agreeing, maps)
+    if known:
+        sides = _Sides.of(known, by_node)
+        loops, pairs = sides.loops(), sides.pairs()
+        astray = sides.contradict(loops, None, c, s)
+        for k in loops[astray]:
+            doubles |= _ends(known[k])
+        for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c, s)]:
+            node, one, other = sides.meeting(i, j)
+            doubles |= {(node, int(landmark)) for landmark in np.intersect1d(one, other)}
+        if doubles:
+            doubles = _followed(doubles, [known[k] for k in loops[~astray]], maps)
     return [_weighed(link, doubles) for link in links]
 
 
-def _pairs(links: Sequence[Link], by_node: Mapping[NodeId, Fragment]) -> Iterator[tuple[Link, Link]]:
-    """Links from one node into one other fragment, two by two, both seen from that node."""
-    meeting: dict[tuple[NodeId, NodeId], list[Link]] = defaultdict(list)
-    for link in links:
-        if by_node[link.a] is not by_node[link.b]:
-            meeting[link.a, by_node[link.b].name].append(link)
-            meeting[link.b, by_node[link.a].name].append(link.turned())
-    for some in meeting.values():
-        yield from combinations(some, 2)
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """N links, each from both of its sides: row k as link k has it, row N + k turned round.
 
-
-def _contradictions(
-    pairs: Sequence[tuple[Link, Link | None]],
-    by_node: Mapping[NodeId, Fragment],
-    c: ConsistencySettings,
-    s: DistinctnessSettings,
-) -> NDArray[np.bool_]:
-    """(N,) whether two links from one node to two others contradict the way between these; or, without a
-    second link, a loop the way between its ends.
+    Attributes:
+        links: N.
+        postures: (2N) of the far end in the near one.
+        near: (2N,) rows in `places`.
+        far: (2N,) likewise.
+        fragments: (P,) which fragment a place is in.
+        places: (P, 3) m, m, rad, all nodes of the fragments, each in its fragment's frame.
+        graphs: of the fragments.
+        starts: (F,) first row of each fragment.
     """
-    out = np.zeros(len(pairs), bool)
-    inside: dict[NodeId, list[int]] = defaultdict(list)
-    for k, (one, _) in enumerate(pairs):
-        inside[by_node[one.b].name].append(k)
-    for seats in inside.values():
-        here = [pairs[k] for k in seats]
-        graph = by_node[here[0][0].b].graph
-        starts = [one.b for one, _ in here]
-        ends = [one.a if other is None else other.b for one, other in here]
-        a, b = graph.means[graph.index(starts)], graph.means[graph.index(ends)]
-        off = compose_poses(_between(here).means, compose_poses(inverse_poses(b), a))
-        far = np.flatnonzero(
-            (np.hypot(off[:, 0], off[:, 1]) > s.apart_xy) | (abs(off[:, 2]) > s.apart_heading)
+
+    links: Sequence[Link]
+    postures: PoseGaussians
+    near: NDArray[np.int64]
+    far: NDArray[np.int64]
+    fragments: NDArray[np.int64]
+    places: Array
+    graphs: tuple[PoseGraph, ...]
+    starts: NDArray[np.int64]
+
+    @staticmethod
+    def of(links: Sequence[Link], by_node: Mapping[NodeId, Fragment]) -> _Sides:
+        """Of links with both nodes in fragments."""
+        graphs = {by_node[node].name: by_node[node].graph for link in links for node in link.pair}
+        sizes = [len(graph.nodes) for graph in graphs.values()]
+        starts = np.cumsum([0, *sizes[:-1]])
+        first = dict(zip(graphs, starts.tolist(), strict=True))
+        a, b = (
+            np.array([first[by_node[node].name] + graphs[by_node[node].name].rows[node] for node in nodes])
+            for nodes in zip(*(link.pair for link in links), strict=True)
         )
-        if len(far):
-            # Covariances cost more than all the rest: only where places seem to be different.
-            back = graph.relative([ends[k] for k in far], [starts[k] for k in far])
-            loop = _between([here[k] for k in far]) @ back
+        there = PoseGaussians(
+            np.array([(m.x, m.y, m.heading) for m in (link.a_from_b.mean for link in links)]),
+            np.array([link.a_from_b.covariance for link in links]),
+        )
+        back = there.inverse()
+        return _Sides(
+            links,
+            PoseGaussians(
+                np.concatenate([there.means, back.means]),
+                np.concatenate([there.covariances, back.covariances]),
+            ),
+            np.concatenate([a, b]),
+            np.concatenate([b, a]),
+            np.repeat(np.arange(len(sizes)), sizes),
+            np.concatenate([graph.means for graph in graphs.values()]),
+            tuple(graphs.values()),
+            starts,
+        )
+
+    def loops(self) -> NDArray[np.int64]:
+        """(L,) links within one fragment."""
+        count = len(self.links)
+        found = self.fragments[self.near[:count]] == self.fragments[self.far[:count]]
+        return np.flatnonzero(found)
+
+    def pairs(self) -> NDArray[np.int64]:
+        """(K, 2) sides that go from one node into one other fragment, two by two."""
+        out = np.flatnonzero(self.fragments[self.near] != self.fragments[self.far])
+        keys = self.near[out] * len(self.graphs) + self.fragments[self.far[out]]
+        order = np.argsort(keys, kind="stable")
+        cuts = np.flatnonzero(np.diff(keys[order])) + 1
+        groups = np.split(out[order], cuts)
+        pairs = [pair for group in groups for pair in combinations(group.tolist(), 2)]
+        return np.array(pairs, np.int64).reshape(-1, 2)
+
+    def meeting(self, i: int, j: int) -> tuple[NodeId, NDArray[np.int64], NDArray[np.int64]]:
+        """The node from which two sides go, and which of its landmarks each of them rests on."""
+        count = len(self.links)
+        links = self.links[i % count], self.links[j % count]
+        columns = int(i >= count), int(j >= count)
+        one, other = (link.shared[:, column] for link, column in zip(links, columns, strict=True))
+        return links[0].pair[columns[0]], one, other
+
+    def contradict(
+        self,
+        sides: NDArray[np.int64],
+        others: NDArray[np.int64] | None,
+        c: ConsistencySettings,
+        s: DistinctnessSettings,
+    ) -> NDArray[np.bool_]:
+        """(K,) whether two sides that go out from one node contradict the way between their far ends.
+
+        Args:
+            sides: (K,) which.
+            others: (K,) which; None: loops, and the way between the two ends of each.
+            c: when they contradict it,
+            s: and by how much at least.
+        """
+        starts = self.far[sides]
+        ends = self.near[sides] if others is None else self.far[others]
+        own = compose_poses(inverse_poses(self.places[ends]), self.places[starts])
+        off = compose_poses(self._between(sides, others).means, own)
+        much = (np.hypot(off[:, 0], off[:, 1]) > s.apart_xy) | (abs(off[:, 2]) > s.apart_heading)
+        out = np.zeros(len(sides), bool)
+        # Covariances cost more than all the rest: only where places seem to be different.
+        for fragment in np.unique(self.fragments[starts[much]]):
+            here = np.flatnonzero(much & (self.fragments[starts] == fragment))
+            nodes, first = self.graphs[fragment].nodes, self.starts[fragment]
+            back = self.graphs[fragment].relative(
+                [nodes[k - first] for k in ends[here]], [nodes[k - first] for k in starts[here]]
+            )
+            loop = self._between(sides[here], None if others is None else others[here]) @ back
             floor = np.diag([c.floor_xy**2, c.floor_xy**2, c.floor_heading**2])
-            wrong = PoseGaussians(loop.means, loop.covariances + floor).distances2() > c.gate
-            out[np.array(seats)[far[wrong]]] = True
-    return out
+            out[here] = PoseGaussians(loop.means, loop.covariances + floor).distances2() > c.gate
+        return out
 
-
-def _between(pairs: Sequence[tuple[Link, Link | None]]) -> PoseGaussians:
-    """How the far ends stand to each other by the links alone: of a loop, its b and its a."""
-    back = _postures([one for one, _ in pairs]).inverse()
-    onward = [k for k, (_, other) in enumerate(pairs) if other is not None]
-    means, covariances = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3, 3))
-    if onward:
-        there = _postures([other for _, other in pairs if other is not None])
-        means[onward], covariances[onward] = there.means, there.covariances
-    return back @ PoseGaussians(means, covariances)
-
-
-def _postures(links: Sequence[Link]) -> PoseGaussians:
-    return PoseGaussians(
-        np.stack([link.a_from_b.mean.vector for link in links]),
-        np.stack([link.a_from_b.covariance for link in links]),
-    )
+    def _between(self, sides: NDArray[np.int64], others: NDArray[np.int64] | None) -> PoseGaussians:
+        """How the far ends stand to each other by the links alone; of a loop, its far and its near end."""
+        back = self.postures.take(sides).inverse()
+        return back if others is None else back @ self.postures.take(others)
 
 
 def _ends(link: Link) -> set[Landmark]:

@@ -195,6 +195,20 @@ def test_measured_badly_is_not_another_place() -> None:
     assert len(links) == 2 and not any(link.doubles for link in aisle.weighed(links))
 
 
+def test_a_way_that_is_hardly_known_contradicts_nothing() -> None:
+    """A robot slid while it drove from one sight of a bay to the next, and its covariance says so."""
+    aisle = Aisle(11, signs=(1,), cartons=0)
+    aisle.drive("a", [1], views=1)
+    aisle.drive("b", [1], views=2)
+    links = [link for link in aisle.links() if not link.within]
+    b = aisle.maps[MapId("b", 1)]
+    (step,) = b.edges.values()
+    for sigma, doubles in ((0.01, SIGNS), (0.5, 0)):
+        slid = PoseGaussian(step.a_from_b.mean @ Pose2(0.8, 0.0, 0.0), np.diag([sigma, sigma, 0.02]) ** 2)
+        b.edges[step.id] = replace(step, a_from_b=slid)
+        assert [link.doubles for link in aisle.weighed(links)] == [doubles] * 2
+
+
 def test_order_has_no_say() -> None:
     aisle = Aisle(10, signs=(1, 2))
     aisle.drive("a", [0, 1, 2])
