@@ -18,6 +18,8 @@ SUFFIX = ".places"
 """Of the file, behind the store's name."""
 EVERY = 600.0
 """Seconds between two looks whether there is something new to save."""
+WORTHWHILE = 0.02
+"""Share of the nodes that must be new before a running server saves the index."""
 
 
 class PlaceKeeper:
@@ -65,7 +67,10 @@ class PlaceKeeper:
 
     def _work(self) -> None:
         while not self._stop.wait(self._every):
-            self._save()
+            (before, _), (now, nodes) = self._saved, self.index.version
+            # A large index is not written for a few nodes: they are soon put in again.
+            if now - before >= WORTHWHILE * nodes:
+                self._save()
 
     def _save(self) -> None:
         state = self.index.version

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -251,3 +252,27 @@ def test_a_full_disk_is_told_and_nothing_half_is_left(
     with pytest.raises(InvalidFile, match=r"cannot be saved \(No space left"):
         snapshot.save(tmp_path / "x", filled(mapped[0]), LOGS)
     assert [path.name for path in tmp_path.iterdir()] == ["x"] and (tmp_path / "x").read_bytes() == before
+
+
+def test_a_running_server_saves_when_enough_is_new(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store.db")
+    kept = tmp_path / f"store.db{SUFFIX}"
+    keeper = PlaceKeeper(store, tmp_path / "store.db", every=0.01)
+    keeper.start()
+    nodes = many(120)
+    keeper.index.extend(nodes[:100])
+    end = time.monotonic() + 20
+    while not kept.exists():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    first = kept.stat().st_mtime_ns
+    keeper.index.add(nodes[100])
+    time.sleep(0.1)
+    assert kept.stat().st_mtime_ns == first
+    keeper.index.extend(nodes[101:])
+    while kept.stat().st_mtime_ns == first:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    keeper.close()
+    assert len(snapshot.load(kept, store.positions())) == 120
+    store.close()
