@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.reach_book import ReachBook
 from hybridmap.ruling import Rulings
 from mapserver.placeindex import PlaceIndex
-from mapserver.roadmap import ReachBook
 from merge.candidates import CandidateSettings, Pair
 from merge.fading import Fader, FadingSettings
 from merge.incremental import Islands, Verdict, Verdicts
@@ -84,7 +84,7 @@ class Merger:
         self._islands = Islands(self._settings.merging)
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
-        self._renewer = Renewer(self._settings.renewal, self._settings.verification)
+        self._renewer = Renewer(self._settings.renewal, self._settings.verification, self.reaches)
         self._fader = Fader(self._settings.fading)
         self._rulings = Rulings()
         self._merged = MergedMap.empty()

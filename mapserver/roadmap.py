@@ -2,60 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeId, EdgeKind, Node, NodeId
+from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.reach import RECOGNISED, Reach, ReachSettings, reach_of
+from hybridmap.reach import RECOGNISED
+from hybridmap.reach_book import ReachBook
 from merge.merged import MergedMap
 
 NEAR, SUCCESSION = IMPLIED = ("near", "superseded")
 """Stand for the agents in the ids of edges that follow from where nodes are."""
 Faded = Mapping[NodeId, NDArray[np.bool_]]
 """Of each node which landmarks are thought to be gone."""
-
-
-class ReachBook:
-    """What was found out of edges, from merged map to merged map: an edge is looked at once."""
-
-    def __init__(self, settings: ReachSettings | None = None) -> None:
-        """Start with nothing known.
-
-        Args:
-            settings: what the servo manages.
-        """
-        self._settings = settings or ReachSettings()
-        self._known: dict[EdgeId, tuple[tuple[object, ...], Reach]] = {}
-
-    def reach(self, edge: Edge, a: Node, b: Node, gone: Sequence[NDArray[np.bool_] | None]) -> Reach:
-        """Whether the servo could drive an edge.
-
-        Args:
-            edge: between the two.
-            a: node at the edge's a.
-            b: node at its b.
-            gone: which landmarks of a and of b are thought to be gone: these hold no servo.
-        """
-        behind = (edge.a_from_b, a, b, *gone)
-        known = self._known.get(edge.id)
-        if known is None or any(one is not other for one, other in zip(known[0], behind, strict=True)):
-            left = np.ones(len(edge.shared), np.bool_)
-            for side, mask in enumerate(gone):
-                if mask is not None:
-                    left &= ~mask[edge.shared[:, side]]
-            known = behind, reach_of(replace(edge, shared=edge.shared[left]), a, b, self._settings)
-            self._known[edge.id] = known
-        return known[1]
-
-    def forget(self, but: Container[EdgeId]) -> None:
-        """Forget what is known of all edges but some."""
-        self._known = {edge_id: known for edge_id, known in self._known.items() if edge_id in but}
 
 
 class ClosedEdges(Collection[EdgeId]):

@@ -13,9 +13,10 @@ from hybridmap.node import EdgeId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
 from hybridmap.reach import RECOGNISED
+from hybridmap.reach_book import ReachBook
 from hybridmap.route import Route, RouteSettings, Ways
 from mapserver.living import without_faded
-from mapserver.roadmap import ReachBook, Roadmap
+from mapserver.roadmap import Roadmap
 from merge.merged import MergedMap
 from merge.undoing import reason_of
 

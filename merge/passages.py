@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId, NodeId
-from hybridmap.reach import RECOGNISED, ReachSettings, reach_of
+from hybridmap.reach import RECOGNISED
+from hybridmap.reach_book import ReachBook
 from merge.links import Link
 from merge.merged import MergedMap
 from merge.posegraph import PoseGraph
@@ -26,7 +27,7 @@ class Passages:
         self,
         merged: MergedMap,
         links: Iterable[Link],
-        reach: ReachSettings,
+        reaches: ReachBook,
         near: float,
         foreign: Iterable[Edge] = (),
         without: Iterable[NodeId] = (),
@@ -36,12 +37,12 @@ class Passages:
         Args:
             merged: the map.
             links: of it, of the components that are asked about.
-            reach: what the servo manages.
+            reaches: what is known of edges; it is written to.
             near: m, nodes nearer than this to each other stand in one place.
             foreign: edges that lead out of the maps that tell them, see `ForeignEdges`.
             without: nodes that are left out from the start.
         """
-        self._merged, self._reach, self._near = merged, reach, near
+        self._merged, self._book, self._near = merged, reaches, near
         self._gone = set(without)
         self._trees: dict[NodeId, cKDTree] = {}
         self._ways: dict[NodeId, dict[NodeId, float]] = {}
@@ -130,7 +131,7 @@ class Passages:
             return True
         maps = self._merged.maps
         a, b = (maps[end.map].nodes.get(end) if end.map in maps else None for end in (edge.a, edge.b))
-        return a is not None and b is not None and reach_of(edge, a, b, self._reach).drivable
+        return a is not None and b is not None and self._book.reach(edge, a, b, (None, None)).drivable
 
     def _graph(self, node: NodeId) -> PoseGraph:
         component = self._merged.component_of(node)

@@ -16,17 +16,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hybridmap.matching import match
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.reach import ReachSettings, least_in_view
+from hybridmap.reach_book import ReachBook
 from hybridmap.superseded import Superseded
 from merge.ages import is_older
+from merge.comparisons import Comparisons
 from merge.links import Link
 from merge.merged import MergedMap
 from merge.passages import ForeignEdges, Passages
 from merge.posegraph import PoseGraph
-from merge.verification import VerificationSettings, verify
+from merge.verification import VerificationSettings
 
 SECOND = 1_000_000_000
 
@@ -39,11 +40,11 @@ class RenewalSettings:
         reach: where a robot that follows a route looks for a node: nearer than this, and turned by less. It
             is well within the servo's basin.
         found: landmarks that both show and that stay in view between them.
-        depths: the newer one knows at least this share of the number of depths that the older one knows.
+        depths: the newer one knows at least this share of the number of depths that the older one knows,
+        enough: or at least this many.
         again: s, that lie between them if both belong to one map: views of one visit complete each other.
         detour: m, by which a way between neighbours may become longer.
         near: m, nodes nearer than this to each other stand in one place, as for routes.
-        tries: pairs that are compared for this alone, of each new node.
         gate: chi-square with 3 degrees of freedom within which such a comparison bears out the merged map.
         floor: m, m and rad, error of both that no covariance tells of.
     """
@@ -51,10 +52,10 @@ class RenewalSettings:
     reach: ReachSettings = field(default_factory=lambda: ReachSettings(farthest=1.4, widest=0.6))
     found: int = 20
     depths: float = 0.7
+    enough: int = 60
     again: float = 120.0
     detour: float = 1.5
     near: float = 0.5
-    tries: int = 6
     gate: float = 16.3
     floor: tuple[float, float, float] = (0.05, 0.05, 0.03)
 
@@ -63,16 +64,21 @@ class Renewer:
     """Goes from merged map to merged map with what was superseded: only what is new is looked at."""
 
     def __init__(
-        self, settings: RenewalSettings | None = None, verification: VerificationSettings | None = None
+        self,
+        settings: RenewalSettings | None = None,
+        verification: VerificationSettings | None = None,
+        reaches: ReachBook | None = None,
     ) -> None:
         """Begin with nothing superseded.
 
         Args:
             settings: when a node is.
             verification: as in the merge.
+            reaches: what is known of edges; it is written to.
         """
         self._settings = settings or RenewalSettings()
-        self._verification = verification
+        self._comparisons = Comparisons(verification)
+        self._reaches = reaches or ReachBook()
         self._fates: dict[NodeId, Superseded] = {}
         self._seen: dict[NodeId, Node] = {}
         self._linked: set[tuple[NodeId, NodeId]] = set()
@@ -86,21 +92,21 @@ class Renewer:
             merged: the next merged map of the same fleet.
         """
         nodes = self._changed(merged)
-        fresh = {node for node, one in nodes.items() if self._seen.get(node) is not one}
+        anew = {node for node, one in nodes.items() if self._seen.get(node) is not one}
         self._seen |= nodes
         links = [link for link in merged.links if link.a in nodes]
-        fresh |= {node for link in links if link.pair not in self._linked for node in link.pair}
+        fresh = anew | {node for link in links if link.pair not in self._linked for node in link.pair}
         self._linked = {link.pair for link in merged.links}
         # One that is known better is judged anew, as are those that it stood for.
         for node, fate in tuple(self._fates.items()):
-            if node not in self._seen or fate.by not in self._seen or {node, fate.by} & fresh:
+            if node not in self._seen or fate.by not in self._seen or {node, fate.by} & anew:
                 del self._fates[node]
                 fresh |= {node} & nodes.keys()
         if nodes:
             s = self._settings
             foreign = self._foreign.of(merged.maps)
-            passages = Passages(merged, links, ReachSettings(), s.near, foreign, self._fates)
-            this = _Round(merged, nodes, links, self._fates, passages, s, self._verification)
+            passages = Passages(merged, links, self._reaches, s.near, foreign, self._fates)
+            this = _Round(merged, nodes, links, self._fates, passages, self._comparisons, s)
             this.look_at(fresh | this.revive())
         return replace(merged, superseded=dict(sorted(self._fates.items())))
 
@@ -133,18 +139,18 @@ class _Round:
         links: Iterable[Link],
         fates: dict[NodeId, Superseded],
         passages: Passages,
+        comparisons: Comparisons,
         settings: RenewalSettings,
-        verification: VerificationSettings | None,
     ) -> None:
         self._merged, self._nodes, self._fates = merged, nodes, fates
-        self._settings, self._verification = settings, verification
+        self._settings = settings
+        self._comparisons = comparisons
         self._links = {link.pair: link for link in links}
         self._refused = {refusal.pair for refusal in merged.refused if refusal.edge is None}
         self._stands_for: dict[NodeId, set[NodeId]] = {}
         for node, fate in fates.items():
             self._stands_for.setdefault(fate.by, set()).add(node)
         self._passages = passages
-        self._compared: dict[NodeId, int] = {}
 
     def revive(self) -> set[NodeId]:
         """Give life back to nodes whose successor is too far off now, or shown to be wrong."""
@@ -215,7 +221,7 @@ class _Round:
             return None
         if old.map == new.map and abs(a.stamp_ns - b.stamp_ns) < s.again * SECOND:
             return None
-        if b.landmarks.has_depth.sum() < s.depths * a.landmarks.has_depth.sum():
+        if b.landmarks.has_depth.sum() < min(s.depths * a.landmarks.has_depth.sum(), s.enough):
             return None
         link = self._links.get(_ordered(old, new)) or self._compare(a, b)
         if link is None:
@@ -225,18 +231,12 @@ class _Round:
         return Superseded(new, found, distance, turn) if found >= s.found else None
 
     def _compare(self, a: Node, b: Node) -> Link | None:
-        """A link between two nodes that the merge had no need to compare."""
+        """A link between two nodes that the merge had no need to compare; one that it refused is none."""
         s, pair = self._settings, _ordered(a.id, b.id)
-        tried = max(self._compared.get(node, 0) for node in pair)
-        if pair in self._refused or tried >= s.tries:
+        if pair in self._refused:
             return None
-        recognition = (self._verification or VerificationSettings()).recognition
-        if len(match(a.landmarks.codes, b.landmarks.codes, recognition.matching)) < s.found:
-            return None
-        for node in pair:
-            self._compared[node] = self._compared.get(node, 0) + 1
-        verdict = verify(a, b, self._verification)
-        if not isinstance(verdict, Link):
+        verdict = self._comparisons.link(a, b, s.found)
+        if verdict is None:
             return None
         there = self._merged.relative(*verdict.pair)
         assert there is not None, "nodes of one component"

@@ -13,12 +13,13 @@ from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
+from hybridmap.reach_book import ReachBook
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.living import LivingPlaces
 from mapserver.mapfiles import map_file_of, merged_of
 from mapserver.merger import Merger
 from mapserver.relocalization import Relocalizer
-from mapserver.roadmap import ReachBook, Roadmap
+from mapserver.roadmap import Roadmap
 from mapserver.routes import Router
 from merge.explanation import explain_nodes
 from merge.links import Link
