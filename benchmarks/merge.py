@@ -6,9 +6,12 @@
 Synthetic fleets of four robots (see `benchmarks.merge_fleets`) with 0, 50, 80 and 90 % false links, `--runs`
 of each. `ate_ratio`: error of all nodes after one alignment of the whole fleet over that of plain least
 squares which knows the true links, median; a robot that is left apart counts with where its own map is.
-`link_precision` and `link_recall` are means, `whole` is the share of the fleets that became one map. Side by
-side: plain least squares, graduated non-convexity alone (GNC), pairwise consistency alone (PCM), the two
-together, PCM with limited pull, and Mapweave as it is by default.
+`link_precision` and `link_recall` are means; `whole`, `good` and `joined_falsely` are the shares of fleets
+that became one map, whose ratio is at most 1.1, and in which robots are joined by no true link. False links
+come in sets of up to four that agree with each other; under `independent` are the same figures where each is
+false for itself, as is usual in the literature. Side by side: plain least squares, graduated non-convexity
+alone (GNC), pairwise consistency alone (PCM), the two together, Mapweave with GNC at the end, and Mapweave as
+it is by default.
 
 With `--g2o FILE` the graph is also split among `--split` robots and merged: `cost_ratio` is the chi-square of
 all its edges, refused ones too, over that of GTSAM's batch optimum. With `--robots FOLDER`, which holds one
@@ -34,16 +37,17 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.merge_fleets import draw_fleet
+from benchmarks.merge_fleets import FleetSettings, draw_fleet
 from benchmarks.merge_g2o import batch_optimum, chi2_of, factors_of, split
-from benchmarks.merge_rivals import MAPWEAVE, RIVALS, error, oracle, precision_recall
+from benchmarks.merge_rivals import MAPWEAVE, RIVALS, error, joined_falsely, oracle, precision_recall
 from benchmarks.merge_robots import kept_links
 from hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.g2o import G2oGraph, read_g2o
-from merge.merging import merge_maps
 
 SHARES = (0, 50, 80, 90)
 """Of false links, per cent."""
+GOOD = 1.1
+"""An `ate_ratio` that is as good as knowing the true links."""
 Figures = dict[str, dict[str, float | None]]
 """By figure, then by the share of false links or the file."""
 
@@ -59,7 +63,9 @@ def main() -> None:
         folders = {str(folder): kept_links(folder) for folder in arguments.robots}
         graphs = {path.stem: read_g2o(path) for path in arguments.g2o}
         with Progress(console=console) as progress:
-            found = with_false_links(arguments.seed, arguments.runs, progress)
+            found = with_false_links(arguments.seed, arguments.runs, FleetSettings(), progress)
+            alone = FleetSettings(most_alike=1)
+            independent = with_false_links(arguments.seed, arguments.runs, alone, progress)
             for title, graph in graphs.items():
                 for name, figures in standard_set(title, graph, arguments.split, progress).items():
                     for figure, value in figures.items():
@@ -69,6 +75,8 @@ def main() -> None:
         raise SystemExit(1) from None
     for figure in found[MAPWEAVE]:
         console.print(_table(figure, found))
+    for figure in independent[MAPWEAVE]:
+        console.print(_table(figure, independent, ", each false link for itself"))
     for folder, (links, kept) in folders.items():
         console.print(f"{folder}: {len(kept)} of {len(links)} links between robots are kept")
     if arguments.json:
@@ -78,34 +86,50 @@ def main() -> None:
                 for folder, (links, kept) in folders.items()
             }
         }
-        rivals = {name: figures for name, figures in found.items() if name != MAPWEAVE}
-        print(json.dumps({"seed": arguments.seed, **found[MAPWEAVE], **spatial, "rivals": rivals}))
+        out = {
+            "seed": arguments.seed,
+            "runs": arguments.runs,
+            **_with_rivals(found),
+            "independent": _with_rivals(independent),
+            **spatial,
+        }
+        print(json.dumps(out))
 
 
-def with_false_links(seed: int, runs: int, progress: Progress) -> dict[str, Figures]:
+def _with_rivals(found: dict[str, Figures]) -> dict[str, object]:
+    """Mapweave's figures, and those of its rivals beside them."""
+    return {**found[MAPWEAVE], "rivals": {name: f for name, f in found.items() if name != MAPWEAVE}}
+
+
+def with_false_links(seed: int, runs: int, settings: FleetSettings, progress: Progress) -> dict[str, Figures]:
     """The figures of each rival by the share of false links."""
-    task = progress.add_task("false links", total=len(SHARES) * runs * len(RIVALS))
+    task = progress.add_task(
+        f"false links, up to {settings.most_alike} alike", total=len(SHARES) * runs * len(RIVALS)
+    )
     found: dict[str, Figures] = {name: {} for name in RIVALS}
     for share in SHARES:
         rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in RIVALS}
         for run in range(runs):
-            fleet = draw_fleet(share / 100.0, np.random.default_rng([seed, run, share]))
+            fleet = draw_fleet(share / 100.0, np.random.default_rng([seed, run, share]), settings)
             best = error(oracle(fleet), fleet.truth)
-            for name, settings in RIVALS.items():
+            for name, merge in RIVALS.items():
                 began = time.perf_counter()
-                merged = merge_maps(fleet.maps, fleet.links, settings=settings)
+                merged = merge(fleet.maps, fleet.links)
                 took = 1e3 * (time.perf_counter() - began)
                 ratio = error(merged, fleet.truth) / best
-                whole = float(len(merged.components) == 1)
-                rows[name].append((ratio, *precision_recall(merged.links, fleet), whole, took))
+                outcome = len(merged.components) == 1, ratio <= GOOD, joined_falsely(merged, fleet)
+                links = precision_recall(merged.links, fleet)
+                rows[name].append((ratio, *links, *(float(one) for one in outcome), took))
                 progress.advance(task)
         for name, values in rows.items():
-            ratios, precisions, recalls, wholes, times = zip(*values, strict=True)
+            ratios, precisions, recalls, wholes, goods, falsely, times = zip(*values, strict=True)
             for figure, value in (
                 ("ate_ratio", statistics.median(ratios)),
                 ("link_precision", statistics.mean(precisions)),
                 ("link_recall", statistics.mean(recalls)),
                 ("whole", statistics.mean(wholes)),
+                ("good", statistics.mean(goods)),
+                ("joined_falsely", statistics.mean(falsely)),
                 ("merge_ms", statistics.median(times)),
             ):
                 found[name].setdefault(figure, {})[str(share)] = round(value, 4)
@@ -121,8 +145,8 @@ def standard_set(
     maps, links, nodes = split(graph, robots)
     task = progress.add_task(title, total=len(RIVALS))
     found: dict[str, dict[str, float | None]] = {}
-    for name, settings in RIVALS.items():
-        merged = merge_maps(maps, links, settings=settings)
+    for name, merge in RIVALS.items():
+        merged = merge(maps, links)
         chi2 = chi2_of(factors, merged, nodes)
         found[name] = {
             "cost_ratio": None if chi2 is None else round(chi2 / best, 6),
@@ -133,9 +157,9 @@ def standard_set(
     return found
 
 
-def _table(figure: str, found: dict[str, Figures]) -> Table:
+def _table(figure: str, found: dict[str, Figures], of_what: str = "") -> Table:
     columns: Sequence[str] = list(found[MAPWEAVE][figure])
-    table = Table("", *(f"{c} %" if c.isdigit() else c for c in columns), title=figure)
+    table = Table("", *(f"{c} %" if c.isdigit() else c for c in columns), title=figure + of_what)
     for name, figures in found.items():
         values = [figures[figure][column] for column in columns]
         table.add_row(name, *("in pieces" if value is None else f"{value:.4g}" for value in values))

@@ -1,15 +1,22 @@
-"""The ways to merge that `benchmarks.merge` compares, all by the same code with parts of it left out."""
+"""The ways to merge that `benchmarks.merge` compares."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import networkx as nx
 import numpy as np
 
 from benchmarks.merge_fleets import SyntheticFleet
-from hybridmap.node import NodeId
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Array, Pose2
 from mapweave.scoring import align
+from merge.cliques import best_clique
+from merge.consistency import ConsistencySettings, group_links, loop_distances2
+from merge.cutting import fragments_of
+from merge.fragments import fragment_by_node
 from merge.joining import Outliers
 from merge.links import Link
 from merge.merged import MergedMap
@@ -17,30 +24,68 @@ from merge.merging import MergeSettings, merge_maps
 
 MAPWEAVE = "mapweave"
 """The settings that are the default."""
+Maps = Mapping[MapId, HybridMap]
+Rival = Callable[[Maps, Sequence[Link]], MergedMap]
 
 
-def settings_of(cliques: bool, outliers: Outliers) -> MergeSettings:
-    """The default with these parts."""
+def believing(outliers: Outliers) -> MergeSettings:
+    """No link is asked whether others agree with it."""
     default = MergeSettings()
-    consistency = replace(default.consistency, cliques=cliques)
+    consistency = replace(default.consistency, cliques=False)
     return replace(default, consistency=consistency, outliers=outliers)
 
 
-RIVALS: dict[str, MergeSettings] = {
-    "least_squares": settings_of(False, Outliers.NONE),
-    "gnc": settings_of(False, Outliers.GRADUATED),
-    "pcm": settings_of(True, Outliers.NONE),
-    "pcm_huber": settings_of(True, Outliers.WORST_FIRST),
-    "pcm_gnc": settings_of(True, Outliers.GRADUATED),
-    MAPWEAVE: MergeSettings(),
+def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
+    """All links are believed."""
+    return merge_maps(maps, links, settings=believing(Outliers.NONE))
+
+
+def gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
+    """Graduated non-convexity over all links at once (Yang et al., RA-L 2020)."""
+    return merge_maps(maps, links, settings=believing(Outliers.GRADUATED))
+
+
+def pcm(maps: Maps, links: Sequence[Link]) -> MergedMap:
+    """The largest pairwise consistent set between each two maps (Mangelson et al., ICRA 2018)."""
+    return least_squares(maps, largest_sets(maps, links))
+
+
+def pcm_gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
+    """First the one, then the other, as in Kimera-Multi."""
+    return gnc(maps, largest_sets(maps, links))
+
+
+def largest_sets(maps: Maps, links: Sequence[Link]) -> list[Link]:
+    """The links in the largest consistent set of their pair of maps, if there are two at least."""
+    s, by_node = ConsistencySettings(), fragment_by_node(fragments_of(maps))
+    out: list[Link] = []
+    for (first, second), group in group_links(links, by_node).items():
+        agree = loop_distances2(group, by_node[first], by_node[second], s) < s.gate
+        best = best_clique(agree, np.ones(len(group), np.int64), s.exact)
+        out += [group[k].canonical() for k in best if len(best) >= s.least_links]
+    return out
+
+
+def mapweave_gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
+    """Mapweave with graduated non-convexity at the end."""
+    return merge_maps(maps, links, settings=replace(MergeSettings(), outliers=Outliers.GRADUATED))
+
+
+RIVALS: dict[str, Rival] = {
+    "least_squares": least_squares,
+    "gnc": gnc,
+    "pcm": pcm,
+    "pcm_gnc": pcm_gnc,
+    "mapweave_gnc": mapweave_gnc,
+    MAPWEAVE: merge_maps,
 }
-"""By name. `pcm_huber` limits the pull of links and refuses the worst, one after the other."""
+"""By name."""
 
 
 def oracle(fleet: SyntheticFleet) -> MergedMap:
     """What who knows the true links makes of them, by plain least squares."""
     links = [link for link in fleet.links if link.pair in fleet.true]
-    return merge_maps(fleet.maps, links, settings=RIVALS["least_squares"])
+    return least_squares(fleet.maps, links)
 
 
 def error(merged: MergedMap, truth: dict[NodeId, Pose2]) -> float:
@@ -69,3 +114,12 @@ def precision_recall(links: tuple[Link, ...], fleet: SyntheticFleet) -> tuple[fl
     kept = {link.pair for link in links}
     good = len(kept & fleet.true)
     return good / len(kept) if kept else 1.0, good / len(fleet.true) if fleet.true else 1.0
+
+
+def joined_falsely(merged: MergedMap, fleet: SyntheticFleet) -> bool:
+    """Whether robots are in one component that no true links tie together, directly or by way of others."""
+    tied: nx.Graph = nx.Graph()
+    tied.add_nodes_from(fleet.maps)
+    tied.add_edges_from((link.a.map, link.b.map) for link in merged.links if link.pair in fleet.true)
+    part_of = {one: k for k, part in enumerate(nx.connected_components(tied)) for one in part}
+    return any(len({part_of[node.map] for node in component}) > 1 for component in merged.components)

@@ -49,8 +49,8 @@ def test_a_split_graph_costs_what_the_whole_one_does() -> None:
     assert len(links) == 12 + 3 and sum(len(one.edges) for one in maps.values()) == 36
     best = batch_optimum(graph)
     assert best < graph.chi2()
-    for name in ("least_squares", "gnc"):
-        chi2 = chi2_of(factors_of(graph), merge_maps(maps, links, settings=RIVALS[name]), nodes)
+    for name in ("least_squares", "gnc", "mapweave"):
+        chi2 = chi2_of(factors_of(graph), RIVALS[name](maps, links), nodes)
         assert chi2 == pytest.approx(best, rel=1e-3)
     assert chi2_of(factors_of(graph), merge_maps(maps, []), nodes) is None
 
