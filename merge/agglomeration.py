@@ -21,6 +21,7 @@ from merge.groups import LinkGroup
 from merge.joining import Solver, misfits
 from merge.links import Link, RefusedLink, refuse
 from merge.posegraph import PoseGraph
+from merge.readmission import readmitted
 from merge.witnesses import FalseWitnesses
 
 Key = tuple[NodeId, NodeId]
@@ -104,7 +105,7 @@ def _heard_again(
     while True:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
-        back = _borne_out(inside, by_node, agreed, heard, s)
+        back = _borne_out(inside, by_node, agreed, heard, s) or readmitted(solver, kept, inside, s)
         if not back:
             return kept
         kept += back

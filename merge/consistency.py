@@ -58,7 +58,7 @@ class ConsistencySettings:
     overwhelming_inliers: int = 45
     overwhelming_share: float = 0.7
     place: float = 2.0
-    chance: float = 0.02
+    chance: float = 0.01
     dominance: float = 1.5
     exact: int = 40
     least_evidence: float = 4.6

@@ -66,6 +66,11 @@ class Solver:
                 out |= {(m.a, m.b) for m in wrong} & {link.pair for link in here}
         return out
 
+    def measurements(self, links: Sequence[Link], graph: PoseGraph) -> list[Measurement]:
+        """All that a component was solved from, given its links."""
+        names = [fragment.name for fragment in self.fragments if fragment.name in graph.rows]
+        return self._measurements(names, links)
+
     def _components(self, links: Sequence[Link]) -> list[tuple[list[NodeId], list[Link]]]:
         """Names of the fragments of each component, ascending, and its links; in the order of the names."""
         joined: nx.Graph = nx.Graph()
