@@ -13,10 +13,11 @@ false for itself, as is usual in the literature. Side by side: plain least squar
 alone (GNC), pairwise consistency alone (PCM), the two together, Mapweave with GNC at the end, and Mapweave as
 it is by default.
 
-With `--g2o FILE` the graph is also split among `--split` robots and merged: `cost_ratio` is the chi-square of
-all its edges, refused ones too, over that of GTSAM's batch optimum. With `--robots FOLDER`, which holds one
-g2o file of a graph in space for each robot: how many links between robots there are, and which of them
-pairwise consistency keeps, as pairs of keys.
+Drives through a city of square blocks (see `benchmarks.merge_grid`), and with `--g2o FILE` the graphs in
+files, are split among `--split` robots and merged: `cost_ratio` is the chi-square of all edges, refused ones
+too, over that of GTSAM's batch optimum; null where the graph ended in pieces. With `--robots FOLDER`, which
+holds one g2o file of a graph in space for each robot: how many links between robots there are, and which of
+them pairwise consistency keeps, as pairs of keys.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from rich.table import Table
 
 from benchmarks.merge_fleets import FleetSettings, draw_fleet
 from benchmarks.merge_g2o import batch_optimum, chi2_of, factors_of, split
+from benchmarks.merge_grid import HEADING_SIGMAS, draw_grid
 from benchmarks.merge_rivals import MAPWEAVE, RIVALS, error, joined_falsely, oracle, precision_recall
 from benchmarks.merge_robots import kept_links
 from hybridmap.errors import InvalidValue, MapweaveError
@@ -46,6 +48,8 @@ from mapweave.g2o import G2oGraph, read_g2o
 
 SHARES = (0, 50, 80, 90)
 """Of false links, per cent."""
+GRID_NODES = 400
+"""Of the drives through a city."""
 GOOD = 1.1
 """An `ate_ratio` that is as good as knowing the true links."""
 Figures = dict[str, dict[str, float | None]]
@@ -66,6 +70,9 @@ def main() -> None:
             found = with_false_links(arguments.seed, arguments.runs, FleetSettings(), progress)
             alone = FleetSettings(most_alike=1)
             independent = with_false_links(arguments.seed, arguments.runs, alone, progress)
+            for k, (title, sigma) in enumerate(HEADING_SIGMAS.items()):
+                city = draw_grid(GRID_NODES, sigma, np.random.default_rng([arguments.seed, k]))
+                graphs.setdefault(title, city)
             for title, graph in graphs.items():
                 for name, figures in standard_set(title, graph, arguments.split, progress).items():
                     for figure, value in figures.items():

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.merge_fleets import FleetSettings, draw_fleet
+from benchmarks.merge_g2o import batch_optimum, chi2_of, factors_of, split
+from benchmarks.merge_grid import draw_grid
 from benchmarks.merge_rivals import RIVALS, error, oracle, precision_recall
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -85,3 +87,13 @@ def test_links_that_are_too_few_between_two_maps_join_what_others_join() -> None
     assert len(merge_maps(fleet.maps, few[:-1]).components) == 2
     again = merge_maps(dict(reversed(fleet.maps.items())), few[::-1])
     assert [link.pair for link in again.links] == [link.pair for link in merged.links]
+
+
+@pytest.mark.parametrize("heading_sigma", [0.01, 0.1])
+def test_links_that_are_all_right_end_at_the_batch_optimum(heading_sigma: float) -> None:
+    """None is refused, and none held back: GTSAM's optimum of the whole graph."""
+    graph = draw_grid(300, heading_sigma, np.random.default_rng([5, 0]))
+    maps, links, nodes = split(graph, 2)
+    merged = merge_maps(maps, links)
+    assert len(merged.links) == len(links)
+    assert chi2_of(factors_of(graph), merged, nodes) == pytest.approx(batch_optimum(graph), rel=1e-3)
