@@ -56,7 +56,12 @@ def gather(seed: int, nodes: int, queries: int, bar: Progress) -> Seen:
     found: Seen = []
     for query in asked:
         ranked = index.query(query.picture.view, RelocalizationSettings().candidates)
-        seen = relocalizer.places(relocalizer.look(query.picture.view, ranked)[0])
+        sightings = relocalizer.look(query.picture.view, ranked)[0]
+        doubled = []
+        if sightings:
+            best = max(sightings, key=lambda one: one.recognition.inliers)
+            doubled = relocalizer.doubled(query.picture.view, best, ranked)
+        seen = relocalizer.places([*sightings, *doubled])
         off = [errors(query, truth.get(place.best.node), place.best_from_robot) for place in seen]
         found.append((supported(seen), [m <= RIGHT_M and deg <= RIGHT_DEG for m, deg in off]))
     bar.update(task, completed=nodes + (len(KINDS) + 2) * queries)

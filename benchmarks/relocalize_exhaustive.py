@@ -18,9 +18,11 @@ from hybridmap.descriptor import root_sift
 from hybridmap.matching import match_vectors, squared_distances
 from hybridmap.query import RelocalizeAnswer
 from hybridmap.recognition import Recognition, RecognitionSettings, examine_matches
-from mapserver.relocalization import Relocalizer
-from mapserver.seenplaces import Sighting
+from mapserver.relocalization import RelocalizationSettings, Relocalizer
+from mapserver.seenplaces import Sighting, is_lonely
 
+RIVALS = RelocalizationSettings().candidates
+"""Places that look most like a view, among which doubles are looked for."""
 BLOCK = 4096
 """Landmarks that are compared at once."""
 
@@ -40,8 +42,8 @@ class Exhaustive:
     def answer(self, query: Query) -> RelocalizeAnswer:
         """As a relocalizer answers."""
         roots, view = root_sift(query.picture.sift), query.picture.view
-        sightings = []
-        for k in np.flatnonzero(self._may_match(roots) >= self._settings.least_inliers).tolist():
+        sightings, counts = [], self._may_match(roots)
+        for k in np.flatnonzero(counts >= self._settings.least_inliers).tolist():
             place = self._places[k]
             pairs = match_vectors(self._roots[k], roots, self._settings.matching).pairs
             if len(pairs) < self._settings.least_inliers:
@@ -49,8 +51,12 @@ class Exhaustive:
             rng = np.random.default_rng(zlib.crc32(str(place.node.id).encode()))
             verdict = examine_matches(place.node, view, pairs, self._settings, rng)
             if isinstance(verdict, Recognition):
-                sightings.append(Sighting(place.node.id, verdict))
-        return self._relocalizer.conclude(sightings)
+                lonely = is_lonely(place.node, view.camera, verdict)
+                sightings.append(Sighting(place.node.id, verdict, lonely=lonely))
+        most = np.argsort(-counts, kind="stable")[:RIVALS].tolist()
+        return self._relocalizer.conclude(
+            view, sightings, [(self._places[k].node.id, float(counts[k])) for k in most]
+        )
 
     def _may_match(self, roots: NDArray[np.float32]) -> NDArray[np.int64]:
         """(P,) landmarks of each place that pass the matching's own test on their side: no fewer than match.

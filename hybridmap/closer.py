@@ -6,6 +6,8 @@ where the node was made they are off by a tenth, and where the robot is follows 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hybridmap.node import Node
@@ -18,6 +20,13 @@ from hybridmap.sightings import Sightings
 
 LEAST_SIGMA, ROUNDS = 0.1, 3
 """px, pixels are rounded in a node; and how often the noise is measured anew."""
+
+PRIOR_COUNT, PRIOR_SIGMA = 8, 0.5
+"""What is thought of a pixel's noise before, as if by so many pixels, px: few that happen to agree do not
+make a sharp image."""
+
+SHIFT_SIGMA = 0.1
+"""px, what is left of a lens and of where features settle in a pixel, the same for a whole image."""
 
 MAD_TO_SIGMA = 1.4826
 """A Gaussian's standard deviation over the median of its absolute values."""
@@ -53,7 +62,7 @@ def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSett
         sigma = fresh
         covariances = landmarks.covariances_in_robot(node.camera, sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
-        fix = refine(Stack.build([sightings]), best.mean, pose.scale_sigma, None, pose.rounds)
+        fix = refine(Stack.build([sightings]), best.mean, pose.scale_sigma, None, pose.rounds, SHIFT_SIGMA)
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
             break
         best = fix.node_from_robot
@@ -63,4 +72,5 @@ def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSett
 def _noise(points: Array, pixels: Array, view: View, best: PoseGaussian) -> float:
     """px, standard deviation of a pixel around where its point should be."""
     off = pixels - view.camera.project(best.mean.inverse().apply(points))
-    return MAD_TO_SIGMA * float(np.median(np.abs(off - np.median(off, axis=0))))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(off - np.median(off, axis=0))))
+    return math.sqrt((len(off) * spread**2 + PRIOR_COUNT * PRIOR_SIGMA**2) / (len(off) + PRIOR_COUNT))

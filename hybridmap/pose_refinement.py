@@ -179,13 +179,18 @@ def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) 
 
 
 def refine(
-    stack: Stack, pose: Pose2, scale_sigma: float, prior: PoseGaussian | None, rounds: int
+    stack: Stack,
+    pose: Pose2,
+    scale_sigma: float,
+    prior: PoseGaussian | None,
+    rounds: int,
+    shift_sigma: float = 0.0,
 ) -> PlanarFix | None:
     """Bring a posture to its best and say how certain it is.
 
     The covariance is the inverse information, larger where the residuals are larger than they should be,
-    and larger by what a common scale error of the points, or of the measured depths, would do: these come
-    from one drive with one set of wheels and do not average out.
+    and larger by what does not average out: a common scale error of the points, or of the measured depths,
+    which come from one drive with one set of wheels, and a shift of all pixels.
 
     Args:
         stack: the sightings.
@@ -193,6 +198,7 @@ def refine(
         scale_sigma: share by which all points, or all measured depths, may be wrong together.
         prior: what else is known of the posture.
         rounds: of Gauss-Newton at most.
+        shift_sigma: px by which all pixels may be off together, to either side.
 
     Returns:
         The posture, or None if the inliers do not determine one.
@@ -212,9 +218,11 @@ def refine(
     covariance = np.linalg.inv(information)
     freedom = max(int(np.where(stack.measured, 3, 2)[inliers].sum()) - 3, 1)
     mean_square = float(linear.distance2[inliers].sum()) / freedom
-    covariance = covariance * max(1.0, mean_square)
-    for share in _common_scales(stack, linear, moved):
-        drift = scale_sigma * (covariance @ (linear.weighted @ share.ravel()))
+    alone = covariance = covariance * max(1.0, mean_square)
+    common = [scale_sigma * share for share in _common_scales(stack, linear, moved)]
+    common += [shift_sigma * np.tile(side, (len(moved), 1)) for side in np.eye(3)[:2]]
+    for change in common:
+        drift = alone @ (linear.weighted @ change.ravel())
         covariance = covariance + np.outer(drift, drift)
     return PlanarFix(
         PoseGaussian(pose, 0.5 * (covariance + covariance.T)),

@@ -9,7 +9,9 @@ from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
+from hybridmap.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
+from mapserver.doubles import Doubles
 from mapserver.placeindex import PlaceIndex
 from merge.candidates import CandidateSettings, Pair
 from merge.fading import Fader, FadingSettings
@@ -74,6 +76,7 @@ class Merger:
             settings: how.
         """
         self.index = index or PlaceIndex()
+        self.doubles = Doubles(RecognitionSettings())
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
         self.reaches = ReachBook()

@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.closer import look_closer
 from hybridmap.matching import match
 from hybridmap.node import Node, NodeId
-from hybridmap.pose import PoseGaussian
+from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
 from hybridmap.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
 from mapserver.belief import probabilities
-from mapserver.seenplaces import SeenPlace, Sighting, fuse, supported
+from mapserver.doubles import Doubles, carried, elsewhere, same_place, unexplained
+from mapserver.seenplaces import SeenPlace, Sighting, fuse, is_lonely, supported
 from merge.merged import MergedMap
 
 
@@ -77,6 +79,7 @@ class Relocalizer:
         node_of: Callable[[NodeId], Node | None],
         merged: MergedMap,
         settings: RelocalizationSettings | None = None,
+        doubles: Doubles | None = None,
     ) -> None:
         """Take what is known.
 
@@ -85,11 +88,13 @@ class Relocalizer:
             node_of: gives a node by its id, for example `Merger.node`.
             merged: where nodes are.
             settings: how.
+            doubles: which nodes look alike; outlives the merged map, so that it is found out once.
         """
         self._index = index
         self._node_of = node_of
         self._merged = merged
         self._settings = settings or RelocalizationSettings()
+        self._doubles = doubles or Doubles(self._settings.recognition)
 
     def answer(self, view: View) -> RelocalizeAnswer:
         """Say where a view was taken, or that it is not known, with the reason in words."""
@@ -100,7 +105,7 @@ class Relocalizer:
         if not ranked:
             return _unknown("no node of any map has features like these")
         sightings, refusals = self.look(view, ranked)
-        return self.conclude(sightings) if sightings else _unknown(_best_refusal(refusals))
+        return self.conclude(view, sightings, ranked) if sightings else _unknown(_best_refusal(refusals))
 
     def look(
         self, view: View, ranked: Sequence[tuple[NodeId, float]]
@@ -129,17 +134,66 @@ class Relocalizer:
             seed = zlib.crc32(view.codes.tobytes(), zlib.crc32(str(node_id).encode()))
             verdict = examine_matches(node, view, pairs, s.recognition, np.random.default_rng(seed))
             if isinstance(verdict, Recognition):
-                sightings.append(Sighting(node_id, verdict))
+                lonely = is_lonely(node, view.camera, verdict)
+                sightings.append(Sighting(node_id, verdict, lonely=lonely))
                 best_score = max(best_score, score)
             else:
                 refusals.append((node_id, verdict))
         return sightings, refusals
 
-    def conclude(self, sightings: Sequence[Sighting]) -> RelocalizeAnswer:
-        """Say what follows from the nodes that were recognised."""
+    def conclude(
+        self, view: View, sightings: Sequence[Sighting], ranked: Sequence[tuple[NodeId, float]]
+    ) -> RelocalizeAnswer:
+        """Say what follows from the nodes that were recognised.
+
+        Args:
+            view: the image's features.
+            sightings: these.
+            ranked: nodes with how much they look like the view, best first; those that look like the one that
+                was recognised best are thought of too.
+        """
         if not sightings:
             return _unknown("no node was recognised")
-        return self._judge(self.places(sightings))
+        best, *others = sorted(sightings, key=lambda one: (-one.recognition.inliers, one.node))
+        best = self._closer(view, best)
+        return self._judge(self.places([best, *others, *self.doubled(view, best, ranked)]))
+
+    def _closer(self, view: View, one: Sighting) -> Sighting:
+        """A sighting with the posture that the pixels give at the noise that they have."""
+        node = self._node_of(one.node)
+        if node is None:
+            return one
+        closer = look_closer(node, view, one.recognition, self._settings.recognition.pose)
+        return replace(one, recognition=replace(one.recognition, node_from_robot=closer))
+
+    def doubled(self, view: View, best: Sighting, ranked: Sequence[tuple[NodeId, float]]) -> list[Sighting]:
+        """Nodes elsewhere, of those that look like a view, that look like the node recognised best."""
+        s, found = self._settings, []
+        node = self._node_of(best.node)
+        for other in elsewhere(ranked, best.node, s.faint):
+            double = self._node_of(other)
+            if node is None or double is None:
+                continue
+            mapped = self._between(other, best.node)
+            if mapped is not None:
+                pairs = match(double.landmarks.codes, node.landmarks.codes, s.recognition.matching)
+                left = unexplained(double, pairs, node.landmarks.pixels, node.camera, mapped, s.explained_px)
+                if left < s.recognition.least_inliers:
+                    continue
+            likeness = self._doubles.compare(double, node)
+            if likeness is None or (mapped is not None and same_place(mapped, likeness.node_from_robot.mean)):
+                continue
+            sighting = carried(double, likeness, best, view, s.recognition.matching, s.explained_px)
+            if sighting.recognition.inliers >= s.slight * best.recognition.inliers:
+                found.append(sighting)
+        return found
+
+    def _between(self, a: NodeId, b: NodeId) -> Pose2 | None:
+        """Posture `a_from_b` on the merged map; None if that does not join the two."""
+        here, there = (self._merged.postures.get(one) for one in (a, b))
+        if here is None or there is None or here.component != there.component:
+            return None
+        return here.merged_from_robot.mean.inverse() @ there.merged_from_robot.mean
 
     def _may_differ(
         self, node: Node, pairs: NDArray[np.int64], view: View, sightings: Sequence[Sighting]
@@ -153,15 +207,11 @@ class Relocalizer:
         least = max(s.recognition.least_inliers, s.slight * best.recognition.inliers)
         if len(pairs) < least:
             return False
-        here, there = (self._merged.postures.get(one) for one in (node.id, best.node))
-        if here is None or there is None or here.component != there.component:
+        mapped = self._between(node.id, best.node)
+        if mapped is None:
             return True
-        node_from_best = here.merged_from_robot.mean.inverse() @ there.merged_from_robot.mean
-        robot_from_node = (node_from_best @ best.recognition.node_from_robot.mean).inverse()
-        points = node.landmarks.take(pairs[:, 0]).points_in_robot(node.camera)
-        off = view.camera.project(robot_from_node.apply(points)) - view.pixels[pairs[:, 1]]
-        explained = np.hypot(off[:, 0], off[:, 1]) < s.explained_px
-        return len(pairs) - int(explained.sum()) >= least
+        from_robot = mapped @ best.recognition.node_from_robot.mean
+        return unexplained(node, pairs, view.pixels, view.camera, from_robot, s.explained_px) >= least
 
     def places(self, sightings: Sequence[Sighting]) -> list[SeenPlace]:
         """Group the sightings by agreement, best supported place first."""
@@ -209,11 +259,17 @@ class Relocalizer:
         if len(rivals) == 1:
             if len(places[0].sightings) == 1 and best.recognition.inliers < s.alone:
                 return _unknown(f"not sure: {words}, and no other node says the same")
+            if all(one.lonely for one in places[0].sightings):
+                return _unknown(
+                    f"not sure: {words}, all on one thing, and nothing of what should be beside it"
+                )
             if len(places[0].sightings) > 1:
                 words += f", and {len(places[0].sightings) - 1} more nodes with them"
             return RelocalizeAnswer(Certainty.FOUND, candidates, words)
         names = " or ".join(str(place.best.node) for place in rivals)
         words = f"it may be {names}: they explain {most} to {len(rivals[-1].features)} features"
+        if any(place.is_double for place in rivals):
+            words += ", and look alike on the map"
         if any(self._merged.relative(best.node, place.best.node) is None for place in rivals):
             words += ", and nothing joins their parts of the map yet"
         return RelocalizeAnswer(Certainty.AMBIGUOUS, candidates, words)

@@ -8,18 +8,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.node import NodeId
+from hybridmap.camera import Camera
+from hybridmap.node import Node, NodeId
 from hybridmap.pose import PoseGaussian
 from hybridmap.recognition import Recognition
 from mapserver.belief import Support
 
+THING_SIGMA = 0.35
+"""Largest standard deviation of the landmarks on one thing, seen from above, m: of a table of 1.2 m."""
+BESIDE = 0.35
+"""What is farther from all landmarks on a thing is not of it, m."""
+MISSING_BY_CHANCE = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A node that was recognised in the view."""
+    """A node that was recognised in the view.
+
+    Attributes:
+        node: which.
+        recognition: how.
+        alike: the node that it looks like, if that one was recognised in the view and this one in that one.
+        lonely: it rests on one thing, and nothing is seen of what should be seen beside that.
+    """
 
     node: NodeId
     recognition: Recognition
+    alike: NodeId | None = None
+    lonely: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +56,35 @@ class SeenPlace:
     def best(self) -> Sighting:
         """The one of most landmarks."""
         return self.sightings[0]
+
+    @property
+    def is_double(self) -> bool:
+        """Whether it looks like a place that was recognised."""
+        return any(one.alike is not None for one in self.sightings)
+
+
+def is_lonely(node: Node, camera: Camera, found: Recognition) -> bool:
+    """Whether a recognition rests on one thing, and nothing is seen of what should be seen beside it.
+
+    A thing can be moved, and takes all that is told from it along. Landmarks away from it, of which each
+    would be seen as often as those on it are, are then missing.
+
+    Args:
+        node: the place.
+        camera: that took the view.
+        found: that the view shows the place.
+    """
+    points = node.landmarks.points_in_robot(node.camera)
+    agreeing = np.zeros(len(points), np.bool_)
+    agreeing[found.pairs[:, 0]] = True
+    on_it = points[agreeing & np.isfinite(points[:, 0])]
+    if len(on_it) < 3 or np.linalg.eigvalsh(np.cov(on_it[:, :2].T))[-1] > THING_SIGMA**2:
+        return False
+    there = found.node_from_robot.mean.inverse().apply(points)
+    expected = points[camera.contains(camera.project(there)) & ~agreeing]
+    away = np.linalg.norm(expected[:, None] - on_it[None], axis=2).min(axis=1) > BESIDE
+    seen = min(found.evidence["seen"], 0.9)
+    return float(away.sum()) * math.log(1.0 - seen) < math.log(MISSING_BY_CHANCE)
 
 
 def supported(places: Sequence[SeenPlace]) -> list[Support]:
