@@ -160,16 +160,14 @@ class Relocalizer:
 
     def _closer(self, view: View, one: Sighting) -> Sighting:
         """A sighting with the posture that the pixels give at the noise that they have."""
-        node = self._node_of(one.node)
-        if node is None:
+        if (node := self._node_of(one.node)) is None:
             return one
         closer = look_closer(node, view, one.recognition, self._settings.recognition.pose)
         return replace(one, recognition=replace(one.recognition, node_from_robot=closer))
 
     def doubled(self, view: View, best: Sighting, ranked: Sequence[tuple[NodeId, float]]) -> list[Sighting]:
         """Nodes elsewhere, of those that look like a view, that look like the node recognised best."""
-        s, found = self._settings, []
-        node = self._node_of(best.node)
+        s, found, node = self._settings, [], self._node_of(best.node)
         for other in elsewhere(ranked, best.node, s.faint):
             double = self._node_of(other)
             if node is None or double is None:
@@ -234,6 +232,8 @@ class Relocalizer:
 
     def _in_frame_of(self, node: NodeId, one: Sighting) -> PoseGaussian | None:
         """A sighting's estimate in another node's frame; None if the map does not join the two."""
+        if node == one.node:
+            return one.recognition.node_from_robot
         relative = self._merged.relative(node, one.node)
         return None if relative is None else relative @ one.recognition.node_from_robot
 
@@ -270,7 +270,7 @@ class Relocalizer:
         words = f"it may be {names}: they explain {most} to {len(rivals[-1].features)} features"
         if any(place.is_double for place in rivals):
             words += ", and look alike on the map"
-        if any(self._merged.relative(best.node, place.best.node) is None for place in rivals):
+        if any(self._between(best.node, place.best.node) is None for place in rivals):
             words += ", and nothing joins their parts of the map yet"
         return RelocalizeAnswer(Certainty.AMBIGUOUS, candidates, words)
 

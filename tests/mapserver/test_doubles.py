@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.synthetic import Sensing, room, take_node, take_view
 from hybridmap.camera import Camera
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
 from hybridmap.recognition import Recognition, RecognitionSettings, recognise
-from hybridmap.synthetic import Sensing, room, take_node, take_view
 from mapserver.doubles import Doubles, carried, unexplained
 from mapserver.placeindex import PlaceIndex
 from mapserver.relocalization import Relocalizer
