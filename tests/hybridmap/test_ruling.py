@@ -50,3 +50,17 @@ def test_the_last_one_counts_however_the_record_is_put_together(made, cut):
     assert (whole.against(B, A) is not None) == any(
         r.apart for r in last.values() if r.ends in ((A, B), (A.map, B.map))
     )
+
+
+def test_the_same_map_twice_retires_it_and_a_node_twice_is_refused() -> None:
+    one, other = MapId("r0", 1), MapId("r1", 1)
+    retired = Ruling((one, one), True, "anna", 1)
+    assert retired.retires == one and Ruling((one, other), True, "anna", 1).retires is None
+    rulings = Rulings([retired])
+    assert rulings.retired == {one: retired}
+    assert rulings.against(NodeId("r0", 1, 1), NodeId("r1", 1, 1)) is retired
+    assert rulings.against(NodeId("r1", 1, 1), NodeId("r1", 1, 2)) is None
+    assert rulings.about(one, other) == (retired,)
+    assert not Rulings([retired, Ruling((one, one), False, "bob", 2)]).retired
+    with pytest.raises(InvalidValue, match="two different nodes, or two maps"):
+        Ruling((NodeId("r0", 1, 1), NodeId("r0", 1, 1)), True, "anna", 1)
