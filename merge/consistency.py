@@ -192,6 +192,7 @@ def sort_links(
         reason = f"ambiguous: {support} landmarks support one way of joining, {against_it} another"
         rivals = sets
     chance = chances(distances2, spreads, first, second)
+    telling = np.array([link.telling for link in links])
     for k, link in enumerate(links):
         if k not in best:
             contradicts = f"contradicts {len(best)} links with {support} landmarks between the same maps"
@@ -204,7 +205,7 @@ def sort_links(
         rivals,
         weight,
         sets,
-        (support_of(best, agree, near, chance), support_of(rival, agree, near, chance)),
+        (support_of(best, telling, agree, near, chance), support_of(rival, telling, agree, near, chance)),
     )
 
 

@@ -170,20 +170,26 @@ def chances(distances2: Array, spreads: Array, first: Fragment, second: Fragment
 
 
 def support_of(
-    some: Sequence[int], agree: NDArray[np.bool_], near: NDArray[np.bool_], chance: Array
+    some: Sequence[int],
+    telling: NDArray[np.bool_],
+    agree: NDArray[np.bool_],
+    near: NDArray[np.bool_],
+    chance: Array,
 ) -> Support:
-    """What is behind some of the links.
+    """What is behind some of the links. Those that tell no place are no witnesses, neither true nor false.
 
     Args:
         some: which.
+        telling: (N,) see `Link.telling`.
         agree: (N, N) symmetric.
         near: (N, N), see `neighbours`.
         chance: (N, N), see `chances`.
     """
+    others = np.setdiff1d(np.flatnonzero(telling), some)
+    some = [k for k in some if telling[k]]
     inside = np.ix_(some, some)
     apart = np.triu(~near[inside], 1)
     logarithms = np.log(chance[inside][apart])
-    others = np.setdiff1d(np.arange(len(agree)), some)
     rest = np.ix_(others, others)
     return Support(
         crowds(agree[inside], near[inside]),

@@ -36,9 +36,13 @@ def test_neighbours_at_both_ends_are_one_witness() -> None:
     near = neighbours(links, a, b, 2.0)
     assert crowds(np.ones((5, 5), bool), near).tolist() == [3, 3, 3, 1, 1]
     assert crowds(np.eye(5, dtype=bool), near).tolist() == [1] * 5
-    found = support_of([0, 1, 2, 4], np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
+    found = support_of([0, 1, 2, 4], np.ones(5, bool), np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
     assert found.witnesses == pytest.approx(2.0) and found.coincidence == pytest.approx(0.01)
     assert found.others.tolist() == [1]
+    # What is found at other places too is no witness, on either side.
+    telling = np.array([True, True, True, False, False])
+    found = support_of([0, 1, 2, 4], telling, np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
+    assert found.witnesses == pytest.approx(1.0) and found.others.tolist() == []
 
 
 def test_chance_is_the_share_of_postures_by_which_a_loop_closes_as_well() -> None:
