@@ -15,8 +15,9 @@ from mapserver.doubles import Doubles
 from mapserver.placeindex import PlaceIndex
 from merge.candidates import CandidateSettings, Pair
 from merge.fading import Fader, FadingSettings
-from merge.incremental import Islands, Verdict, Verdicts
+from merge.incremental import Islands
 from merge.incremental_pairs import PairTable
+from merge.incremental_verdicts import Verdict, Verdicts
 from merge.links import Link
 from merge.merged import MergedMap
 from merge.merging import MergeSettings

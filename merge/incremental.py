@@ -12,82 +12,31 @@ from dataclasses import replace
 import networkx as nx
 
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
+from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Rulings
-from merge.candidates import Pair
 from merge.incremental_memory import Memory
+from merge.incremental_sheets import MapPair
+from merge.incremental_steps import Steps, StepSettings
+from merge.incremental_verdicts import Verdict, Verdicts
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap, Postures
 from merge.merging import MergeSettings, merge_maps
 from merge.undoing import undo
 
-Verdict = Link | RefusedLink
-MapPair = tuple[MapId, MapId]
-"""Smaller first; twice the same for pairs within a map."""
-
-
-class Verdicts:
-    """What was found of the pairs that are chosen, by their maps."""
-
-    def __init__(self) -> None:
-        """None yet."""
-        self._between: dict[MapPair, dict[Pair, Verdict]] = {}
-        self._partners: dict[MapId, set[MapId]] = {}
-
-    def put(self, pair: Pair, verdict: Verdict) -> None:
-        """Take note of what was found of a pair."""
-        maps = pair[0].map, pair[1].map
-        self._between.setdefault(maps, {})[pair] = verdict
-        self._partners.setdefault(maps[0], set()).add(maps[1])
-
-    def drop(self, pair: Pair) -> None:
-        """A pair is chosen no longer. One that never was is no error."""
-        maps = pair[0].map, pair[1].map
-        known = self._between.get(maps, {})
-        known.pop(pair, None)
-        if not known and maps in self._between:
-            del self._between[maps]
-            self._partners[maps[0]].discard(maps[1])
-
-    def ties(self, rulings: Rulings) -> Iterable[MapPair]:
-        """Maps between which there are links, those that people have ruled out left out."""
-        ruled = bool(rulings.in_force)
-        for maps, known in self._between.items():
-            if maps[0] == maps[1]:
-                continue
-            found = (v for v in known.values() if isinstance(v, Link))
-            if any(not ruled or rulings.against(*link.pair) is None for link in found):
-                yield maps
-
-    def among(self, maps: frozenset[MapId]) -> list[Verdict]:
-        """Of all pairs with both ends in these maps."""
-        return [
-            verdict
-            for one in sorted(maps)
-            for other in sorted(self._partners.get(one, set()) & maps)
-            for verdict in self._between[one, other].values()
-        ]
-
-    def across(self, island_of: Mapping[MapId, frozenset[MapId]]) -> list[Verdict]:
-        """Of all pairs of which the two maps are in different islands."""
-        return [
-            verdict
-            for (one, other), known in self._between.items()
-            if island_of[one] is not island_of[other]
-            for verdict in known.values()
-        ]
-
 
 class Islands:
     """Merges island by island, and keeps what it has merged."""
 
-    def __init__(self, settings: MergeSettings | None = None) -> None:
+    def __init__(self, settings: MergeSettings | None = None, steps: StepSettings | None = None) -> None:
         """Nothing is merged yet.
 
         Args:
             settings: how.
+            steps: when an island is merged step by step.
         """
         self._settings = settings or MergeSettings()
+        self._how = steps or StepSettings()
+        self._steps: dict[frozenset[MapId], Steps] = {}
         self._memory = Memory()
         self._merged: dict[frozenset[MapId], MergedMap] = {}
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
@@ -112,18 +61,25 @@ class Islands:
         Returns:
             What `merge_maps` makes of all maps.
         """
-        if rulings.in_force != self._rulings.in_force:
-            # What people rule may tie maps and part them; it is rare enough to begin anew.
-            self._merged = {}
+        news = verdicts.news()
+        for ruling in {*rulings.in_force} ^ {*self._rulings.in_force}:
+            one, other = (end.map if isinstance(end, NodeId) else end for end in ruling.ends)
+            news.add((one, other))
+            touched = touched | {one, other}
         self._rulings = rulings
-        self._memory.forget({one for island in self._merged for one in island} - set(maps))
         islands = self._ties(maps, verdicts)
         before, self._merged = self._merged, {}
         for island in islands:
             known = before.get(island)
             if known is None or island & touched:
-                known = self._island({one: maps[one] for one in sorted(island)}, verdicts.among(island))
+                inside = {one: maps[one] for one in sorted(island)}
+                if sum(len(one.nodes) for one in inside.values()) <= self._how.anew_up_to:
+                    self._steps.pop(island, None)
+                    known = self._anew(inside, verdicts.among(island))
+                else:
+                    known = self._step(inside, verdicts, news, before)
             self._merged[island] = known
+        self._steps = {island: one for island, one in self._steps.items() if island in self._merged}
         island_of = {one: island for island in islands for one in island}
         return _together(list(self._merged.values()), maps, verdicts.across(island_of), rulings)
 
@@ -141,7 +97,27 @@ class Islands:
         found = (frozenset(part & maps.keys()) for part in nx.connected_components(ties))
         return sorted((island for island in found if island), key=min)
 
-    def _island(self, maps: Mapping[MapId, HybridMap], verdicts: Iterable[Verdict]) -> MergedMap:
+    def _step(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        news: set[MapPair],
+        before: Mapping[frozenset[MapId], MergedMap],
+    ) -> MergedMap:
+        """The next step of an island, of which parts may have been merged anew until now."""
+        known = [one for one in self._steps.values() if one.maps & maps.keys()]
+        steps = max(known, key=lambda one: len(one.maps & maps.keys()), default=None)
+        if steps is None:
+            steps = Steps(self._settings, self._how, self._memory)
+        strange = maps.keys() - steps.maps
+        for island in sorted(before, key=min):
+            if island & strange:
+                steps.begin(before[island], strange, verdicts, self._rulings)
+        merged = steps.step(maps, verdicts, news | verdicts.at(strange), self._rulings)
+        self._steps[steps.maps] = steps
+        return merged
+
+    def _anew(self, maps: Mapping[MapId, HybridMap], verdicts: Iterable[Verdict]) -> MergedMap:
         links, refused = _sorted_out(verdicts)
         undone = undo(maps, links, self._rulings)
         merged = merge_maps(

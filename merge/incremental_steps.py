@@ -1,0 +1,405 @@
+"""A large island merged step by step: what was decided stands until something touches it.
+
+A new node lies where its edges put it. A new link within a component is tested against it, as
+`merge.agglomeration` does; between components all links are sorted together, and pieces are joined of which
+each is the other's best supported one. Then the neighbourhood of what is new is optimised, further and
+further out until nothing moves at the rim. Now and then everything is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import EdgeId, MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.ruling import Rulings
+from merge.candidates import Pair
+from merge.distinctness import weigh
+from merge.drives import refuse_drives
+from merge.fragments import fragment_by_node
+from merge.groups import LinkGroup
+from merge.incremental_clashes import clashing, neighbours
+from merge.incremental_factors import RelaxSettings, Rows, relax
+from merge.incremental_graph import WideGraph
+from merge.incremental_judgement import Judge
+from merge.incremental_memory import Memory
+from merge.incremental_sheets import Assembly, Bundle, MapPair, Sheet
+from merge.incremental_verdicts import Verdicts
+from merge.links import Link, RefusedLink, refuse
+from merge.merged import MergedMap, Postures
+from merge.merging import MergeSettings
+from merge.undoing import reason_of, undo
+
+ATTEMPTS = 20
+"""Times that links are refused after optimisation in one step; what is left waits for the next."""
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """When and how a merge is made in steps.
+
+    Attributes:
+        anew_up_to: islands of as many nodes are merged anew whenever they change, so that the outcome is
+            exactly that of one merge.
+        whole_share: everything is decided again when so many measurements have come or gone since it was last
+            done, as a share of all.
+        optimise_share: the same for optimising everything: what is left of strain after each step adds up.
+        relax: how far a change is followed.
+    """
+
+    anew_up_to: int = 600
+    whole_share: float = 0.1
+    optimise_share: float = 0.01
+    relax: RelaxSettings = field(default_factory=RelaxSettings)
+
+
+class Steps:
+    """One island. What it hands out is never changed."""
+
+    def __init__(self, settings: MergeSettings, steps: StepSettings, memory: Memory) -> None:
+        """Nothing is merged yet.
+
+        Args:
+            settings: of the merge.
+            steps: when and how it is made in steps.
+            memory: of merges with the same settings.
+        """
+        self._settings = settings
+        self._steps = steps
+        self._memory = memory
+        self._sheets: dict[MapId, Sheet] = {}
+        self._bundles: dict[MapPair, Bundle] = {}
+        self._waiting: dict[MapPair, dict[Pair, Link]] = {}
+        self._refused: dict[MapPair, dict[Pair, RefusedLink]] = {}
+        self._own: dict[MapId, list[RefusedLink]] = {}
+        self._groups: dict[MapPair, list[LinkGroup]] = {}
+        self._links: dict[Pair, tuple[Link, Link]] = {}
+        self._fallen: dict[Pair, tuple[Link, str]] = {}
+        self._since = self._rough = 0
+        self._touched: set[NodeId] = set()
+        self._plain = True
+        self._moved: Rows = np.zeros(0, np.int64)
+        self._all = Assembly({}, {})
+
+    @property
+    def maps(self) -> frozenset[MapId]:
+        """Which maps are in it."""
+        return frozenset(self._sheets)
+
+    def begin(self, merged: MergedMap, some: Set[MapId], verdicts: Verdicts, rulings: Rulings) -> None:
+        """Take over what was merged otherwise of some maps: which links are believed, and where nodes are."""
+        for map_id in sorted(some & merged.maps.keys()):
+            one = merged.maps[map_id]
+            self._place(map_id, one, rulings, {node: merged.pose(node) for node in one.nodes})
+            # What held them where they are may not have come along.
+            self._touched |= one.nodes.keys()
+        links: dict[MapPair, dict[Pair, Link]] = {}
+        for link in merged.links:
+            maps = link.a.map, link.b.map
+            given = verdicts.between(maps).get(link.pair)
+            if isinstance(given, Link) and maps[0] in some and maps[1] in some:
+                weighed = replace(given, evidence=link.evidence)
+                self._links[link.pair] = given, weighed
+                links.setdefault(maps, {})[link.pair] = weighed
+        for maps, here in links.items():
+            self._believe(maps, here)
+
+    def step(
+        self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, news: Iterable[MapPair], rulings: Rulings
+    ) -> MergedMap:
+        """Merge what has changed.
+
+        Args:
+            maps: of the island.
+            verdicts: on pairs of their nodes.
+            news: between which maps verdicts or rulings have changed since the last step.
+            rulings: of people.
+
+        Returns:
+            The island's merged map.
+        """
+        self._leave(self._sheets.keys() - maps.keys())
+        changed = {one for one in maps if self._place(one, maps[one], rulings)}
+        fresh = {pair for pair in news if pair[0] in maps and pair[1] in maps}
+        known = {*self._bundles, *self._waiting}
+        self._weigh(fresh, verdicts)
+        for pair in sorted(fresh | {pair for pair in known if pair[0] in changed or pair[1] in changed}):
+            self._review(pair, verdicts, rulings)
+        whole = self._since > self._steps.whole_share * max(len(self._all.factors), 1)
+        if whole:
+            self._since, self._rough, changed = 0, 0, set(self._sheets)
+            fresh = self._doubt_all(verdicts, rulings)
+        # All is tried with limited pull first, what is new is tested by what is believed.
+        self._plain, self._moved = not whole, np.zeros(0, np.int64)
+        self._assemble()
+        self._follow(self._touched)
+        self._touched = set()
+        self._join(fresh)
+        if not whole and self._since - self._rough > self._steps.optimise_share * len(self._all.factors):
+            self._rough = self._since
+            self._relax(np.arange(len(self._all.means)), len(self._all.means), believed=True)
+            self._keep()
+        self._settle(self._all.nodes_at(self._moved), whole, changed)
+        return self._outcome(maps, rulings)
+
+    def _settle(self, nodes: Iterable[NodeId], whole: bool, changed: set[MapId]) -> None:
+        """Optimise until no link strains too much and no robots clash, then with all links at full pull."""
+        touched = set(nodes)
+        for _ in range(ATTEMPTS):
+            # Limited pull lets the wrong ones stand out; in a step they were tested before.
+            for believed in (False, True) if whole else (True,):
+                if whole:
+                    self._relax(np.arange(len(self._all.means)), len(self._all.means), believed)
+                    self._keep()
+                else:
+                    self._follow(touched)
+                lost = self._strained()
+                if lost:
+                    break
+            lost = lost or self._fall(changed)
+            if not lost:
+                break
+            self._since += len(lost)
+            touched |= {node for link in lost for node in link.pair}
+            self._assemble()
+
+    def _leave(self, gone: Iterable[MapId]) -> None:
+        """Forget maps that belong to another island now."""
+        away = set(gone)
+        for pair in [pair for pair in {*self._bundles, *self._waiting} if away & set(pair)]:
+            self._touched |= {node for ends in self._believed(pair) for node in ends if node.map not in away}
+            self._bundles.pop(pair, None)
+            self._waiting.pop(pair, None)
+            self._refused.pop(pair, None)
+            self._groups.pop(pair, None)
+        for map_id in away:
+            del self._sheets[map_id], self._own[map_id]
+
+    def _place(
+        self, map_id: MapId, one: HybridMap, rulings: Rulings, known: Mapping[NodeId, Pose2] | None = None
+    ) -> bool:
+        """Make the sheet of a map anew if it has changed."""
+        s, before = self._settings, self._sheets.get(map_id)
+        undone = undo({map_id: one}, (), rulings)
+        if before is not None and before.one is one and _edges(undone.refused) == _edges(before.undone):
+            return False
+        pieces = self._memory.fragments(undone.maps, s.consistency, s.strain)
+        if known is None:
+            known = {} if before is None else before.known()
+        after = Sheet.of(one, pieces, known, undone.refused)
+        told = after.said() ^ (set() if before is None else before.said())
+        self._since += len(told)
+        ends = {node for a, b, _ in told for node in (a, b)}
+        self._touched |= {node for node in ends if node in after.rows}
+        self._sheets[map_id] = after
+        self._own[map_id] = [r for piece in pieces for r in piece.refused] + list(undone.refused)
+        return True
+
+    def _review(self, maps: MapPair, verdicts: Verdicts, rulings: Rulings) -> None:
+        """Which links between two maps may be believed: those that are new wait, those that are gone go."""
+        first, second = self._sheets[maps[0]], self._sheets[maps[1]]
+        refused: dict[Pair, RefusedLink] = {}
+        waiting: dict[Pair, Link] = {}
+        believed = self._believed(maps)
+        kept: dict[Pair, Link] = {}
+        for pair, verdict in verdicts.between(maps).items():
+            if pair[0] not in first.rows or pair[1] not in second.rows:
+                continue
+            fallen = self._fallen.get(pair)
+            ruling = rulings.against(*pair)
+            if isinstance(verdict, RefusedLink):
+                refused[pair] = verdict
+            elif ruling is not None:
+                refused[pair] = refuse(verdict, reason_of(ruling))
+            elif fallen is not None and fallen[0] is verdict:
+                refused[pair] = refuse(verdict, fallen[1])
+            elif pair in believed and believed[pair].a_from_b is verdict.a_from_b:
+                kept[pair] = self._links[pair][1]
+            else:
+                waiting[pair] = self._links[pair][1]
+        lost = believed.keys() - kept.keys()
+        self._since += len(lost)
+        self._touched |= {node for pair in lost for node in pair if node in first.rows or node in second.rows}
+        self._believe(maps, kept)
+        told = {pair: known for pair, known in self._refused.get(maps, {}).items() if pair in waiting}
+        self._waiting[maps], self._refused[maps] = waiting, {**told, **refused}
+
+    def _weigh(self, between: Iterable[MapPair], verdicts: Verdicts) -> None:
+        """Find landmarks that there are twice by the links between some maps; what is known already stays."""
+        s, pairs = self._settings, sorted(between)
+        some = sorted({one for pair in pairs for one in pair})
+        by_node = fragment_by_node([piece for one in some for piece in self._sheets[one].fragments])
+        found = [v for pair in pairs for v in verdicts.between(pair).values() if isinstance(v, Link)]
+        found = [link for link in found if link.a in by_node and link.b in by_node]
+        whole = {one: self._sheets[one].one for one in some}
+        for link, weighed in zip(found, weigh(found, by_node, whole, s.consistency), strict=True):
+            known = self._links.get(link.pair)
+            if known is None or known[0] is not link or known[1].doubles < weighed.doubles:
+                self._links[link.pair] = link, weighed
+
+    def _doubt_all(self, verdicts: Verdicts, rulings: Rulings) -> set[MapPair]:
+        """Let all links wait again: what was decided one after the other is decided together."""
+        self._fallen.clear()
+        self._bundles.clear()
+        self._refused.clear()
+        for map_id, sheet in self._sheets.items():
+            self._sheets[map_id] = Sheet.of(sheet.one, sheet.fragments, {}, sheet.undone)
+        known = set(self._waiting)
+        self._links.clear()
+        self._weigh(known, verdicts)
+        for maps in sorted(known):
+            self._review(maps, verdicts, rulings)
+        return known
+
+    def _believed(self, maps: MapPair) -> Mapping[Pair, Link]:
+        return self._bundles[maps].links if maps in self._bundles else {}
+
+    def _believe(self, maps: MapPair, links: Mapping[Pair, Link]) -> None:
+        if links:
+            self._bundles[maps] = Bundle.of(links, self._sheets[maps[0]], self._sheets[maps[1]])
+        else:
+            self._bundles.pop(maps, None)
+
+    def _assemble(self) -> None:
+        self._all = Assembly(self._sheets, self._bundles)
+        self._all.in_their_frames()
+
+    def _keep(self) -> None:
+        """Let the sheets know where their nodes are now."""
+        for map_id, sheet in self._sheets.items():
+            means = self._all.means_of(map_id)
+            if means is not sheet.means:
+                self._sheets[map_id] = replace(sheet, means=means)
+
+    def _follow(self, nodes: Iterable[NodeId]) -> None:
+        """Optimise around nodes, as far as they are still there."""
+        there = [node for node in nodes if node.map in self._sheets and node in self._sheets[node.map].rows]
+        self._relax(self._all.rows(sorted(there)), self._steps.relax.least, self._plain)
+        self._keep()
+
+    def _relax(self, rows: Rows, least: int, believed: bool) -> None:
+        # On the way a tenth of a millimetre does; the last word is exact.
+        step = self._steps.relax.step if least >= len(self._all.means) else 1e-4
+        held, how = self._all.anchors(), replace(self._steps.relax, least=least, step=step)
+        huber = math.inf if believed else self._settings.huber
+        self._all.means, moved = relax(self._all.factors, self._all.means, held, rows, huber, how)
+        self._moved = np.union1d(self._moved, np.concatenate([moved, rows]))
+
+    def _join(self, fresh: Iterable[MapPair]) -> None:
+        """Believe links that the components bear out, and join components, as long as any can be."""
+        judge = Judge(self._settings, self._memory, self._sheets, self._groups)
+        for maps in [maps for maps in self._groups if maps not in self._waiting]:
+            del self._groups[maps]
+        open_, heard, last = set(fresh), set(fresh), False
+        while True:
+            standing = {
+                maps: (
+                    self._bundles[maps].links if maps in self._bundles else {},
+                    self._waiting.get(maps, {}),
+                )
+                for maps in sorted(open_)
+            }
+            believed, refused, joins = judge.round(self._all, standing, self._waiting, last)
+            for link, reason in refused:
+                self._refused.setdefault((link.a.map, link.b.map), {})[link.pair] = refuse(link, reason)
+            if not believed:
+                if last:
+                    return
+                open_, last = set(heard), True
+                continue
+            before = self._all
+            self._accept(believed)
+            for first, second, second_from_first in joins:
+                self._all.move(before, first, second, second_from_first)
+            self._all.in_their_frames()
+            self._follow({node for link in believed for node in link.pair})
+            # What has come to lie within one component can be tested now.
+            open_ = {
+                maps
+                for maps, links in self._waiting.items()
+                if (last and maps in heard)
+                or any(before.label(link.a) != before.label(link.b) for link in links.values())
+            }
+            heard |= open_
+
+    def _accept(self, links: Iterable[Link]) -> None:
+        by_maps: dict[MapPair, dict[Pair, Link]] = {}
+        for link in links:
+            by_maps.setdefault((link.a.map, link.b.map), {})[link.pair] = link
+        for maps, more in by_maps.items():
+            more = {pair: self._waiting[maps][pair] for pair in more}
+            self._believe(maps, {**self._believed(maps), **more})
+            for pair in more:
+                self._waiting[maps].pop(pair, None)
+                self._refused[maps].pop(pair, None)
+            self._since += len(more)
+        self._all = Assembly(self._sheets, self._bundles)
+
+    def _strained(self) -> list[Link]:
+        """Refuse the link that strains the most where something has moved, if it is too much."""
+        links, index = self._all.believed(self._moved)
+        if not links:
+            return []
+        row_of = np.arange(len(self._all.means))
+        strains = self._all.factors.take(index, row_of).strains(self._all.means)
+        worst = int(strains.argmax())
+        if strains[worst] <= self._settings.strain:
+            return []
+        off = float(strains[worst]) ** 0.5
+        reason = f"strains the joined map: {off:.1f} standard deviations from where it ended"
+        self._disbelieve([links[worst]], reason)
+        return [links[worst]]
+
+    def _fall(self, changed: set[MapId]) -> list[Link]:
+        """Refuse groups of links under which robots would walk through each other."""
+        some = neighbours(self._sheets, changed)
+        if len(some) < 2:
+            return []
+        inside = {pair: b for pair, b in self._bundles.items() if pair[0] in some and pair[1] in some}
+        kept = [link for bundle in inside.values() for link in bundle.links.values()]
+        labels = sorted({self._all.label(node) for one in some for node in self._sheets[one].nodes})
+        graphs = [self._all.graph(label, math.inf) for label in labels]
+        impossible, refutation = clashing(self._sheets, some, graphs, kept, self._settings)
+        lost = []
+        for key, reason in impossible.items():
+            story = [link for link in kept if refutation.key_of(link) == key]
+            for link in story:
+                self._fallen[link.pair] = self._links[link.pair][0], reason
+            self._disbelieve(story, reason)
+            lost += story
+        return lost
+
+    def _disbelieve(self, links: Iterable[Link], reason: str) -> None:
+        for link in links:
+            maps = link.a.map, link.b.map
+            self._believe(maps, {p: one for p, one in self._bundles[maps].links.items() if p != link.pair})
+            self._waiting.setdefault(maps, {})[link.pair] = link
+            self._refused.setdefault(maps, {})[link.pair] = refuse(link, reason)
+
+    def _outcome(self, maps: Mapping[MapId, HybridMap], rulings: Rulings) -> MergedMap:
+        """The island as a merged map."""
+        labels = np.unique(self._all.labels)
+        graphs: list[WideGraph] = [self._all.graph(int(label), math.inf) for label in labels]
+        graphs.sort(key=lambda graph: (-len(graph.nodes), graph.anchor))
+        links = [link for bundle in self._bundles.values() for link in bundle.links.values()]
+        refused = [r for known in self._refused.values() for r in known.values()]
+        refused += [r for known in self._own.values() for r in known]
+        refused += refuse_drives(maps, graphs, self._settings.consistency)
+        return MergedMap(
+            dict(sorted(maps.items())),
+            tuple(sorted(links, key=lambda link: link.pair)),
+            tuple(sorted(refused, key=lambda refusal: refusal.pair)),
+            tuple(frozenset(graph.rows) for graph in graphs),
+            Postures(graphs),
+            tuple(graphs),
+            rulings,
+        )
+
+
+def _edges(refused: Iterable[RefusedLink]) -> list[EdgeId | None]:
+    return [r.edge for r in refused]
