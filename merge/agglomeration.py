@@ -21,7 +21,6 @@ from merge.groups import LinkGroup
 from merge.joining import Solver, misfits
 from merge.links import Link, RefusedLink, refuse
 from merge.posegraph import PoseGraph
-from merge.readmission import readmitted
 from merge.witnesses import FalseWitnesses
 
 Key = tuple[NodeId, NodeId]
@@ -105,7 +104,7 @@ def _heard_again(
     while True:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
-        back = _borne_out(inside, by_node, agreed, heard, s) or readmitted(solver, kept, inside, s)
+        back = _borne_out(inside, by_node, agreed, heard, s)
         if not back:
             return kept
         kept += back

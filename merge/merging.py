@@ -4,7 +4,8 @@
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
 3. Pieces are joined, best supported first, and the links between what is larger now are sorted anew. Links
    that would join what is joined already must agree with it.
-4. Each component is optimised; a link that then strains more than it should is refused, worst first.
+4. Each component is optimised; a link that then strains more than it should is refused, worst first. Where
+   few are refused, each is tried once more by solving with it.
 5. Where two robots would have been at the same place at the same time, the links that make them so are
    refuted, and it goes on at 2 with the rest.
 6. Drives of a robot among others' nodes are checked against the outcome.
@@ -28,6 +29,7 @@ from merge.joining import Outliers, Solver, optimise
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap, Postures
 from merge.posegraph import HUBER
+from merge.readmission import readmitted
 from merge.refutation import Refutation
 
 
@@ -101,6 +103,15 @@ def merge_maps(
     while True:
         kept, unjoined = agglomerate(solver, groups, s.consistency)
         solved, kept, strained = optimise(solver, kept, s.strain, s.outliers)
+        if s.outliers is Outliers.WORST_FIRST:
+            tried = [r.link for r in (*unjoined, *strained) if r.link is not None]
+            if back := readmitted(solver, kept, tried, s.consistency):
+                kept = [*kept, *back]
+                solved = solver.solve(kept, believed=True)
+                told = {link.canonical().pair for link in back}
+                unjoined, strained = (
+                    [r for r in some if r.pair not in told] for some in (unjoined, strained)
+                )
         impossible = refutation.impossible(groups, solved, kept)
         if not impossible:
             break

@@ -2,18 +2,21 @@
 
 How far a link is off is judged along the tangent of the solution without it. Where headings are little known
 that is not good enough: the map bends by more than its tangent tells. If nearly all links of a map are
-believed, those that are not are likely to be right too, and if they are not far off worth a solution each: a
-right one is one with which the chi-square of everything rises by no more than one measurement may cost.
+believed, those that are not are likely to be right too, and if they are not far off worth a solution each.
+How much the chi-square of everything rises takes the place of the misfit in Bayes' factor, and the odds begin
+with how many links are believed for one that is not (see merge.credence).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from hybridmap.pose_arrays import compose_poses, inverse_poses
 from merge.consistency import ConsistencySettings
+from merge.credence import standpoints
 from merge.joining import Solver, misfits
 from merge.links import Link
 from merge.posegraph import Measurement, PoseGraph
@@ -41,12 +44,16 @@ def readmitted(
         inside = [link for link in refused if link.a in graph.rows and link.b in graph.rows]
         if not inside or len(inside) > FEW * (len(here) + len(inside)):
             continue
-        off = misfits(inside, graph, s)
-        tried = [link for link, far in zip(inside, off, strict=True) if far < NEAR * s.gate]
+        log_odds = math.log((len(here) + 0.5) / (len(inside) + 0.5))
+        known = zip(inside, misfits(inside, graph, s), standpoints(inside, graph, kept=False), strict=True)
+        tried = sorted(
+            ((link, far, found) for link, far, found in known if far < NEAR * s.gate and not found.alone),
+            key=lambda item: item[0].canonical().pair,
+        )
         cost = _cost(solver, here) if tried else 0.0
-        for link in sorted(tried, key=lambda link: link.canonical().pair):
+        for link, far, found in tried:
             now = _cost(solver, [*here, link])
-            if now - cost < s.gate:
+            if log_odds + found.log_factor + 0.5 * (far - (now - cost)) > s.least_evidence:
                 here, cost = [*here, link], now
                 out.append(link)
     return out
