@@ -132,7 +132,7 @@ class Steps:
             self._review(pair, verdicts, rulings)
         whole = self._since > self._steps.whole_share * max(len(self._all.factors), 1)
         if whole:
-            self._since, self._rough, changed = 0, 0, set(self._sheets)
+            changed = set(self._sheets)
             fresh = self._doubt_all(verdicts, rulings)
         # All is tried with limited pull first, what is new is tested by what is believed.
         self._plain, self._moved = not whole, np.zeros(0, np.int64)
@@ -145,6 +145,8 @@ class Steps:
             self._relax(np.arange(len(self._all.means)), len(self._all.means), believed=True)
             self._keep()
         self._settle(self._all.nodes_at(self._moved), whole, changed)
+        if whole:
+            self._since = self._rough = 0
         return self._outcome(maps, rulings)
 
     def _settle(self, nodes: Iterable[NodeId], whole: bool, changed: set[MapId]) -> None:

@@ -18,7 +18,7 @@ from merge.candidates import Pair
 from merge.incremental import Islands
 from merge.incremental_factors import Factors, RelaxSettings, relax
 from merge.incremental_graph import WideGraph
-from merge.incremental_steps import StepSettings
+from merge.incremental_steps import Steps, StepSettings
 from merge.incremental_verdicts import Verdict, Verdicts
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap
@@ -204,6 +204,22 @@ def test_steps_of_growth_are_the_merge_made_anew(seed: int) -> None:
     assert len(two) > 150 and len(one ^ two) <= 0.03 * len(two)
     if one == two:
         assert max(merged.pose(node).distance(anew.pose(node)) for node in anew.postures) < 0.02
+
+
+def test_all_is_decided_again_now_and_then_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What deciding again makes anew is no change that calls for deciding again."""
+    times: list[int] = []
+    real = Steps._doubt_all
+    monkeypatch.setattr(Steps, "_doubt_all", lambda *a: (times.append(1), real(*a))[1])
+    life, islands = Life(4, 0.0, DENSE), Islands(steps=StepSettings(anew_up_to=0))
+    for _ in range(40):
+        life.step(quiet=True)
+    islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+    assert len(times) >= 1
+    times.clear()
+    for _ in range(3):
+        islands.merge(life.maps, life.verdicts, set(life.maps), life.rulings)
+    assert not times
 
 
 def test_covariances_of_a_wide_graph_are_those_of_the_whole_or_larger() -> None:
