@@ -19,6 +19,7 @@ from rich.progress import Progress, TaskID
 
 from benchmarks.merge_building import Building
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from hybridmap.errors import InvalidValue
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from mapserver.merger import Merger
@@ -37,19 +38,35 @@ TRUE = 0.5
 Figures = dict[str, float]
 
 
-def at_size(nodes: int, seed: int, progress: Progress) -> Figures:
+def scale(sizes: Sequence[int], seed: int, progress: Progress) -> dict[str, dict[str, float]]:
+    """By figure, then by the number of nodes. See `at_size`.
+
+    Raises:
+        InvalidValue: a size that cannot be drawn.
+    """
+    if any(size < 2 * NODES_A_MAP or size % NODES_A_MAP for size in sizes):
+        raise InvalidValue(f"--scale: fleets have {2 * NODES_A_MAP} nodes or more, in hundreds")
+    found: dict[str, dict[str, float]] = {}
+    for size in sizes:
+        for figure, value in at_size(size, seed, progress).items():
+            found.setdefault(figure, {})[str(size)] = value
+    return found
+
+
+def at_size(nodes: int, seed: int, progress: Progress, measured: int = MEASURED) -> Figures:
     """Figures for a fleet of so many nodes.
 
     Args:
         nodes: of all maps together, a multiple of NODES_A_MAP.
         seed: of the building.
         progress: told how far it is.
+        measured: nodes that come while the clock runs.
     """
     robots = nodes // NODES_A_MAP
-    task = progress.add_task(f"{nodes} nodes, {robots} maps", total=nodes + MEASURED)
+    task = progress.add_task(f"{nodes} nodes, {robots} maps", total=nodes + measured)
     building = Building.draw(robots, NODES_A_MAP, seed)
     active = min(ACTIVE, robots)
-    first_new = NODES_A_MAP - MEASURED // active
+    first_new = NODES_A_MAP - measured // active
     told = np.ones(building.rooms.shape, np.bool_)
     told[:active, first_new:] = False
     read: list[tuple[MapId, ChangeBody]] = []
@@ -73,7 +90,9 @@ def at_size(nodes: int, seed: int, progress: Progress) -> Figures:
     began = time.perf_counter()
     merger.merged()
     first_s = time.perf_counter() - began
-    by_node, by_merge = _feed(merger, [part for k in sorted(coming) for part in coming[k]], progress, task)
+    by_node, by_merge, cpu = _feed(
+        merger, [part for k in sorted(coming) for part in coming[k]], progress, task
+    )
     merged = merger.merged()
     false = sum(_off(building, merged, *link.pair) > TRUE for link in merged.links)
     took = sum(by_node) + sum(by_merge)
@@ -83,6 +102,8 @@ def at_size(nodes: int, seed: int, progress: Progress) -> Figures:
         "ms_per_merge_median": round(statistics.median(by_merge), 2),
         "ms_per_merge_p95": round(float(np.percentile(by_merge, 95)), 2),
         "ms_per_node_with_merges": round(took / len(by_node), 2),
+        "cpu_ms_per_node": round(cpu[0] / len(by_node), 2),
+        "cpu_ms_per_merge": round(cpu[1] / max(len(by_merge), 1), 2),
         "verified_per_node": round(merger.counters.verified / len(by_node), 2),
         "read_s": round(read_s, 2),
         "first_merge_s": round(first_s, 2),
@@ -97,23 +118,26 @@ def at_size(nodes: int, seed: int, progress: Progress) -> Figures:
 
 def _feed(
     merger: Merger, parts: Sequence[list[tuple[MapId, ChangeBody]]], progress: Progress, task: TaskID
-) -> tuple[list[float], list[float]]:
-    """Milliseconds of each node, and of each merge."""
+) -> tuple[list[float], list[float], tuple[float, float]]:
+    """Milliseconds of each node and of each merge by the clock, and of the processor in all."""
+    cpu = [0.0, 0.0]
     by_node: list[float] = []
     by_merge: list[float] = []
     sequence = 0
     for k, part in enumerate(parts, 1):
-        began = time.perf_counter()
+        began, spent = time.perf_counter(), time.process_time()
         for map_id, body in part:
             sequence += 1
             merger.on_change(Change(map_id, sequence, 0, body))
         by_node.append(1e3 * (time.perf_counter() - began))
+        cpu[0] += 1e3 * (time.process_time() - spent)
         if k % EVERY == 0:
-            began = time.perf_counter()
+            began, spent = time.perf_counter(), time.process_time()
             merger.merged()
             by_merge.append(1e3 * (time.perf_counter() - began))
+            cpu[1] += 1e3 * (time.process_time() - spent)
         progress.advance(task)
-    return by_node, by_merge
+    return by_node, by_merge, (cpu[0], cpu[1])
 
 
 def _node(body: ChangeBody) -> NodeId:

@@ -1,0 +1,36 @@
+"""The merge at scale: the building is what it says, and a small fleet goes through whole."""
+
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from benchmarks.merge_building import Building
+from benchmarks.merge_scale import at_size, scale
+from hybridmap.change import NodePut
+from hybridmap.errors import InvalidValue
+from merge.links import Link
+from merge.verification import verify
+
+
+def test_links_that_are_drawn_are_those_that_would_be_found() -> None:
+    """Verification confirms most pairs that are said to show the same, and where they stand."""
+    building = Building.draw(3, 24, 5)
+    told = np.ones(building.rooms.shape, np.bool_)
+    nodes = {b.node.id: b.node for r in range(3) for _, b in building.log(r) if isinstance(b, NodePut)}
+    overlaps, links = building.knowledge(told)
+    assert overlaps.keys() == links.keys() and len(links) > 10
+    found = [verify(nodes[a], nodes[b]) for a, b in list(links)[:12]]
+    good = [one for one in found if isinstance(one, Link)]
+    assert len(good) >= 8
+    for one in good:
+        true = building.world_from(one.a).inverse() @ building.world_from(one.b)
+        assert one.a_from_b.mean.distance(true) < 0.4
+
+
+def test_a_small_fleet_becomes_one_map() -> None:
+    figures = at_size(200, 0, Progress(disable=True), measured=6)
+    assert figures["false_links"] == 0.0 and figures["links"] > 50.0
+    assert figures["components"] == 1.0 and figures["error_m_median"] < 0.5
+    assert figures["ms_per_node_p95"] >= figures["ms_per_node_median"] > 0.0
+    with pytest.raises(InvalidValue, match="hundreds"):
+        scale([250], 0, Progress(disable=True))
