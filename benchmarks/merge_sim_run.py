@@ -182,7 +182,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             run = run_one(scenario, arguments.seed, Path(folder))
     except MapweaveError as problem:
-        print(f"{arguments.scenario}, seed {arguments.seed}: {problem}", file=sys.stderr)
+        print(problem, file=sys.stderr)
         raise SystemExit(1) from None
     print(json.dumps(asdict(run), allow_nan=False))
 
