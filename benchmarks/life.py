@@ -117,6 +117,7 @@ def run(
         spent, old = time.perf_counter() - began, len(merged.superseded)
         curve.append(Drive(len(merged.postures) - old, old, len(merged.components), spent))
         first_nodes = first_nodes or frozenset(merged.postures)
+        console.print(f"drive {epoch}: {curve[-1].nodes} nodes, {old} superseded, merged in {spent:.1f} s")
     views = [house.look(rng) for _ in range(queries)]
     figures: dict[str, float | list[int]] = {
         "nodes_first": curve[0].nodes,

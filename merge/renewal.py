@@ -1,10 +1,9 @@
 """Renewal: nodes that newer ones of the same place stand for, so that a map does not grow with every drive.
 
 A node is superseded if a robot that stood there would know itself by a newer one and could servo to it: the
-two were verified to show the same, enough common landmarks stay in view between them, and they are so near to
-each other that a robot at the one looks for the other. Besides, the newer one must know about as many depths;
-nothing that the old one stood for may be left without; and no way between its neighbours may become much
-longer without it.
+two were verified to show the same, enough common landmarks stay in view between them, and they stand within
+the servo's basin. Besides, the newer one must know about as many depths; nothing that the old one stood for
+may be left without; and no way between its neighbours may become much longer without it.
 
 Superseded nodes stay where they are: they tie postures, and come back if what supersedes them does not stand.
 """
@@ -37,8 +36,7 @@ class RenewalSettings:
     """When a newer node stands for an older one.
 
     Attributes:
-        reach: where a robot that follows a route looks for a node: nearer than this, and turned by less. It
-            is well within the servo's basin.
+        reach: the servo's basin: from the older node's place it brings a robot to the newer one.
         found: landmarks that both show and that stay in view between them.
         depths: the newer one knows at least this share of the number of depths that the older one knows,
         enough: or at least this many.
@@ -49,7 +47,7 @@ class RenewalSettings:
         floor: m, m and rad, error of both that no covariance tells of.
     """
 
-    reach: ReachSettings = field(default_factory=lambda: ReachSettings(farthest=1.4, widest=0.6))
+    reach: ReachSettings = field(default_factory=ReachSettings)
     found: int = 20
     depths: float = 0.7
     enough: int = 60
