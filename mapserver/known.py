@@ -50,7 +50,7 @@ class Known:
         others = sorted(node for node in component if node.map != asking)
         if not own or not others:
             return []
-        postures = {node: merged.postures[node].merged_from_robot.mean for node in component}
+        postures = {node: merged.pose(node) for node in component}
         tree = cKDTree([[postures[node].x, postures[node].y] for node in own])
         _, nearest = tree.query([[postures[node].x, postures[node].y] for node in others])
         views = []

@@ -80,4 +80,4 @@ class MapPart:
 
     def pose(self, node: NodeId) -> Pose2:
         """Posture in the component's frame."""
-        return self.merged.postures[node].merged_from_robot.mean
+        return self.merged.pose(node)

@@ -48,12 +48,15 @@ class StepSettings:
             exactly that of one merge.
         whole_share: everything is decided again when so many measurements have come or gone since it was last
             done, as a share of all.
+        whole_up_to: islands of more nodes are not decided again as a whole, which would take minutes; only
+            once, when nothing is known of them yet.
         optimise_share: the same for optimising everything: what is left of strain after each step adds up.
         relax: how far a change is followed.
     """
 
     anew_up_to: int = 600
     whole_share: float = 0.1
+    whole_up_to: int = 3000
     optimise_share: float = 0.01
     relax: RelaxSettings = field(default_factory=RelaxSettings)
 
@@ -130,7 +133,8 @@ class Steps:
         self._weigh(fresh, verdicts)
         for pair in sorted(fresh | {pair for pair in known if pair[0] in changed or pair[1] in changed}):
             self._review(pair, verdicts, rulings)
-        whole = self._since > self._steps.whole_share * max(len(self._all.factors), 1)
+        few = sum(len(one.nodes) for one in maps.values()) <= self._steps.whole_up_to or not self._bundles
+        whole = few and self._since > self._steps.whole_share * max(len(self._all.factors), 1)
         if whole:
             changed = set(self._sheets)
             fresh = self._doubt_all(verdicts, rulings)
