@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
+from hybridmap.kernels import kernels
 from hybridmap.matching import MatchSettings, match
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, wrap_angle
@@ -44,6 +45,7 @@ class Doubles:
     def __init__(self, settings: RecognitionSettings) -> None:
         """Take when a place counts as recognised; a likeness may leave open where exactly it is seen from."""
         self._settings = replace(settings, **VAGUE)
+        kernels()  # compiled when a server starts, if ever: nobody who asks waits for that
         self._kept: OrderedDict[tuple[NodeId, NodeId], tuple[Node, Node, Recognition | None]] = OrderedDict()
 
     def compare(self, a: Node, b: Node) -> Recognition | None:

@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from agent.ekf import algebra
+from hybridmap.kernels import kernels
 
 PRODUCTS = (
     "drive", "advance",
@@ -24,6 +25,8 @@ def load() -> None:
         form = _compiled()
         globals().update({name: getattr(form or algebra, name) for name in PRODUCTS})
         globals()["COMPILED"] = form is not None
+        # A robot that maps will recognise places too, and must not wait for a compiler then.
+        kernels()
 
 
 def _compiled() -> ModuleType | None:
