@@ -104,10 +104,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.fit_belief", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[100, 101], help="that are learned from")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[100], help="that are learned from")
     parser.add_argument("--check", type=int, nargs="+", default=[0], help="on which it is shown")
-    parser.add_argument("--nodes", type=int, nargs=2, default=[600, 1000], help="to learn, and to check")
-    parser.add_argument("--queries", type=int, nargs=2, default=[120, 200], help="of each kind, likewise")
+    parser.add_argument("--nodes", type=int, nargs=2, default=[300, 1000], help="to learn, and to check")
+    parser.add_argument("--queries", type=int, nargs=2, default=[60, 200], help="of each kind, likewise")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
     if set(arguments.seeds) & set(arguments.check):
