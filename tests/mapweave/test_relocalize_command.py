@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -113,7 +114,8 @@ def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Pat
     assert (np.abs(image.astype(int) - GREEN) < 40).all(axis=2).sum() > 1000
     # As people read it.
     assert main(["relocalize", str(photo), "--connect", served]) == 0
-    assert "node r0.1.1: +0.3" in capfd.readouterr().out
+    told = re.search(r"node r0\.1\.1: (\S+) m ahead", capfd.readouterr().out)
+    assert told is not None and float(told[1]) == pytest.approx(MOVED.x, abs=0.03)
 
 
 def test_what_is_not_known_is_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
