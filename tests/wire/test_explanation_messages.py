@@ -124,11 +124,16 @@ def test_a_damaged_explanation_is_refused_with_one_line(field: str, value: Any) 
 
 
 @pytest.mark.parametrize(
-    "value", [[["a", 1], ["a", 1], True, "x", 0, ""], [["a", 1], ["b", 1, 2], True, "x", 0, ""]]
+    "value", [[["a", 1, 2], ["a", 1, 2], True, "x", 0, ""], [["a", 1], ["b", 1, 2], True, "x", 0, ""]]
 )
 def test_a_ruling_on_nothing_is_refused(value: list[Any]) -> None:
     with pytest.raises(InvalidMessage):
         decode_ruling(msgpack.packb({"v": 1, "r": value}))
+
+
+def test_a_ruling_on_one_map_retires_it() -> None:
+    ruling = decode_ruling(msgpack.packb({"v": 1, "r": [["a", 1], ["a", 1], True, "x", 0, ""]}))
+    assert ruling.retires == MapId("a", 1)
 
 
 def test_what_would_not_decode_is_not_encoded() -> None:
