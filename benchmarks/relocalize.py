@@ -30,6 +30,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+# Small matrices gain nothing from more threads, and wait for each other where other programs run.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress

@@ -188,10 +188,10 @@ class Relocalizer:
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2 | None:
         """Posture `a_from_b` on the merged map; None if that does not join the two."""
-        here, there = (self._merged.postures.get(one) for one in (a, b))
-        if here is None or there is None or here.component != there.component:
+        component = self._merged.component_of(a)
+        if component is None or component != self._merged.component_of(b):
             return None
-        return here.merged_from_robot.mean.inverse() @ there.merged_from_robot.mean
+        return self._merged.pose(a).inverse() @ self._merged.pose(b)
 
     def _may_differ(
         self, node: Node, pairs: NDArray[np.int64], view: View, sightings: Sequence[Sighting]
