@@ -18,22 +18,20 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeId, MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Rulings
-from merge.candidates import Pair
-from merge.distinctness import weigh
 from merge.drives import refuse_drives
-from merge.fragments import fragment_by_node
 from merge.groups import LinkGroup
 from merge.incremental_clashes import clashing, neighbours
 from merge.incremental_factors import RelaxSettings, Rows, relax
 from merge.incremental_graph import WideGraph
 from merge.incremental_judgement import Judge
+from merge.incremental_ledger import Ledger, ends_of
 from merge.incremental_memory import Memory
-from merge.incremental_sheets import Assembly, Bundle, MapPair, Sheet
+from merge.incremental_sheets import Assembly, MapPair, Sheet
 from merge.incremental_verdicts import Verdicts
-from merge.links import Link, RefusedLink, refuse
+from merge.links import Link, RefusedLink
 from merge.merged import MergedMap, Postures
 from merge.merging import MergeSettings
-from merge.undoing import reason_of, undo
+from merge.undoing import undo
 
 ATTEMPTS = 20
 """Times that links are refused after optimisation in one step; what is left waits for the next."""
@@ -76,13 +74,9 @@ class Steps:
         self._steps = steps
         self._memory = memory
         self._sheets: dict[MapId, Sheet] = {}
-        self._bundles: dict[MapPair, Bundle] = {}
-        self._waiting: dict[MapPair, dict[Pair, Link]] = {}
-        self._refused: dict[MapPair, dict[Pair, RefusedLink]] = {}
+        self._ledger = Ledger(self._sheets, settings.consistency)
         self._own: dict[MapId, list[RefusedLink]] = {}
         self._groups: dict[MapPair, list[LinkGroup]] = {}
-        self._links: dict[Pair, tuple[Link, Link]] = {}
-        self._fallen: dict[Pair, tuple[Link, str]] = {}
         self._since = self._rough = 0
         self._touched: set[NodeId] = set()
         self._plain = True
@@ -101,16 +95,7 @@ class Steps:
             self._place(map_id, one, rulings, {node: merged.pose(node) for node in one.nodes})
             # What held them where they are may not have come along.
             self._touched |= one.nodes.keys()
-        links: dict[MapPair, dict[Pair, Link]] = {}
-        for link in merged.links:
-            maps = link.a.map, link.b.map
-            given = verdicts.between(maps).get(link.pair)
-            if isinstance(given, Link) and maps[0] in some and maps[1] in some:
-                weighed = replace(given, evidence=link.evidence)
-                self._links[link.pair] = given, weighed
-                links.setdefault(maps, {})[link.pair] = weighed
-        for maps, here in links.items():
-            self._believe(maps, here)
+        self._ledger.begin(merged, verdicts)
 
     def step(
         self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, news: Iterable[MapPair], rulings: Rulings
@@ -129,11 +114,13 @@ class Steps:
         self._leave(self._sheets.keys() - maps.keys())
         changed = {one for one in maps if self._place(one, maps[one], rulings)}
         fresh = {pair for pair in news if pair[0] in maps and pair[1] in maps}
-        known = {*self._bundles, *self._waiting}
-        self._weigh(fresh, verdicts)
+        known, ledger = self._ledger.known, self._ledger
+        ledger.weigh(fresh, verdicts)
         for pair in sorted(fresh | {pair for pair in known if pair[0] in changed or pair[1] in changed}):
-            self._review(pair, verdicts, rulings)
-        few = sum(len(one.nodes) for one in maps.values()) <= self._steps.whole_up_to or not self._bundles
+            lost = ledger.review(pair, verdicts, rulings)
+            self._since += len(lost)
+            self._touched |= ends_of(lost)
+        few = sum(len(one.nodes) for one in maps.values()) <= self._steps.whole_up_to or not ledger.bundles
         whole = few and self._since > self._steps.whole_share * max(len(self._all.factors), 1)
         if whole:
             changed = set(self._sheets)
@@ -177,11 +164,10 @@ class Steps:
     def _leave(self, gone: Iterable[MapId]) -> None:
         """Forget maps that belong to another island now."""
         away = set(gone)
-        for pair in [pair for pair in {*self._bundles, *self._waiting} if away & set(pair)]:
-            self._touched |= {node for ends in self._believed(pair) for node in ends if node.map not in away}
-            self._bundles.pop(pair, None)
-            self._waiting.pop(pair, None)
-            self._refused.pop(pair, None)
+        for pair in [pair for pair in self._ledger.known if away & set(pair)]:
+            ends = ends_of(self._ledger.believed(pair))
+            self._touched |= {node for node in ends if node.map not in away}
+            self._ledger.forget(pair)
             self._groups.pop(pair, None)
         for map_id in away:
             del self._sheets[map_id], self._own[map_id]
@@ -206,73 +192,18 @@ class Steps:
         self._own[map_id] = [r for piece in pieces for r in piece.refused] + list(undone.refused)
         return True
 
-    def _review(self, maps: MapPair, verdicts: Verdicts, rulings: Rulings) -> None:
-        """Which links between two maps may be believed: those that are new wait, those that are gone go."""
-        first, second = self._sheets[maps[0]], self._sheets[maps[1]]
-        refused: dict[Pair, RefusedLink] = {}
-        waiting: dict[Pair, Link] = {}
-        believed = self._believed(maps)
-        kept: dict[Pair, Link] = {}
-        for pair, verdict in verdicts.between(maps).items():
-            if pair[0] not in first.rows or pair[1] not in second.rows:
-                continue
-            fallen = self._fallen.get(pair)
-            ruling = rulings.against(*pair)
-            if isinstance(verdict, RefusedLink):
-                refused[pair] = verdict
-            elif ruling is not None:
-                refused[pair] = refuse(verdict, reason_of(ruling))
-            elif fallen is not None and fallen[0] is verdict:
-                refused[pair] = refuse(verdict, fallen[1])
-            elif pair in believed and believed[pair].a_from_b is verdict.a_from_b:
-                kept[pair] = self._links[pair][1]
-            else:
-                waiting[pair] = self._links[pair][1]
-        lost = believed.keys() - kept.keys()
-        self._since += len(lost)
-        self._touched |= {node for pair in lost for node in pair if node in first.rows or node in second.rows}
-        self._believe(maps, kept)
-        told = {pair: known for pair, known in self._refused.get(maps, {}).items() if pair in waiting}
-        self._waiting[maps], self._refused[maps] = waiting, {**told, **refused}
-
-    def _weigh(self, between: Iterable[MapPair], verdicts: Verdicts) -> None:
-        """Find landmarks that there are twice by the links between some maps; what is known already stays."""
-        s, pairs = self._settings, sorted(between)
-        some = sorted({one for pair in pairs for one in pair})
-        by_node = fragment_by_node([piece for one in some for piece in self._sheets[one].fragments])
-        found = [v for pair in pairs for v in verdicts.between(pair).values() if isinstance(v, Link)]
-        found = [link for link in found if link.a in by_node and link.b in by_node]
-        whole = {one: self._sheets[one].one for one in some}
-        for link, weighed in zip(found, weigh(found, by_node, whole, s.consistency), strict=True):
-            known = self._links.get(link.pair)
-            if known is None or known[0] is not link or known[1].doubles < weighed.doubles:
-                self._links[link.pair] = link, weighed
-
     def _doubt_all(self, verdicts: Verdicts, rulings: Rulings) -> set[MapPair]:
         """Let all links wait again: what was decided one after the other is decided together."""
-        self._fallen.clear()
-        self._bundles.clear()
-        self._refused.clear()
+        known = self._ledger.doubt_all()
         for map_id, sheet in self._sheets.items():
             self._sheets[map_id] = Sheet.of(sheet.one, sheet.fragments, {}, sheet.undone)
-        known = set(self._waiting)
-        self._links.clear()
-        self._weigh(known, verdicts)
+        self._ledger.weigh(known, verdicts)
         for maps in sorted(known):
-            self._review(maps, verdicts, rulings)
+            self._ledger.review(maps, verdicts, rulings)
         return known
 
-    def _believed(self, maps: MapPair) -> Mapping[Pair, Link]:
-        return self._bundles[maps].links if maps in self._bundles else {}
-
-    def _believe(self, maps: MapPair, links: Mapping[Pair, Link]) -> None:
-        if links:
-            self._bundles[maps] = Bundle.of(links, self._sheets[maps[0]], self._sheets[maps[1]])
-        else:
-            self._bundles.pop(maps, None)
-
     def _assemble(self) -> None:
-        self._all = Assembly(self._sheets, self._bundles)
+        self._all = Assembly(self._sheets, self._ledger.bundles)
         self._all.in_their_frames()
 
     def _keep(self) -> None:
@@ -299,27 +230,24 @@ class Steps:
     def _join(self, fresh: Iterable[MapPair]) -> None:
         """Believe links that the components bear out, and join components, as long as any can be."""
         judge = Judge(self._settings, self._memory, self._sheets, self._groups)
-        for maps in [maps for maps in self._groups if maps not in self._waiting]:
+        for maps in [maps for maps in self._groups if maps not in self._ledger.waiting]:
             del self._groups[maps]
         open_, heard, last = set(fresh), set(fresh), False
         while True:
             standing = {
-                maps: (
-                    self._bundles[maps].links if maps in self._bundles else {},
-                    self._waiting.get(maps, {}),
-                )
+                maps: (self._ledger.believed(maps), self._ledger.waiting.get(maps, {}))
                 for maps in sorted(open_)
             }
-            believed, refused, joins = judge.round(self._all, standing, self._waiting, last)
-            for link, reason in refused:
-                self._refused.setdefault((link.a.map, link.b.map), {})[link.pair] = refuse(link, reason)
+            believed, refused, joins = judge.round(self._all, standing, self._ledger.waiting, last)
+            self._ledger.tell(refused)
             if not believed:
                 if last:
                     return
                 open_, last = set(heard), True
                 continue
             before = self._all
-            self._accept(believed)
+            self._since += self._ledger.accept(believed)
+            self._all = Assembly(self._sheets, self._ledger.bundles)
             for first, second, second_from_first in joins:
                 self._all.move(before, first, second, second_from_first)
             self._all.in_their_frames()
@@ -327,24 +255,11 @@ class Steps:
             # What has come to lie within one component can be tested now.
             open_ = {
                 maps
-                for maps, links in self._waiting.items()
+                for maps, links in self._ledger.waiting.items()
                 if (last and maps in heard)
                 or any(before.label(link.a) != before.label(link.b) for link in links.values())
             }
             heard |= open_
-
-    def _accept(self, links: Iterable[Link]) -> None:
-        by_maps: dict[MapPair, dict[Pair, Link]] = {}
-        for link in links:
-            by_maps.setdefault((link.a.map, link.b.map), {})[link.pair] = link
-        for maps, more in by_maps.items():
-            more = {pair: self._waiting[maps][pair] for pair in more}
-            self._believe(maps, {**self._believed(maps), **more})
-            for pair in more:
-                self._waiting[maps].pop(pair, None)
-                self._refused[maps].pop(pair, None)
-            self._since += len(more)
-        self._all = Assembly(self._sheets, self._bundles)
 
     def _strained(self) -> list[Link]:
         """Refuse the link that strains the most where something has moved, if it is too much."""
@@ -358,7 +273,7 @@ class Steps:
             return []
         off = float(strains[worst]) ** 0.5
         reason = f"strains the joined map: {off:.1f} standard deviations from where it ended"
-        self._disbelieve([links[worst]], reason)
+        self._ledger.disbelieve([links[worst]], reason)
         return [links[worst]]
 
     def _fall(self, changed: set[MapId]) -> list[Link]:
@@ -366,7 +281,7 @@ class Steps:
         some = neighbours(self._sheets, changed)
         if len(some) < 2:
             return []
-        inside = {pair: b for pair, b in self._bundles.items() if pair[0] in some and pair[1] in some}
+        inside = {pair: b for pair, b in self._ledger.bundles.items() if pair[0] in some and pair[1] in some}
         kept = [link for bundle in inside.values() for link in bundle.links.values()]
         labels = sorted({self._all.label(node) for one in some for node in self._sheets[one].nodes})
         graphs = [self._all.graph(label, math.inf) for label in labels]
@@ -374,26 +289,17 @@ class Steps:
         lost = []
         for key, reason in impossible.items():
             story = [link for link in kept if refutation.key_of(link) == key]
-            for link in story:
-                self._fallen[link.pair] = self._links[link.pair][0], reason
-            self._disbelieve(story, reason)
+            self._ledger.disbelieve(story, reason, for_good=True)
             lost += story
         return lost
-
-    def _disbelieve(self, links: Iterable[Link], reason: str) -> None:
-        for link in links:
-            maps = link.a.map, link.b.map
-            self._believe(maps, {p: one for p, one in self._bundles[maps].links.items() if p != link.pair})
-            self._waiting.setdefault(maps, {})[link.pair] = link
-            self._refused.setdefault(maps, {})[link.pair] = refuse(link, reason)
 
     def _outcome(self, maps: Mapping[MapId, HybridMap], rulings: Rulings) -> MergedMap:
         """The island as a merged map."""
         labels = np.unique(self._all.labels)
         graphs: list[WideGraph] = [self._all.graph(int(label), math.inf) for label in labels]
         graphs.sort(key=lambda graph: (-len(graph.nodes), graph.anchor))
-        links = [link for bundle in self._bundles.values() for link in bundle.links.values()]
-        refused = [r for known in self._refused.values() for r in known.values()]
+        links = [link for bundle in self._ledger.bundles.values() for link in bundle.links.values()]
+        refused = [r for known in self._ledger.refused.values() for r in known.values()]
         refused += [r for known in self._own.values() for r in known]
         refused += refuse_drives(maps, graphs, self._settings.consistency)
         return MergedMap(
