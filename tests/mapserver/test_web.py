@@ -9,47 +9,15 @@ import socket
 import struct
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from collections.abc import Iterator
 
-import cv2
 import numpy as np
 import pytest
 
 from hybridmap.errors import Busy, NotConnected, SettingsError
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
 from mapserver import web
 from mapserver.web import MOST_BYTES, Web, parse_address
-
-HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.1), 0.02, 0.01)
-ANSWER = RelocalizeAnswer(
-    Certainty.FOUND,
-    (Whereabouts(NodeId("r0", 1, 7), HERE, None, -1, 31, 0.99),),
-    "31 landmarks of r0.1.7 agree",
-)
-
-
-class Desk:
-    """Answers everything alike and remembers what was asked, or does what the test says."""
-
-    def __init__(self) -> None:
-        self.views: list[View] = []
-        self.refusal: Exception | None = None
-
-    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
-        done: Future[RelocalizeAnswer] = Future()
-        if isinstance(self.refusal, Busy):
-            raise self.refusal
-        try:
-            self.views.append(look())
-            if self.refusal is not None:
-                raise self.refusal
-            done.set_result(ANSWER)
-        except Exception as error:  # noqa: BLE001 - as a worker would
-            done.set_exception(error)
-        return done
+from tests.mapserver.desks import ANSWER, Desk, picture
 
 
 @pytest.fixture
@@ -61,13 +29,6 @@ def desk() -> Desk:
 def served(desk: Desk) -> Iterator[Web]:
     with Web(("127.0.0.1", 0), desk.locate, lambda: {"nodes": 12, "summary": "12 nodes"}) as served:
         yield served
-
-
-def picture(width: int = 160, height: int = 120, kind: str = ".png") -> bytes:
-    """Something with features in it."""
-    noise = np.random.default_rng(1).integers(0, 255, (height // 8, width // 8)).astype(np.uint8)
-    image = cv2.resize(noise, (width, height), interpolation=cv2.INTER_CUBIC)
-    return bytes(cv2.imencode(kind, image)[1].tobytes())
 
 
 def ask(

@@ -1,0 +1,89 @@
+"""A real browser for tests: Chromium without a window, driven by the W3C WebDriver protocol."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from tests.waiting import eventually, free_port
+
+PROGRAMS = ("chromium", "chromedriver")
+ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--window-size=420,800",
+)  # fmt: skip
+
+
+def there_is_none() -> bool:
+    """Whether this machine has no browser to test with."""
+    return any(shutil.which(name) is None for name in PROGRAMS)
+
+
+class Browser:
+    """One page at a time. Use it as a context."""
+
+    def __init__(self, folder: Path) -> None:
+        """Start it with a profile of its own in a folder."""
+        self._port = free_port()
+        self._driver = subprocess.Popen(
+            [str(shutil.which("chromedriver")), f"--port={self._port}"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            eventually(self._ready)
+            options = {"binary": shutil.which("chromium"), "args": [*FLAGS, f"--user-data-dir={folder}"]}
+            wanted = {"alwaysMatch": {"browserName": "chrome", "goog:chromeOptions": options}}
+            self._session = f"/session/{self._ask('POST', '/session', {'capabilities': wanted})['sessionId']}"
+        except BaseException:
+            self._end()
+            raise
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self._ask("DELETE", self._session)
+        finally:
+            self._end()
+
+    def open(self, address: str) -> None:
+        """Go to a page."""
+        self._ask("POST", f"{self._session}/url", {"url": address})
+
+    def type(self, selector: str, text: str) -> None:
+        """Type into the field that a CSS selector finds; into one for files, a path."""
+        found = self._ask("POST", f"{self._session}/element", {"using": "css selector", "value": selector})
+        self._ask("POST", f"{self._session}/element/{found[ELEMENT]}/value", {"text": text})
+
+    def run(self, script: str) -> Any:
+        """What a function body in JavaScript returns."""
+        return self._ask("POST", f"{self._session}/execute/sync", {"script": script, "args": []})
+
+    def _ready(self) -> bool:
+        try:
+            return bool(self._ask("GET", "/status")["ready"])
+        except OSError:
+            return False
+
+    def _ask(self, method: str, path: str, body: object = None) -> Any:
+        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
+        try:
+            connection.request(method, path, None if body is None else json.dumps(body))
+            value = json.loads(connection.getresponse().read())["value"]
+        finally:
+            connection.close()
+        if isinstance(value, dict) and "error" in value:
+            raise RuntimeError(f"{value['error']}: {value['message']}")
+        return value
+
+    def _end(self) -> None:
+        self._driver.terminate()
+        self._driver.wait(30)
