@@ -131,14 +131,15 @@ class MapServer:
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._upkeep.answers.merged
-        between = [link for link in merged.links if link.a.map != link.b.map]
+        loops = sum(link.within for link in merged.links)
         traffic = self._store.traffic()
         return {
             "nodes": len(merged.postures),
             "superseded": len(merged.superseded),
             "maps": len(merged.maps),
             "components": len(merged.components),
-            "links": len(between),
+            "links": len(merged.links) - loops,
+            "loops": loops,
             "refused": sum(refusal.link is not None for refusal in merged.refused),
             "rulings": len(merged.rulings.in_force),
             "event": self._upkeep.event,

@@ -169,16 +169,18 @@ class MergedMap:
         return f"{a} and {b} were not compared: they share too few alike features"
 
     def summary(self) -> str:
-        """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused, 4 superseded`.
+        """For example `17 nodes, 3 maps, 2 components, 5 links, 1 loop, 2 refused, 4 superseded`.
 
-        Superseded nodes and retired maps are among the nodes and maps.
+        Links are between maps, loops within one; superseded nodes and retired maps count as nodes and maps.
         """
+        loops = sum(link.within for link in self.links)
         refused = sum(refusal.link is not None for refusal in self.refused)
         counts = (
             (len(self.postures), "node"),
             (len(self.maps), "map"),
             (len(self.components), "component"),
-            (len(self.links), "link"),
+            (len(self.links) - loops, "link"),
+            *([(loops, "loop")] if loops else []),
         )
         words = [f"{count} {word}{'' if count == 1 else 's'}" for count, word in counts]
         more = ((len(self.superseded), "superseded"), (len(self.rulings.retired), "retired"))

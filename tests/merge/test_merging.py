@@ -207,6 +207,10 @@ def test_a_map_in_pieces_is_joined_piece_by_piece() -> None:
     assert set(merged.postures) == set(whole.nodes)
 
 
+def refused_links(merged: MergedMap) -> list[RefusedLink]:
+    return [one for one in merged.refused if one.link is not None]
+
+
 def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]) -> None:
     fleet, merged = office_fleet
     link = merged.links[0]
@@ -216,7 +220,9 @@ def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]) -> None
     known = {link.pair for link in merged.links} | {r.pair for r in merged.refused}
     unknown = next((a, b) for a, b in pairwise(sorted(fleet.truth)) if (a, b) not in known)
     assert "not compared" in merged.explain(*unknown)
-    assert merged.summary().startswith("40 nodes, 3 maps, 1 component, ")
+    loops = sum(link.a.map == link.b.map for link in merged.links)
+    told = f"{len(merged.links) - loops} links, {loops} loops, {len(refused_links(merged))} refused"
+    assert loops > 1 and merged.summary() == f"40 nodes, 3 maps, 1 component, {told}"
     union = merged.union()
     assert set(union.nodes) == set(fleet.truth)
     assert len(union.edges) == sum(len(one.edges) for one in fleet.maps.values()) + len(merged.links)
