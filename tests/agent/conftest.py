@@ -9,9 +9,12 @@ import skimage.data
 
 from agent.mapper import Mapper
 from agent.observation import Observation, Odometry, RobotDescription
+from benchmarks.synthetic import World
 from hybridmap.camera import Camera
+from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
+from tests.agent.scripted_fleet import home_map, home_world
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 DESCRIPTION = RobotDescription(camera=CAMERA)
@@ -89,3 +92,15 @@ def node(walls) -> Node:
 def description() -> RobotDescription:
     """The robot in it."""
     return DESCRIPTION
+
+
+@pytest.fixture(scope="module")
+def home() -> World:
+    """A room of landmarks, for navigators whose fleet is scripted."""
+    return home_world()
+
+
+@pytest.fixture(scope="module")
+def own_map(home: World) -> HybridMap:
+    """Three nodes in a row in it, each 1.2 m before the one before."""
+    return home_map(home)

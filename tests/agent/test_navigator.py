@@ -14,7 +14,6 @@ from agent.navigator import NavigatorSettings, Stage
 from agent.own_route import own_route
 from agent.tally import Tally
 from benchmarks.synthetic import World
-from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
@@ -33,24 +32,9 @@ from tests.agent.scripted_fleet import (
     bare,
     found,
     here,
-    home_map,
-    home_world,
     navigator,
     straight,
 )
-
-
-@pytest.fixture(scope="module")
-def home() -> World:
-    """A room."""
-    return home_world()
-
-
-@pytest.fixture(scope="module")
-def own_map(home: World) -> HybridMap:
-    """Three nodes in a row, each 1.2 m before the one before."""
-    return home_map(home)
-
 
 # Blocked
 

@@ -14,7 +14,7 @@ from agent.observation import Observation, Odometry
 from agent.search import Search, SearchSettings
 from agent.tally import Tally
 from agent.vision.lens import Lens
-from benchmarks.synthetic import World, take_map
+from benchmarks.synthetic import take_map
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
@@ -34,23 +34,9 @@ from tests.agent.scripted_fleet import (
     bare,
     found,
     here,
-    home_map,
-    home_world,
     navigator,
     straight,
 )
-
-
-@pytest.fixture(scope="module")
-def home() -> World:
-    """A room."""
-    return home_world()
-
-
-@pytest.fixture(scope="module")
-def own_map(home: World) -> HybridMap:
-    """Three nodes in a row, each 1.2 m before the one before."""
-    return home_map(home)
 
 
 def test_an_ambiguous_view_is_never_taken_for_a_place(home):
