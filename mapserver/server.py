@@ -25,6 +25,7 @@ from mapserver.placekeeper import PlaceKeeper
 from mapserver.services import Services
 from mapserver.store import Store
 from mapserver.upkeep import Upkeep
+from merge.merging import MergeSettings
 from wire.bus import Bus
 from wire.keys import Keys
 from wire.log_messages import Scalar, encode_record
@@ -44,12 +45,14 @@ class ServerSettings:
             answer does not depend on the machine's speed, and merge only when asked (simulation only; a
             robot's question must not wait).
         desk: how questions that take long are shared out.
+        merge: how maps are merged.
     """
 
     status_every: float = 0.5
     merge_share: float = 0.4
     lockstep: bool = False
     desk: DeskSettings = field(default_factory=DeskSettings)
+    merge: MergeSettings = field(default_factory=MergeSettings)
 
 
 class MapServer:
@@ -79,7 +82,7 @@ class MapServer:
         # In lock-step all must come about again as it did, the cells of the index too.
         self._keeper = None if s.lockstep else PlaceKeeper(self._store, path)
         index = self._keeper.index if self._keeper else None
-        self._upkeep = Upkeep(s.merge_share, by_itself=not s.lockstep, index=index)
+        self._upkeep = Upkeep(s.merge_share, by_itself=not s.lockstep, index=index, merge=s.merge)
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
         self._desk = Desk(replace(s.desk, workers=0) if s.lockstep else s.desk)

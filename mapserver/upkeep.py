@@ -12,9 +12,10 @@ from hybridmap.change import Change
 from hybridmap.errors import MapweaveError
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
-from mapserver.merger import Merger
+from mapserver.merger import Merger, MergerSettings
 from mapserver.placeindex import PlaceIndex
 from merge.merged import MergedMap
+from merge.merging import MergeSettings
 from merge.parting import joinings, partings
 
 log = logging.getLogger(__name__)
@@ -26,17 +27,24 @@ MOST_WORDS = 1000
 class Upkeep:
     """Merges beside the questions. Only its thread touches the merger; done answers replace those before."""
 
-    def __init__(self, share: float, by_itself: bool = True, index: PlaceIndex | None = None) -> None:
+    def __init__(
+        self,
+        share: float,
+        by_itself: bool = True,
+        index: PlaceIndex | None = None,
+        merge: MergeSettings | None = None,
+    ) -> None:
         """Begin with nothing.
 
         Args:
             share: at most this share of the time is spent making the merged map anew.
             by_itself: merge whenever there is something new; else only when somebody waits for it.
             index: is filled with the nodes that come; may have them already.
+            merge: how maps are merged.
         """
         self._share = share
         self._by_itself = by_itself
-        self._merger = Merger(index)
+        self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
         self._changes: queue.SimpleQueue[Change | list[Change] | Rulings | threading.Event | None] = (
             queue.SimpleQueue()
         )

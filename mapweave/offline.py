@@ -10,8 +10,9 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.ruling import Rulings
 from mapserver.mapfiles import maps_of
-from mapserver.merger import Merger
+from mapserver.merger import Merger, MergerSettings
 from merge.merged import MergedMap
+from merge.merging import MergeSettings
 from wire.mapfile import MapFile
 
 Progress = Callable[[int, int], None]
@@ -37,7 +38,10 @@ def parts_of(files: Mapping[Path, MapFile]) -> tuple[dict[MapId, HybridMap], Rul
 
 
 def merge_parts(
-    maps: Mapping[MapId, HybridMap], rulings: Rulings, progress: Progress = lambda done, of: None
+    maps: Mapping[MapId, HybridMap],
+    rulings: Rulings,
+    progress: Progress = lambda done, of: None,
+    settings: MergeSettings | None = None,
 ) -> MergedMap:
     """Merge robots' maps as the map server does.
 
@@ -45,8 +49,9 @@ def merge_parts(
         maps: by id; they are not changed.
         rulings: of people.
         progress: told how far it is.
+        settings: how they are merged.
     """
-    merger = Merger()
+    merger = Merger(settings=MergerSettings(merging=settings or MergeSettings()))
     merger.rule(rulings)
     bodies = [(map_id, body) for map_id, one in sorted(maps.items()) for body in one.contents()]
     for k, (map_id, body) in enumerate(bodies):

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from agent.pipeline import PipelineSettings
 from mapserver.desk import DeskSettings
 from wire.tables import build, read_toml
+
+if TYPE_CHECKING:
+    from merge.merging import MergeSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,11 +38,13 @@ class Settings:
         network: how to reach the fleet.
         pipeline: of an agent.
         desk: how a map server shares out the questions that take long.
+        merge: how maps are merged, as it stands in the file; see `merge_settings`.
     """
 
     network: NetworkSettings = dataclasses.field(default_factory=NetworkSettings)
     pipeline: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
     desk: DeskSettings = dataclasses.field(default_factory=DeskSettings)
+    merge: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def load_settings(path: Path | None) -> Settings:
@@ -49,3 +56,18 @@ def load_settings(path: Path | None) -> Settings:
     if path is None:
         return Settings()
     return build(Settings, read_toml(path), str(path))
+
+
+def merge_settings(settings: Settings, path: Path | None) -> MergeSettings:
+    """How maps are merged, for those who merge them: a robot has none of the libraries that this needs.
+
+    Args:
+        settings: read from the file.
+        path: of the file; for the error's text.
+
+    Raises:
+        SettingsError: names or values are wrong.
+    """
+    from merge.merging import MergeSettings
+
+    return build(MergeSettings, settings.merge, f"{path}: merge")

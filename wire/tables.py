@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import enum
 import sys
 import tomllib
 import types
@@ -36,7 +37,8 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     """Make a dataclass from a table; what is missing keeps its default.
 
     Args:
-        cls: a frozen dataclass whose fields are numbers, texts, flags, tuples or such dataclasses.
+        cls: a frozen dataclass whose fields are numbers, texts, flags, one of several texts (`StrEnum`),
+            tuples, such dataclasses, or tables that are taken as they are (`Mapping`).
         values: the table.
         where: for the error's text, for example `robot.toml: pipeline`.
 
@@ -73,6 +75,14 @@ def _convert(kind: Any, value: Any, where: str) -> Any:
     if origin in (types.UnionType, typing.Union):
         inner = [k for k in typing.get_args(kind) if k is not type(None)]
         return _convert(inner[0], value, where)
+    if origin is Mapping:
+        if not isinstance(value, Mapping):
+            raise SettingsError(f"{where}: must be a table")
+        return dict(value)
+    if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
+        if value not in list(kind):
+            raise SettingsError(f"{where}: {value!r} is none of {', '.join(kind)}")
+        return kind(value)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise SettingsError(f"{where}: must be a list")

@@ -57,7 +57,9 @@ def add_to(commands: Any) -> None:
         "--out", type=Path, metavar="DIR", help="map, links and picture (default: out/eval-merge/FOLDER)"
     )
     merge.add_argument("--json", action="store_true", help="print one JSON object at the end")
-    merge.add_argument("--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline")
+    merge.add_argument(
+        "--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline and the merge"
+    )
     merge.set_defaults(run=run_merge)
 
 
@@ -96,10 +98,12 @@ def run_merge(arguments: argparse.Namespace) -> int:
 
     from mapweave.commands.network import settings_of
     from mapweave.examination.merging import examine_merging
+    from mapweave.settings import merge_settings
 
-    pipeline = settings_of(arguments).pipeline
+    settings = settings_of(arguments)
+    merge = merge_settings(settings, arguments.settings)
     console = Console(stderr=True)
-    examination = examine_merging(arguments.folder, arguments.robots, pipeline, console)
+    examination = examine_merging(arguments.folder, arguments.robots, settings.pipeline, merge, console)
     report = examination.report()
     out = arguments.out or Path("out/eval-merge") / examination.name
     for path in examination.write(out):

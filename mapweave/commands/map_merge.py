@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hybridmap.node import MapId
     from hybridmap.ruling import Rulings
     from merge.merged import MergedMap
+    from merge.merging import MergeSettings
 
 
 def add_to(actions: Any) -> None:
@@ -25,20 +26,26 @@ def add_to(actions: Any) -> None:
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="a .mapweave file")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the merged map's file")
     parser.add_argument("--json", action="store_true", help="print the outcome as one JSON object")
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE", help="TOML; [merge] says which links are believed"
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Merge, write, say what has become of it."""
     from mapserver.mapfiles import map_file_of
+    from mapweave.commands.network import settings_of
     from mapweave.offline import parts_of
+    from mapweave.settings import merge_settings
     from merge.explanation_maps import explain_fleet
     from merge.merged import MergedMap
     from merge.parting import joinings
     from wire.mapfile import read_map_file, write_map_file
 
+    settings = merge_settings(settings_of(arguments), arguments.settings)
     maps, rulings = parts_of({path: read_map_file(path) for path in arguments.files})
-    merged = merged_with_progress(maps, rulings)
+    merged = merged_with_progress(maps, rulings, settings)
     write_map_file(arguments.out, map_file_of(merged))
     joined = joinings(MergedMap.empty(), merged)
     apart = [one.reason for one in explain_fleet(merged, 20) if not one.joined]
@@ -62,7 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def merged_with_progress(maps: dict[MapId, HybridMap], rulings: Rulings) -> MergedMap:
+def merged_with_progress(
+    maps: dict[MapId, HybridMap], rulings: Rulings, settings: MergeSettings | None = None
+) -> MergedMap:
     """Merge, with a bar on stderr for people."""
     from rich.console import Console
     from rich.progress import Progress
@@ -76,4 +85,4 @@ def merged_with_progress(maps: dict[MapId, HybridMap], rulings: Rulings) -> Merg
             words = "reading nodes" if done < of else "comparing and joining"
             bar.update(task, description=words, completed=done, total=of if done < of else None)
 
-        return merge_parts(maps, rulings, told)
+        return merge_parts(maps, rulings, told, settings)

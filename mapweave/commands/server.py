@@ -38,18 +38,20 @@ def run(arguments: argparse.Namespace) -> int:
     from hybridmap.node import check_name
     from mapserver.server import MapServer, ServerSettings
     from mapserver.web import Web, parse_address
+    from mapweave.settings import merge_settings
     from wire.bus_settings import BusSettings
     from wire.keys import Keys
     from wire.zenoh_bus import ZenohBus
 
     settings = settings_of(arguments)
+    merge = merge_settings(settings, arguments.settings)
     network = network_of(arguments, settings)
     name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
     address = parse_address(arguments.http) if arguments.http is not None else None
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
-        how = ServerSettings(lockstep=arguments.lockstep, desk=settings.desk)
+        how = ServerSettings(lockstep=arguments.lockstep, desk=settings.desk, merge=merge)
         with ExitStack() as stack:
             server = MapServer(bus, keys, arguments.data / f"{name}.sqlite", name, how)
             stack.enter_context(server)

@@ -42,7 +42,9 @@ def _add_fleet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--one-process", action="store_true", help="all robots in this process; the outcome is the same"
     )
-    parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML for the robots' pipeline")
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE", help="TOML for the robots' pipeline and the server's merge"
+    )
     parser.add_argument("--json", action="store_true", help="print figures and verdicts as one JSON object")
 
 

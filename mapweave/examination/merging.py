@@ -21,13 +21,14 @@ from hybridmap.errors import DeviceError, InvalidFile
 from hybridmap.node import Edge, MapId, NodeId
 from hybridmap.pose import Pose2
 from mapserver.mapfiles import map_file_of
-from mapserver.merger import Merger
+from mapserver.merger import Merger, MergerSettings
 from mapweave.examination.drive import Truth
 from mapweave.examination.pieces import pieces
 from mapweave.picture import MapPicture, draw_map
 from mapweave.scoring import FALSE_LINK, FALSE_LINK_TURN, link_recall, posture_error, score_map
 from merge.links import Link
 from merge.merged import MergedMap
+from merge.merging import MergeSettings
 from wire.mapfile import write_map_file
 
 FALSE_SHARE = 0.1
@@ -160,7 +161,7 @@ def changes(name: str, robot: Replay, settings: PipelineSettings) -> Iterator[li
 
 
 def examine_merging(
-    folder: Path, robots: int | None, settings: PipelineSettings, console: Console
+    folder: Path, robots: int | None, settings: PipelineSettings, merge: MergeSettings, console: Console
 ) -> MergeExamination:
     """Cut, map, merge.
 
@@ -168,6 +169,7 @@ def examine_merging(
         folder: the recording.
         robots: see `mapweave.examination.pieces.pieces`.
         settings: of every robot's pipeline.
+        merge: how the maps are merged.
         console: shows progress.
 
     Raises:
@@ -175,7 +177,7 @@ def examine_merging(
     """
     cut = pieces(folder, robots)
     truth = Truth.read(folder / "truth.csv")
-    merger = Merger()
+    merger = Merger(settings=MergerSettings(merging=merge))
     images = {}
     for name, robot in cut.items():
         images[name] = len(robot)

@@ -13,6 +13,7 @@ from agent.observation import Command
 from hybridmap.errors import MapweaveError
 from mapserver.server import MapServer, ServerSettings
 from mapweave.agent_process import Agent, AgentOptions
+from mapweave.settings import load_settings, merge_settings
 from mapweave.trial.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
 from sim.control import SimControl
 from sim.desk import ControlDesk
@@ -125,8 +126,8 @@ class LocalFleet:
     def start_server(self) -> None:
         """Start the server with the disk that is there."""
         self._stage.store.parent.mkdir(parents=True, exist_ok=True)
-        self._server_bus = MemoryBus(self._hub)
-        settings = ServerSettings(lockstep=True)
+        self._server_bus, file = MemoryBus(self._hub), self._stage.settings_file
+        settings = ServerSettings(lockstep=True, merge=merge_settings(load_settings(file), file))
         self._server = MapServer(self._server_bus, self.keys, self._stage.store, SERVER, settings)
         self._server.__enter__()
 

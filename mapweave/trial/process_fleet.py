@@ -82,9 +82,11 @@ class ProcessFleet:
             "--mission", stage.scenario.missions[robot],
             "--connect", _endpoint(port), "--body", _endpoint(self._body_port),
         ]  # fmt: skip
-        if stage.settings_file is not None:
-            arguments += ["--settings", str(stage.settings_file)]
-        self._children.start(robot, arguments)
+        self._children.start(robot, [*arguments, *self._settings()])
+
+    def _settings(self) -> list[str]:
+        file = self._stage.settings_file
+        return [] if file is None else ["--settings", str(file)]
 
     def kill_server(self) -> None:
         """SIGKILL; the router goes with it."""
@@ -96,7 +98,7 @@ class ProcessFleet:
         self._children.start(
             "server",
             ["server", "--listen", _endpoint(self._fleet_port), "--name", SERVER, "--fleet", FLEET,
-             "--data", str(self._stage.store.parent), "--lockstep"],
+             "--data", str(self._stage.store.parent), "--lockstep", *self._settings()],
         )  # fmt: skip
         self._until(self.bus.connected, "the map server does not come up")
 

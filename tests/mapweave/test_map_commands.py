@@ -89,6 +89,15 @@ def test_merging_in_steps_is_merging_at_once(files: list[Path], said: Said, tmp_
     assert (tmp_path / "three.mapweave").read_bytes() == files[3].read_bytes()
 
 
+def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_path: Path) -> None:
+    path, out = tmp_path / "strict.toml", tmp_path / "m.mapweave"
+    path.write_text("[merge.consistency]\nleast_links = 1000\noverwhelming_inliers = 1000\n")
+    told = said("map", "merge", *files[:3], "-o", out, "--json", "--settings", path)
+    assert json.loads(told)["links"] == 0
+    path.write_text("[merge]\noutliers = 'least squares'\n")
+    assert main(["map", "merge", *map(str, files[:3]), "-o", str(out), "--settings", str(path)]) == 1
+
+
 def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path: Path) -> None:
     pair = links(files[3])[0]
     picture = tmp_path / "pictures" / "link.png"

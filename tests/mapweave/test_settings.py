@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hybridmap.errors import SettingsError
-from mapweave.settings import Settings, load_settings
+from mapweave.settings import Settings, load_settings, merge_settings
+from merge.joining import Outliers
+from merge.merging import MergeSettings
 from wire.tables import build
 
 
@@ -73,7 +77,9 @@ def as_toml(values: dict[str, Any], name: str = "") -> str:
         if isinstance(value, dict):
             tables.append(as_toml(value, f"{name}.{key}" if name else key))
         elif value is not None:
-            text = list(value) if isinstance(value, tuple) else value
+            text = (
+                list(value) if isinstance(value, tuple) else str(value) if isinstance(value, str) else value
+            )
             plain.append(f"{key} = {str(text).lower() if isinstance(text, bool) else repr(text)}")
     return "\n".join([f"[{name}]" if name else "", *plain, *tables])
 
@@ -118,6 +124,45 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
 )
 def test_what_is_wrong_is_said_in_one_line(tmp_path, text, said):
     assert said in refused(tmp_path, text)
+
+
+def merging(tmp_path: Path, text: str) -> MergeSettings:
+    return merge_settings(load(tmp_path, text), tmp_path / "robot.toml")
+
+
+def test_the_merge_too_can_be_written_down_and_chosen(tmp_path):
+    default = MergeSettings()
+    assert merging(tmp_path, "") == default
+    assert merging(tmp_path, as_toml({"merge": dataclasses.asdict(default)})) == default
+    chosen = merging(tmp_path, "[merge]\noutliers = 'graduated'\n[merge.consistency]\ncliques = false")
+    consistency = dataclasses.replace(default.consistency, cliques=False)
+    assert chosen == dataclasses.replace(default, outliers=Outliers.GRADUATED, consistency=consistency)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("merge = 3", "merge: must be a table"),
+        ("[merge]\noutlier = 'none'", "merge: no setting 'outlier'; did you mean 'outliers'?"),
+        ("[merge]\noutliers = 'pcm'", "merge: outliers: 'pcm' is none of none, worst_first, graduated"),
+        ("[merge]\noutliers = 3", "merge: outliers: 3 is none of none, worst_first, graduated"),
+        ("[merge.consistency]\ncliques = 1", "merge: consistency: cliques: 1 is no bool"),
+    ],
+)
+def test_what_is_wrong_with_the_merge_is_said_in_one_line(tmp_path, text, said):
+    with pytest.raises(SettingsError) as error:
+        merging(tmp_path, text)
+    assert said in str(error.value) and "\n" not in str(error.value)
+    assert str(error.value).startswith(str(tmp_path / "robot.toml"))
+
+
+def test_a_robot_reads_the_file_without_what_a_merge_needs():
+    """gtsam, faiss and scipy are the server's; a robot may not have them."""
+    code = (
+        "import sys; from mapweave.settings import load_settings; load_settings(None); "
+        "sys.exit(', '.join({'gtsam', 'faiss', 'scipy'} & sys.modules.keys()) or None)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 def test_a_file_that_is_not_there(tmp_path):
