@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
