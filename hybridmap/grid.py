@@ -46,6 +46,10 @@ FINE_BITS = np.array(
     ]
 )
 """k of each share."""
+STEPS_PER_E = CELLS_PER_E << FINE_BITS
+"""Of the depth, by the share."""
+SHARES = SHARE_LEAST * np.exp((np.arange(SYMBOLS) - 1) / SHARES_PER_E)
+"""Sigma as a share of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +111,10 @@ class PixelGrid:
     def restore(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32]:
         """(N, 2) px of steps."""
         # Exact in float32: 16 bits scaled by a power of two, less a small integer.
-        scaled = np.stack([x, y], axis=1) * 2.0**-self.shift
-        return (scaled - (self.margin_x, self.margin_y)).astype(np.float32)
+        pixels = np.empty((len(x), 2), np.float32)
+        pixels[:, 0] = x * 2.0**-self.shift - self.margin_x
+        pixels[:, 1] = y * 2.0**-self.shift - self.margin_y
+        return pixels
 
 
 def round_depths(depths: NDArray[Any], sigmas: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -138,12 +144,9 @@ def restore_depths(
     share: NDArray[np.int64], depth: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depths and their sigmas, (N,) m, of steps: the middle of each step."""
-    known = share > 0
-    depths = np.full(len(share), np.nan)
-    steps_per_e = CELLS_PER_E << FINE_BITS[share[known]]
-    depths[known] = DEPTH_LEAST * np.exp((depth[known] + 0.5) / steps_per_e)
-    sigmas = depths * SHARE_LEAST * np.exp((share - 1) / SHARES_PER_E)
-    return depths.astype(np.float32), sigmas.astype(np.float32)
+    depths = DEPTH_LEAST * np.exp((depth + 0.5) / STEPS_PER_E[share])
+    depths[share == 0] = np.nan
+    return depths.astype(np.float32), (depths * SHARES[share]).astype(np.float32)
 
 
 def round_landmarks(landmarks: Landmarks, camera: Camera) -> Rounded:

@@ -31,6 +31,7 @@ MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 MAX_SHARED = MAX_LANDMARKS
 SINGLE = struct.Struct("<f")
+NO_RANGES = Ranges()
 MAX_EVIDENCE = 64
 
 NODE_PUT, NODE_RETIRED, EDGE_PUT, EDGE_RETIRED = 1, 2, 3, 4
@@ -173,7 +174,7 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
         landmarks=_read_landmarks(reader, camera),
         clock=reader.name("z") if reader.has("z") else "",
         radius=reader.integer("r", 0, MAX_RADIUS_MM) / 1000.0 if reader.has("r") else 0.0,
-        ranges=unpack_ranges(reader.binary("g", MAX_RANGE_BYTES)) if reader.has("g") else Ranges(),
+        ranges=unpack_ranges(reader.binary("g", MAX_RANGE_BYTES)) if reader.has("g") else NO_RANGES,
     )
 
 

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import dataclass
 from functools import cache
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +92,11 @@ def _code_columns() -> Columns:
 
 
 @cache
+def _all_columns() -> Columns:
+    return Columns((*_code_columns().columns, *_depth_columns()))
+
+
+@cache
 def _depth_columns() -> tuple[Column, Column]:
     return Column(landmark_tables().shares), Column(landmark_tables().cells)
 
@@ -133,20 +140,79 @@ def _unpack(data: bytes, with_depths: bool) -> tuple[Rounded, NDArray[np.uint8]]
         raise InvalidMessage(f"landmarks: flags {flags} do not go with them")
     if count > MAX_LANDMARKS:
         raise InvalidMessage(f"{count} landmarks, at most {MAX_LANDMARKS} are allowed")
-    bits = BitReader(body[HEAD.size :])
     ascending = bool(flags & ASCENDING)
     low = _low_bits(count, reach_y) if ascending else reach_y.bit_length()
-    high = _read_row(bits, count, reach_y >> low) if ascending else np.zeros(count, np.int64)
-    size = _lane_size(reach_x, low)
-    lanes = LaneReader(bits, count, size)
-    codes = lanes.pop_columns(_code_columns())
-    share, depth = _pop_depths(lanes) if with_depths else (np.zeros(count, np.int64),) * 2
-    bits.end()
-    seeds = lanes.states - (1 << size)
+    lay = _Layout(count, _lane_size(reach_x, low), reach_y >> low if ascending else None, with_depths)
+    seeds, high, codes, share, depth = _read(body[HEAD.size :], lay)
     x, y = least_x + (seeds >> low), least_y + (high << low | seeds & ((1 << low) - 1))
     if x.max(initial=0) > min(least_x + reach_x, 65535) or y.max(initial=0) > min(least_y + reach_y, 65535):
         raise InvalidMessage("landmarks: a pixel is out of range")
-    return Rounded(x, y, share, depth), np.ascontiguousarray(codes.T)
+    return Rounded(x, y, share, depth), codes
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What the head says of the bits behind it.
+
+    Attributes:
+        count: landmarks.
+        size: bits of a lane.
+        steps: of the row of high parts; None without a row.
+        with_depths: whether there are any.
+    """
+
+    count: int
+    size: int
+    steps: int | None
+    with_depths: bool
+
+
+_Parts = tuple[Ints, Ints, NDArray[np.uint8], Ints, Ints]
+"""What the lanes began with, high parts of y, (N, 32) codes, shares, depths."""
+
+
+def _read(data: bytes, lay: _Layout) -> _Parts:
+    compiled = _compiled()
+    if compiled is None:
+        return _read_by_columns(data, lay)
+    n, some = lay.count, lay.count if lay.with_depths else 0
+    high, states, share, depth = (np.zeros(k, np.int64) for k in (n, n, some, some))
+    codes = np.empty((n, CODE_BYTES), np.uint8)
+    verdict = compiled.unpack(
+        np.frombuffer(bytearray(data) + bytes(5), np.uint8), lay.size,
+        0 if lay.steps is None or not n else n + lay.steps,
+        *_all_columns().tables, FINE_BITS, high, states, codes, share, depth,
+    )  # fmt: skip
+    if verdict == compiled.CUT_OFF:
+        raise InvalidMessage("landmarks: cut off")
+    if verdict == compiled.WRONG_ROWS:
+        raise InvalidMessage(f"landmarks: the rows are not those of {n} landmarks")
+    if verdict == compiled.LEFT_OVER:
+        raise InvalidMessage("landmarks: more than there should be")
+    if not lay.with_depths:
+        share = depth = np.zeros(n, np.int64)
+    return states - (1 << lay.size), high, codes, share, depth
+
+
+def _read_by_columns(data: bytes, lay: _Layout) -> _Parts:
+    """The same where nothing can be compiled."""
+    bits, nothing = BitReader(data), np.zeros(lay.count, np.int64)
+    high = nothing if lay.steps is None else _read_row(bits, lay.count, lay.steps)
+    lanes = LaneReader(bits, lay.count, lay.size)
+    codes = np.ascontiguousarray(lanes.pop_columns(_code_columns()).T)
+    share, depth = _pop_depths(lanes) if lay.with_depths else (nothing, nothing)
+    bits.end()
+    return lanes.states - (1 << lay.size), high, codes, share, depth
+
+
+@cache
+def _compiled() -> ModuleType | None:
+    """wire.compiled_lanes, where this installation has a compiler for it."""
+    try:
+        from wire import compiled_lanes
+    except ImportError:
+        return None
+    return compiled_lanes
 
 
 def _push_depths(lanes: LaneWriter, rounded: Rounded) -> None:
@@ -191,6 +257,6 @@ def _read_row(bits: BitReader, count: int, steps: int) -> Ints:
     row = bits.read(np.ones(count + steps if count else 0, np.int64))
     ones = np.flatnonzero(row)
     if len(ones) != count:
-        raise InvalidMessage(f"landmarks: {len(ones)} rows for {count} landmarks")
+        raise InvalidMessage(f"landmarks: the rows are not those of {count} landmarks")
     high: Ints = ones - np.arange(count)
     return high

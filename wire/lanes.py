@@ -10,8 +10,7 @@ hold m bits of something else. All lanes move together: a column is a few operat
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache, cached_property
-from types import ModuleType
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,18 +145,8 @@ class LaneReader:
             InvalidMessage: there are not enough bits.
         """
         out = np.empty((len(columns.columns), len(self.states)), np.uint8)
-        compiled = _compiled()
-        if compiled is None:
-            for k, column in enumerate(columns.columns):
-                out[k] = self.pop(column)
-            return out
-        end = compiled.pop_columns(
-            self.states, self._size, self._bits.windows, self._bits.at, self._bits.length,
-            *columns.tables, out,
-        )  # fmt: skip
-        if end < 0:
-            raise InvalidMessage("landmarks: cut off")
-        self._bits.at = end
+        for k, column in enumerate(columns.columns):
+            out[k] = self.pop(column)
         return out
 
     def pop_plain(self, widths: Ints, lanes: Lanes = EVERY) -> Ints:
@@ -215,16 +204,6 @@ class BitReader:
         left = self.length - self.at
         if left >= 8 or self.read(np.array([left])).any():
             raise InvalidMessage("landmarks: more than there should be")
-
-
-@cache
-def _compiled() -> ModuleType | None:
-    """wire.compiled_lanes, where this installation has a compiler for it."""
-    try:
-        from wire import compiled_lanes
-    except ImportError:
-        return None
-    return compiled_lanes
 
 
 def pack_bits(numbers: Ints, widths: Ints) -> bytes:

@@ -71,14 +71,14 @@ def unpack_posture(data: bytes) -> PoseGaussian:
     """
     if len(data) != POSTURE.size:
         raise InvalidMessage(f"posture: {len(data)} bytes instead of {POSTURE.size}")
-    numbers = np.array(POSTURE.unpack(data))
+    x, y, heading, *upper = POSTURE.unpack(data)
     # Written so that NaN fails.
-    if not ((np.abs(numbers[:3]) <= MAX_POSITION).all() and (np.abs(numbers[3:]) <= MAX_POSITION**2).all()):
+    near = abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION and abs(heading) <= MAX_POSITION
+    if not (near and all(abs(number) <= MAX_POSITION**2 for number in upper)):
         raise InvalidMessage("posture: a number is not finite or out of range")
-    covariance = np.zeros((3, 3))
-    covariance[UPPER] = numbers[3:]
-    covariance = covariance + np.triu(covariance, 1).T
+    xx, xy, xh, yy, yh, hh = upper
+    covariance = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
     try:
-        return PoseGaussian(Pose2.from_vector(numbers[:3]), covariance)
+        return PoseGaussian(Pose2(x, y, heading), covariance)
     except InvalidValue as error:
         raise InvalidMessage(str(error)) from None

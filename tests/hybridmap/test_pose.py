@@ -104,6 +104,28 @@ def test_what_is_no_covariance_is_refused(covariance: np.ndarray) -> None:
         PoseGaussian(Pose2(), covariance)
 
 
+@pytest.mark.parametrize("seed", range(200))
+def test_what_counts_as_a_covariance_agrees_with_its_eigenvalues(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    values = 10.0 ** rng.uniform(-8, 3, 3) * rng.choice([1.0, 0.0], 3)
+    for beyond in (0.0, 0.5, 2.0, 1e6):
+        least = -1e-6 * beyond * max(values.max(), 1e-12)
+        one = turned @ np.diag([least, *values[1:]]) @ turned.T
+        one = 0.5 * (one + one.T)
+        told = np.linalg.eigvalsh(one)[0] / max(np.abs(one).max(), 1e-12)
+        if abs(told + 1e-6) > 1e-8:
+            assert accepted(one) == (told > -1e-6)
+
+
+def accepted(covariance: np.ndarray) -> bool:
+    try:
+        PoseGaussian(Pose2(), covariance)
+    except InvalidValue:
+        return False
+    return True
+
+
 def test_arrays_agree_with_single_postures() -> None:
     rng = np.random.default_rng(7)
     one = [

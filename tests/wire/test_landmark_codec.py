@@ -27,6 +27,7 @@ from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.recognition import Recognition, examine_nodes
 from hybridmap.selection import SelectionSettings, choose
+from wire import landmark_codec as codec
 from wire.codec import decode_body, encode_body, encode_change
 from wire.landmark_codec import (
     MAX_LANDMARKS,
@@ -243,6 +244,20 @@ def test_damage_is_noticed(some: SimpleNamespace, data: st.DataObject) -> None:
     assert "\n" not in str(error.value)
 
 
+def both_forms(packed: bytes) -> list[Landmarks | str]:
+    """What comes of the compiled decoder, and of NumPy's; a reason if it is none."""
+    assert codec._compiled() is not None, "numba is installed for tests"
+    found: list[Landmarks | str] = []
+    for form in (codec._compiled, lambda: None):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(codec, "_compiled", form)
+            try:
+                found.append(unpack_landmarks(packed, CAMERA))
+            except InvalidMessage as error:
+                found.append(str(error))
+    return found
+
+
 @settings(max_examples=300)
 @given(data)
 def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data: st.DataObject) -> None:
@@ -254,10 +269,13 @@ def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data:
     if data.draw(st.booleans()):
         bad = bad[: data.draw(st.integers(0, len(bad)))]
     forged = bytes(bad) + zlib.crc32(bad).to_bytes(4, "little")
-    try:
-        one = unpack_landmarks(forged, CAMERA)
-    except InvalidMessage:
+    compiled, plain = both_forms(forged)
+    if isinstance(compiled, str) or isinstance(plain, str):
+        assert compiled == plain
         return
+    one = compiled
+    for name in ("pixels", "codes", "depths", "depth_sigmas"):
+        assert getattr(one, name).tobytes() == getattr(plain, name).tobytes()
     assert np.isfinite(one.pixels).all()
     assert (one.depths[one.has_depth] > 0).all()
     packed = pack_landmarks(one, CAMERA)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridmap.errors import InvalidMessage
-from wire import lanes as module
 from wire.lanes import TOTAL, BitReader, Column, Columns, LaneReader, LaneWriter, pack_bits
 
 
@@ -41,14 +40,8 @@ def test_what_is_pushed_comes_back(seed: int, lanes: int, steps: int, size: int)
     bits.end()
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("seed", range(20))
-def test_many_columns_at_once_are_the_same_as_one_by_one(
-    seed: int, compiled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert module._compiled() is not None, "numba is installed for tests"
-    if not compiled:
-        monkeypatch.setattr(module, "_compiled", lambda: None)
+def test_many_columns_at_once_are_the_same_as_one_by_one(seed: int) -> None:
     random = np.random.default_rng(seed)
     lanes, size = int(random.integers(0, 200)), int(random.integers(12, 32))
     columns = Columns(tuple(some_column(random, int(random.integers(1, 60))) for _ in range(9)))
