@@ -43,7 +43,8 @@ class ConsistencySettings:
         place: nodes of a map that are nearer to each other see the same landmarks, m.
         chance: so many false sets at most may be expected between two pieces that are as good as the one
             that is kept.
-        dominance: how many times the landmarks of a contradicting set the kept set must have.
+        dominance: how many times the landmarks of a contradicting set the kept set must have, and how many
+            times its witnesses if that set would be believed without it.
         exact: up to as many links the best clique is searched exhaustively, beyond greedily.
         least_evidence: natural logarithm of the odds from which a link that is too little alone, or was
             contradicted, is believed where others join its two ends: how many witnesses are true for one that
@@ -186,13 +187,19 @@ def sort_links(
     support, against_it = int(landmarks[best].sum()), int(landmarks[rival].sum())
     weight, against = float(weights[best].sum()), float(weights[rival].sum())
     sets = tuple(kept), tuple(links[k] for k in rival)
+    chance = chances(distances2, spreads, first, second)
+    telling = np.array([link.telling for link in links])
+    own, others = (support_of(some, telling, agree, near, chance) for some in (best, rival))
     rivals: tuple[tuple[Link, ...], ...] = ()
     # In number and in places: a single place may bring many links however false they are.
     if not reason and (against_it * s.dominance > support or against * s.dominance > weight):
         reason = f"ambiguous: {support} landmarks support one way of joining, {against_it} another"
         rivals = sets
-    chance = chances(distances2, spreads, first, second)
-    telling = np.array([link.telling for link in links])
+    # One of two stories that would each be believed alone is false: landmarks and links do not tell which.
+    elif not reason and not _too_little(sets[1], s) and own.witnesses < s.dominance * others.witnesses:
+        places = f"{own.witnesses:.1f} independent places support one way of joining"
+        reason = f"ambiguous: {places}, {others.witnesses:.1f} another"
+        rivals = sets
     for k, link in enumerate(links):
         if k not in best:
             contradicts = f"contradicts {len(best)} links with {support} landmarks between the same maps"
@@ -205,7 +212,7 @@ def sort_links(
         rivals,
         weight,
         sets,
-        (support_of(best, telling, agree, near, chance), support_of(rival, telling, agree, near, chance)),
+        (own, others),
     )
 
 

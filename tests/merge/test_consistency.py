@@ -109,6 +109,27 @@ def test_two_stories_that_are_supported_alike_are_both_refused() -> None:
     assert len(found.refused) == 6 and all("ambiguous" in one.reason for one in found.refused)
 
 
+def test_one_place_is_not_believed_for_its_many_links_where_another_contradicts_it() -> None:
+    """A corner like another gave five links, the corridor that both came by four of half the weight."""
+    two = Two(8, n=16)
+    shift = Pose2(-8.0, 0.0, 0.0)
+    corner = [(0, 10), (0, 11), (1, 10), (1, 11), (1, 12)]
+    alike = [
+        link(two.a, i, two.b, j, two.tour_a[i].inverse() @ shift @ two.tour_b[j], two.rng, 30)
+        for i, j in corner
+    ]
+    true = [two.true_link(i, j, 15) for i, j in ((7, 7), (7, 8), (8, 7), (8, 8))]
+    assert len(sort_links(alike, two.a, two.b).kept) == 5
+    found = sort_links([*alike, *true], two.a, two.b)
+    assert not found.kept and len(found.rivals) == 2
+    assert all("ambiguous: 1.0 independent places" in one.reason for one in found.refused)
+    # One link that contradicts is no other story; and two further places decide between the two.
+    assert len(sort_links([*alike, true[0]], two.a, two.b).kept) == 5
+    more = [two.true_link(k, k, 50) for k in (0, 1, 14, 15)]
+    kept = {one.pair for one in sort_links([*alike, *true, *more], two.a, two.b).kept}
+    assert kept == {one.pair for one in [*true, *more]}
+
+
 def test_one_link_is_too_little_unless_overwhelming() -> None:
     two = Two(5)
     found = sort_links([two.true_link(2, 2)], two.a, two.b)
