@@ -61,7 +61,7 @@ def gather(seed: int, nodes: int, queries: int, bar: Progress) -> Seen:
         if sightings:
             best = max(sightings, key=lambda one: one.recognition.inliers)
             doubled = relocalizer.doubled(query.picture.view, best, ranked)
-        seen = relocalizer.places([*sightings, *doubled])
+        seen = relocalizer.judge.places([*sightings, *doubled])
         off = [errors(query, truth.get(place.best.node), place.best_from_robot) for place in seen]
         found.append((supported(seen), [m <= RIGHT_M and deg <= RIGHT_DEG for m, deg in off]))
     bar.update(task, completed=nodes + (len(KINDS) + 2) * queries)

@@ -32,5 +32,5 @@ class Answers:
     def of(cls, merger: Merger, merged: MergedMap) -> Answers:
         """Answers from a merged map; nodes that are newer are recognised, but lie nowhere yet."""
         places = LivingPlaces(merger.index, merger.node, merged)
-        relocalizer = Relocalizer(places, places.node, merged, doubles=merger.doubles)
+        relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Known(merged))

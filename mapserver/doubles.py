@@ -24,6 +24,7 @@ from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import View
 from hybridmap.recognition import Recognition, RecognitionSettings, register
 from mapserver.seenplaces import Sighting
+from merge.merged import MergedMap
 
 REMEMBERED = 20_000
 """Pairs of nodes whose verdict is kept, the last ones asked about."""
@@ -52,13 +53,30 @@ class Doubles:
         """`a_from_b` and what both show, or None if they do not look alike."""
         key = a.id, b.id
         known = self._kept.get(key)
-        if known is not None and known[0] is a and known[1] is b:
+        if known is not None and unchanged(known[0], a) and unchanged(known[1], b):
             return known[2]
         found = register(a, b, self._settings, np.random.default_rng(0))
         self._kept[key] = a, b, found
         while len(self._kept) > REMEMBERED:
             self._kept.popitem(last=False)
         return found
+
+
+def unchanged(one: Node, other: Node) -> bool:
+    """Whether two nodes of one id look the same: without faded landmarks one is made anew each time."""
+    if one is other:
+        return True
+    a, b = one.landmarks, other.landmarks
+    alike = one.id == other.id and one.stamp_ns == other.stamp_ns and one.camera == other.camera
+    return alike and np.array_equal(a.codes, b.codes) and np.array_equal(a.depths, b.depths, equal_nan=True)
+
+
+def between(merged: MergedMap, a: NodeId, b: NodeId) -> Pose2 | None:
+    """Posture `a_from_b` on a merged map; None if that does not join the two."""
+    component = merged.component_of(a)
+    if component is None or component != merged.component_of(b):
+        return None
+    return merged.pose(a).inverse() @ merged.pose(b)
 
 
 def carried(

@@ -11,7 +11,7 @@ from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
 from hybridmap.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
-from mapserver.doubles import Doubles
+from mapserver.lookalikes import LookAlikes
 from mapserver.placeindex import PlaceIndex
 from merge.candidates import CandidateSettings, Pair
 from merge.fading import Fader, FadingSettings
@@ -77,7 +77,7 @@ class Merger:
             settings: how.
         """
         self.index = index or PlaceIndex()
-        self.doubles = Doubles(RecognitionSettings())
+        self.alike = LookAlikes(RecognitionSettings())
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
         self.reaches = ReachBook()

@@ -46,11 +46,13 @@ class SeenPlace:
         sightings: of one place.
         best_from_robot: posture in the first one's frame, combined.
         features: of the view that they explain together.
+        nodes_around: another place, that tell of this one by what they look like; 0 if it was recognised.
     """
 
     sightings: list[Sighting]
     best_from_robot: PoseGaussian
     features: frozenset[int]
+    nodes_around: int = 0
 
     @property
     def best(self) -> Sighting:

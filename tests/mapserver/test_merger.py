@@ -14,6 +14,7 @@ from hybridmap.query import Certainty
 from hybridmap.recognition import examine_matches
 from hybridmap.route import RouteSettings
 from mapserver.belief import Support, probabilities
+from mapserver.judgement import JudgementSettings
 from mapserver.merger import Merger
 from mapserver.relocalization import RelocalizationSettings, Relocalizer
 from mapserver.routes import Router, RouterSettings
@@ -190,7 +191,10 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
     monkeypatch.setattr("mapserver.relocalization.examine_matches", counted)
     # Nobody suffices alone and nothing is faint: then every node that looks alike is examined.
     thorough = Relocalizer(
-        merger.index, merger.node, merger.merged(), RelocalizationSettings(alone=1000, faint=0.0)
+        merger.index,
+        merger.node,
+        merger.merged(),
+        RelocalizationSettings(judgement=JudgementSettings(alone=1000), faint=0.0),
     )
     quick, rng, counts = relocalizer(merger), np.random.default_rng(11), np.zeros(2, int)
     for stop in list(scene.truth.values())[::4]:

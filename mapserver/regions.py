@@ -1,0 +1,232 @@
+"""What a region of the map looks like elsewhere: told by the neighbours of a place, not by the place alone.
+
+A view of one of two rooms that look the same may be like no node of the other room, since nobody has looked
+there from that side. But the nodes around the place that was recognised have their doubles there, and all of
+them imply one and the same motion from room to room. Where that takes the robot it may be as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.node import MapId, Node, NodeId
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from mapserver.doubles import between, same_place
+from mapserver.lookalikes import LookAlike, LookAlikes, Retrieval
+from mapserver.seenplaces import Sighting
+from merge.merged import MergedMap
+
+UNTOLD_XY, UNTOLD_HEADING = 0.1, 0.05
+"""m and rad, what a way between two nodes of a map that is not merged may be off."""
+
+
+@dataclass(frozen=True)
+class RegionSettings:
+    """When the surroundings of a place count as being there twice.
+
+    Attributes:
+        least_nodes: nodes around it whose doubles imply the same motion. 0: regions are not looked at.
+        least_share: of the landmarks that the view shows, how many must lie on what these doubles show.
+        nodes: around a place that are asked at most.
+        first: that are asked before it is left, if none of them looks like anything.
+        reach: nodes farther from the robot are not asked, m.
+        beside: a landmark nearer than this to one that a double shows is shown by it too, m.
+    """
+
+    least_nodes: int = 2
+    least_share: float = 0.5
+    nodes: int = 8
+    first: int = 3
+    reach: float = 3.0
+    beside: float = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Counterpart:
+    """Where a robot may be as well, by what its surroundings look like.
+
+    Attributes:
+        node: the nearest there of those that look like a node here.
+        node_from_robot: posture there.
+        features: of the view, on what is there twice.
+        nodes: how many nodes here say so.
+    """
+
+    node: NodeId
+    node_from_robot: PoseGaussian
+    features: frozenset[int]
+    nodes: int
+
+
+Frame = int | MapId
+"""A component of the merged map, or a map that is not in it yet."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Vote:
+    """A node here and its double there.
+
+    Attributes:
+        here: the node.
+        alike: its double.
+        frame: in which that lies.
+        there: `frame_from_double`.
+        robot: `frame_from_robot`, by the two.
+        shown: (K, 3) m, landmarks here that the double shows too, in the frame here.
+    """
+
+    here: Node
+    alike: LookAlike
+    frame: Frame
+    there: Pose2
+    robot: Pose2
+    shown: Array
+
+
+class Regions:
+    """Finds counterparts of places. It stands for one merged map; make another for the next."""
+
+    def __init__(
+        self,
+        index: Retrieval,
+        node_of: Callable[[NodeId], Node | None],
+        merged: MergedMap,
+        alike: LookAlikes,
+        settings: RegionSettings,
+    ) -> None:
+        """Take what is known; which nodes look alike outlives the merged map."""
+        self._index, self._node_of, self._merged = index, node_of, merged
+        self._alike, self._settings = alike, settings
+
+    def prepare(self, node_id: NodeId) -> bool:
+        """Find out what a node looks like before anybody asks; False if that was known, or it is gone."""
+        node = self._node_of(node_id)
+        if node is None or self._alike.knows(node):
+            return False
+        self._look_alikes(node)
+        return True
+
+    def counterpart(self, seen: Sighting, ranked: Sequence[NodeId] = ()) -> Counterpart | None:
+        """Where else a robot may be.
+
+        Args:
+            seen: the node that was recognised best.
+            ranked: nodes that look like the view; of a map that is not merged yet no other neighbours are
+                known.
+
+        Returns:
+            The counterpart that shows most of what the view shows; None if there is none.
+        """
+        s, node = self._settings, self._node_of(seen.node)
+        if node is None or not s.least_nodes:
+            return None
+        frame, frame_from_node = self._placed(node)
+        robot = frame_from_node @ seen.recognition.node_from_robot.mean
+        landmarks, features = seen.recognition.pairs.T
+        points = frame_from_node.apply(node.points_in_robot[landmarks])
+        known = np.isfinite(points[:, 0])
+        points, features = points[known], features[known]
+        votes = self._votes(self._around(node, frame, robot, points, ranked), frame, robot)
+        best: tuple[list[_Vote], NDArray[np.bool_]] | None = None
+        for party in self._parties(votes):
+            shown = np.concatenate([vote.shown for vote in party])
+            away = np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1)
+            twice = away < s.beside
+            if twice.mean() >= s.least_share and (best is None or twice.sum() > best[1].sum()):
+                best = party, twice
+        return None if best is None else self._told(seen, node, best[0], features[best[1]])
+
+    def _told(
+        self, seen: Sighting, node: Node, party: Sequence[_Vote], features: NDArray[np.int64]
+    ) -> Counterpart:
+        """What a party says, by the node there that is nearest to the robot."""
+        chosen = min(party, key=lambda vote: (vote.robot.distance(vote.there), vote.alike.other.id))
+        robot = seen.recognition.node_from_robot
+        if chosen.here.id != node.id:
+            robot = self._way(chosen.here, node) @ robot
+        posture = chosen.alike.other_from_node @ robot
+        agreeing = len({vote.here.id for vote in party})
+        return Counterpart(chosen.alike.other.id, posture, frozenset(features.tolist()), agreeing)
+
+    def _around(
+        self, node: Node, frame: Frame, robot: Pose2, points: Array, ranked: Sequence[NodeId]
+    ) -> Iterator[Node]:
+        """The node, then others near the robot, first those that look at most of what it sees.
+
+        Args:
+            node: that was recognised.
+            frame: in which it lies.
+            robot: `frame_from_robot`.
+            points: (K, 3) m, what the robot sees, in the frame.
+            ranked: where to look for neighbours in a map that is not merged.
+        """
+        s = self._settings
+        if isinstance(frame, int):
+            graph = self._merged.graphs[frame]
+            away = np.hypot(graph.means[:, 0] - robot.x, graph.means[:, 1] - robot.y)
+            near = np.flatnonzero(away < s.reach)
+            near = near[np.argsort(away[near], kind="stable")][: 3 * s.nodes]
+            ids, means = [graph.nodes[k] for k in near.tolist()], graph.means[near]
+        else:
+            same = [one for one in ranked if one.map == frame and self._merged.component_of(one) is None]
+            nodes = [one for one in map(self._node_of, same) if one is not None]
+            ids, means = (
+                [one.id for one in nodes],
+                np.array([one.map_from_robot.mean.vector for one in nodes]),
+            )
+        yield node
+        if not ids:
+            return
+        way = points[None, :, :2] - means[:, None, :2]
+        bearings = np.arctan2(way[..., 1], way[..., 0]) - means[:, None, 2]
+        seen = np.cos(bearings) > math.cos(node.camera.semi_aperture)
+        for k in np.argsort(-seen.sum(axis=1), kind="stable")[: s.nodes].tolist():
+            one = self._node_of(ids[k])
+            if one is not None and one.id != node.id:
+                yield one
+
+    def _votes(self, around: Iterable[Node], frame: Frame, robot: Pose2) -> list[_Vote]:
+        """What the doubles of nodes say: none of the first few has one, and no others are asked."""
+        votes: list[_Vote] = []
+        for k, one in enumerate(around):
+            if k == self._settings.first and not votes:
+                break
+            frame_from_one = self._placed(one)[1]
+            for alike in self._look_alikes(one):
+                other_frame, there = self._placed(alike.other)
+                told = there @ alike.other_from_node.mean @ frame_from_one.inverse() @ robot
+                if other_frame == frame and same_place(told, robot):
+                    continue
+                shown = frame_from_one.apply(one.points_in_robot[alike.landmarks])
+                shown = shown[np.isfinite(shown[:, 0])]
+                votes.append(_Vote(one, alike, other_frame, there, told, shown))
+        return votes
+
+    def _parties(self, votes: Sequence[_Vote]) -> Iterator[list[_Vote]]:
+        """Votes of enough nodes for about the same posture."""
+        for vote in votes:
+            party = [one for one in votes if one.frame == vote.frame and same_place(one.robot, vote.robot)]
+            if len({one.here.id for one in party}) >= self._settings.least_nodes:
+                yield party
+
+    def _placed(self, node: Node) -> tuple[Frame, Pose2]:
+        """A node's frame, and `frame_from_node`."""
+        component = self._merged.component_of(node.id)
+        if component is None:
+            return node.id.map, node.map_from_robot.mean
+        return component, self._merged.pose(node.id)
+
+    def _way(self, a: Node, b: Node) -> PoseGaussian:
+        """`a_from_b` of two nodes in one frame; in a map that is not merged nobody says how surely."""
+        mean = self._placed(a)[1].inverse() @ self._placed(b)[1]
+        told = self._merged.relative(a.id, b.id)
+        return told or PoseGaussian.from_sigmas(mean, UNTOLD_XY, UNTOLD_HEADING)
+
+    def _look_alikes(self, node: Node) -> list[LookAlike]:
+        return self._alike.of(node, self._index, self._node_of, partial(between, self._merged))
