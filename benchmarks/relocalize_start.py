@@ -1,122 +1,166 @@
-"""How long a server with a large store takes to start, until its places are searchable.
+"""How long a server with a large store takes to start, until it answers lost robots rightly.
 
-    python -m benchmarks.relocalize_start [--nodes N] [--seed N] [--json]
+    python -m benchmarks.relocalize_start [--nodes N] [--seed N] [--store FOLDER] [--json]
 
-Fills a store with nodes as agents would send them, then opens it as a server does: once with nothing but the
-store, once with the place index that was saved beside it. Filling is not counted; it takes longer than both
-(about 2 ms a node), and 2 kB of disk a node. What the merge does with the nodes afterwards is not measured
-here: until it is done, places are found but lie in no merged frame.
+Fills a store with the logs of a fleet (benchmarks.relocalize_store), then starts a real `mapweave server` on
+it twice: with nothing but the store, and with the place index that the first one saved when it was ended.
+Robots ask over Zenoh where views near real places were taken, from the beginning; the clock stops when an
+answer comes back (`answer_s`), and runs from the start of the process. Then all questions are asked once,
+while the server still compares the maps: it does so beside the answers, and is not waited for.
+
+Filling takes about 3 ms of processor a node, and 4.5 kB of disk; with --store it is kept, and used again.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.relocalize_distractors import AGENT, Distractors, gather
-from benchmarks.relocalize_places import mapped, mapped_sites
-from hybridmap.change import Change, NodePut
-from hybridmap.grid import snap
-from hybridmap.node import MapId, Node
-from mapserver.entry import Entry
-from mapserver.placekeeper import SUFFIX, PlaceKeeper
-from mapserver.store import Store
-from wire.codec import encode_change
+from benchmarks.relocalize_distractors import gather
+from benchmarks.relocalize_places import Place, mapped, mapped_sites
+from benchmarks.relocalize_queries import Query, known
+from benchmarks.relocalize_score import judged, share
+from benchmarks.relocalize_store import fill
+from hybridmap.query import RelocalizeAnswer
+from mapserver.placekeeper import SUFFIX
+from mapweave.trial.children import Children, free_port
+from wire.bus_settings import BusSettings
+from wire.keys import Keys
+from wire.log_messages import decode_record
+from wire.messages import decode_relocalize_answer, encode_view
+from wire.zenoh_bus import ZenohBus
 
 REAL, DONORS = 1000, 800
 """Views behind the nodes: those of benchmarks.relocalize, which keeps its pictures."""
-AT_ONCE = 500
-"""Changes in one commit."""
-MAP = MapId(AGENT, 1)
+QUESTIONS = 100
+FLEET, NAME = "start", "s0"
+PATIENCE = 10.0
+"""For one answer, s."""
+LONGEST = 1800.0
+"""Until the first answer, s."""
 
 
-def fill(path: Path, distractors: Distractors, count: int, bar: Progress) -> None:
-    """Make the store."""
-    store, task = Store(path), bar.add_task("the store is filled", total=count)
-    for start in range(0, count, AT_ONCE):
-        entries = []
-        for number in range(start, min(start + AT_ONCE, count)):
-            node = distractors.node(number)
-            node = Node(node.id, 0, node.map_from_robot, node.camera, snap(node.landmarks, node.camera))
-            change = Change(MAP, number + 1, 0, NodePut(node))
-            entries.append(Entry(change.sequence, encode_change(change), change))
-            bar.advance(task)
-        store.apply(MAP, 1, entries)
-    store.close()
-
-
-def start(path: Path, count: int, bar: Progress) -> dict[str, float]:
-    """Open the store, take its nodes in, and stop again.
+def start(folder: Path, queries: Sequence[Query], places: Sequence[Place], bar: Progress) -> dict[str, float]:
+    """Start a server, ask, and end it.
 
     Returns:
-        Seconds for each part, and from the beginning until all places are searchable; of that also those of
-        processors, which a busy machine leaves nearly as they are.
+        Seconds from the start of the process: `answer_s`, of which of processors `answer_cpu_s`. Of all
+        questions then, while maps are compared: `right_share` of the answers "here" (`here_share`), their
+        times, and how many told a posture in a merged frame (`in_frame_share`). `peak_mb` of memory.
     """
-    task = bar.add_task("a server starts", total=count)
-    began, processor = time.perf_counter(), time.process_time()
-    store = Store(path)
-    opened = time.perf_counter()
-    keeper = PlaceKeeper(store, path)
-    restored = time.perf_counter()
-    nodes: list[Node] = []
-    for map_id in store.maps():
-        for change in store.replay(map_id):
-            if isinstance(change.body, NodePut):
-                nodes.append(change.body.node)
+    truth = {place.node.id: place for place in places}
+    endpoint, task = f"tcp/127.0.0.1:{free_port()}", bar.add_task("a server starts", total=len(queries))
+    with Children(folder / "logs") as children:
+        began = time.monotonic()
+        children.start(
+            NAME, ["server", "--fleet", FLEET, "--listen", endpoint, "--data", str(folder), "--name", NAME]
+        )
+        pid, bus = children.pid(NAME), ZenohBus(BusSettings(endpoints=(endpoint,)))
+        try:
+            while _ask(bus, queries[0]) is None:
+                children.check()
+                if time.monotonic() - began > LONGEST:
+                    raise SystemExit(f"no answer within {LONGEST:g} s")
+                time.sleep(0.05)
+            out = {"answer_s": time.monotonic() - began, "answer_cpu_s": _cpu(pid)}
+            took, replies, framed = [], [], 0
+            for query in queries:
+                asked = time.monotonic()
+                answer = _ask(bus, query)
+                if answer is not None:
+                    took.append(time.monotonic() - asked)
+                    reply = judged(query, answer, truth)
+                    replies.append(reply)
+                    best = answer.candidates[:1]
+                    framed += bool(best and best[0].merged_from_robot is not None)
                 bar.advance(task)
-    read = time.perf_counter()
-    keeper.index.extend(nodes)
-    keeper.index.settle()
-    done, spent = time.perf_counter(), time.process_time() - processor
-    assert len(keeper.index) == count
-    keeper.close()
-    store.close()
-    return {
-        "open_s": opened - began, "saved_index_s": restored - opened, "read_s": read - restored,
-        "index_s": done - read, "searchable_s": done - began, "searchable_cpu_s": spent,
-        "save_s": time.perf_counter() - done,
-    }  # fmt: skip
+            status = decode_record(bus.ask(Keys(FLEET).server_status(NAME), b"", PATIENCE)[0].payload)
+            here = [reply for reply in replies if reply.certainty == "found"]
+            out |= {
+                "answered_share": len(took) / len(queries), "here_share": len(here) / max(len(replies), 1),
+                "right_share": share(here, lambda reply: reply.near),
+                "in_frame_share": framed / max(sum(math.isfinite(r.error_m) for r in replies), 1),
+                "p50_ms": 1e3 * float(np.median(took)), "p95_ms": 1e3 * float(np.percentile(took, 95)),
+                "settled": float(bool(status["settled"])), "peak_mb": _peak_mb(pid),
+            }  # fmt: skip
+        finally:
+            bus.close()
+        began = time.monotonic()
+        children.end(NAME, 600.0)
+        out["end_s"] = time.monotonic() - began
+    return out
+
+
+def _ask(bus: ZenohBus, query: Query) -> RelocalizeAnswer | None:
+    """The answer; None while the server does not listen yet, or is busy."""
+    replies = bus.ask(Keys(FLEET).any_relocalize(), encode_view(query.picture.view), PATIENCE)
+    good = [reply for reply in replies if not reply.error]
+    return decode_relocalize_answer(good[0].payload) if good else None
+
+
+def _cpu(pid: int) -> float:
+    """Seconds of processors that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _peak_mb(pid: int) -> float:
+    """Most memory that a process has held."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
 
 
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.relocalize_start", description=__doc__.splitlines()[0]
+        prog="python -m benchmarks.relocalize_start", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--nodes", type=int, default=10_000, help="in the store (default 10000)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--store", type=Path, help="folder for the store, which is kept there and used again")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.nodes < 200 or arguments.seed < 0:
-        parser.error("at least 200 nodes and a seed that is not negative are needed")
-    console = Console(stderr=arguments.json)
+    if arguments.nodes < REAL or arguments.seed < 0:
+        parser.error(f"at least {REAL} nodes and a seed that is not negative are needed")
+    console, seed = Console(stderr=arguments.json), arguments.seed
     found: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(prefix="mapweave-start") as folder, Progress(console=console) as bar:
-        path = Path(folder) / "store.db"
-        task = bar.add_task("views", total=REAL + DONORS)
-        places = mapped(mapped_sites(arguments.seed), REAL, arguments.seed, lambda: bar.advance(task))
-        distractors = gather(DONORS, places, arguments.seed, lambda: bar.advance(task))
-        bar.update(task, completed=REAL + DONORS)
-        fill(path, distractors, arguments.nodes, bar)
-        for name in ("store_alone", "with_saved_index"):
-            found[name] = {key: round(value, 2) for key, value in start(path, arguments.nodes, bar).items()}
+    with tempfile.TemporaryDirectory(prefix="mapweave-start") as temporary, Progress(console=console) as bar:
+        folder = arguments.store or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        path, sites = folder / f"{NAME}.sqlite", mapped_sites(seed)
         saved = path.with_name(path.name + SUFFIX)
+        task = bar.add_task("views", total=REAL + DONORS + QUESTIONS)
+        places = mapped(sites, REAL, seed, lambda: bar.advance(task))
+        queries = known("near", QUESTIONS, sites, places, seed, lambda: bar.advance(task))
+        if not path.exists():
+            distractors = gather(DONORS, places, seed, lambda: bar.advance(task))
+            filling = bar.add_task("the store is filled", total=arguments.nodes)
+            fill(path, places, distractors, arguments.nodes, lambda more: bar.advance(filling, more))
+        bar.update(task, completed=REAL + DONORS + QUESTIONS)
+        saved.unlink(missing_ok=True)
+        for name in ("store_alone", "with_saved_index"):
+            found[name] = {key: round(one, 3) for key, one in start(folder, queries, places, bar).items()}
         found |= {"store_mb": round(path.stat().st_size / 1e6, 1)}
-        found |= {"saved_index_mb": round(saved.stat().st_size / 1e6, 1), "nodes": arguments.nodes}
-    table = Table("s", "store alone", "with the saved index", title=f"{arguments.nodes} nodes")
+        found |= {"saved_index_mb": round(saved.stat().st_size / 1e6, 1)}
+    table = Table("", "store alone", "with the saved index", title=f"{arguments.nodes} nodes")
     for key in found["store_alone"]:
         table.add_row(key, f"{found['store_alone'][key]:g}", f"{found['with_saved_index'][key]:g}")
     console.print(table)
     if arguments.json:
-        print(json.dumps({**found, "seed": arguments.seed}))
+        run = {"nodes": arguments.nodes, "seed": seed, "load": round(os.getloadavg()[0], 1)}
+        print(json.dumps({**found, **run}))
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+from hybridmap.node import Node, NodeId
 from mapserver.known import Known
 from mapserver.living import LivingPlaces
 from mapserver.merger import Merger
@@ -29,8 +31,8 @@ class Answers:
     known: Known
 
     @classmethod
-    def of(cls, merger: Merger, merged: MergedMap) -> Answers:
-        """Answers from a merged map; nodes that are newer are recognised, but lie nowhere yet."""
-        places = LivingPlaces(merger.index, merger.node, merged)
+    def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
+        """Answers from a merged map; nodes that are newer, of which `node_of` knows, lie nowhere yet."""
+        places = LivingPlaces(merger.index, node_of, merged)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Known(merged))

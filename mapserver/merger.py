@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
@@ -76,13 +77,15 @@ class Merger:
             index: is filled with the nodes that come; give it to a Relocalizer too.
             settings: how.
         """
-        self.index = index or PlaceIndex()
+        # An index in which there is nothing yet is one.
+        self.index = PlaceIndex() if index is None else index
         self.alike = LookAlikes(RecognitionSettings())
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
         self.reaches = ReachBook()
         self._settings = settings or MergerSettings()
         self._pairs = PairTable(self._settings.candidates)
+        self._uncompared: dict[NodeId, None] = {}
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._verdicts = Verdicts()
         self._islands = Islands(self._settings.merging)
@@ -93,6 +96,11 @@ class Merger:
         self._rulings = Rulings()
         self._merged = MergedMap.empty()
         self._dirty = False
+
+    @property
+    def uncompared(self) -> int:
+        """Nodes that were read and for which nobody has yet looked which others are like them."""
+        return len(self._uncompared)
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -120,7 +128,9 @@ class Merger:
         overlaps: Mapping[Pair, float] | None = None,
         links: Mapping[Pair, Link] | None = None,
     ) -> None:
-        """Take in many changes at once: a whole store at the start. Nodes are compared when they are merged.
+        """Take in many changes at once: a store at the start. Places can be found as soon as this returns.
+
+        Which are alike is looked for by `look_around`, or when they are merged; then they are compared.
 
         Args:
             log: what each map tells, in its order.
@@ -136,8 +146,7 @@ class Merger:
         fresh = [node for node_id in put if (node := self.node(node_id)) is not None]
         self.index.extend(fresh)
         if overlaps is None:
-            for node in fresh:
-                self._pairs.put(node.id, self.index.overlaps(node, self.node))
+            self._uncompared.update((node.id, None) for node in fresh)
         for (a, b), value in (overlaps or {}).items():
             self._pairs.put(a, {b: value})
         for pair, link in (links or {}).items():
@@ -151,6 +160,7 @@ class Merger:
     def merged(self) -> MergedMap:
         """The merged map of all that has come; made anew only if something has changed, and where it has."""
         if self._dirty:
+            self.look_around()
             changed = self._pairs.changed()
             self._verify(pair for pair in changed if pair in self._pairs)
             for pair in changed:
@@ -168,6 +178,18 @@ class Merger:
             self._touched = set()
             self._dirty = False
         return self._merged
+
+    def look_around(self, most: int | None = None) -> None:
+        """Look for what is like the nodes that were read, or like so many of them."""
+        for node_id in list(islice(self._uncompared, most)):
+            if (node := self.node(node_id)) is not None:
+                self._pairs.put(node_id, self.index.overlaps(node, self.node))
+            del self._uncompared[node_id]
+
+    def apart(self) -> MergedMap:
+        """The merged map if nobody had compared any two maps: a component for each part of each map."""
+        kept = {map_id: HybridMap(one.contents()) for map_id, one in self.maps.items()}
+        return Islands(self._settings.merging).merge(kept, Verdicts(), set(kept), self._rulings)
 
     def status(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
@@ -211,6 +233,7 @@ class Merger:
     def _forget(self, node_id: NodeId) -> None:
         """Drop what was found out about a node: it is gone, or is known better."""
         self._pairs.forget(node_id)
+        self._uncompared.pop(node_id, None)
         for other in self._known.pop(node_id, {}):
             del self._known[other][node_id]
 

@@ -167,14 +167,16 @@ class PlaceIndex:
             return {}
         with self._lock:
             alike = self._landmarks.within(node.landmarks.codes, s.alike)
-            if alike is None:
-                return self._voted(node, node_of)
-            rows, squared, ids = alike
-            columns, slots = ids & ((1 << SLOT_BITS) - 1), ids >> SLOT_BITS
-            found, values = tally.overlaps(rows, columns, squared, slots, s.alike, s.least_overlap)
-            told = zip(found.tolist(), values.tolist(), strict=True)
-            others = [(self._nodes[slot], value) for slot, value in told]
-        return {other: value for other, value in others if other != node.id}
+            if alike is not None:
+                rows, squared, ids = alike
+                columns, slots = ids & ((1 << SLOT_BITS) - 1), ids >> SLOT_BITS
+                found, values = tally.overlaps(rows, columns, squared, slots, s.alike, s.least_overlap)
+                told = zip(found.tolist(), values.tolist(), strict=True)
+                others = {self._nodes[slot]: value for slot, value in told}
+        if alike is None:
+            return self._voted(node, node_of)
+        others.pop(node.id, None)
+        return others
 
     def _voted(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
         s, codes = self._settings, node.landmarks.codes

@@ -7,9 +7,12 @@ import queue
 import threading
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import islice
 
-from hybridmap.change import Change
+from hybridmap.change import Change, NodePut
 from hybridmap.errors import MapweaveError
+from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
 from mapserver.merger import Merger, MergerSettings
@@ -20,8 +23,24 @@ from merge.parting import joinings, partings
 
 log = logging.getLogger(__name__)
 
+READ_AT_ONCE = 1024
+"""Changes of a store that are taken in at once: while these are, the next are decoded."""
+LONG = 500
+"""Nodes whose comparing takes so long that until then each map is told of by itself."""
+LOOK_AT_ONCE = 20
+"""Nodes for which is looked what is like them, before what has come meanwhile is taken in."""
 MOST_WORDS = 1000
 """Characters of an event in a status message."""
+
+
+@dataclass(frozen=True)
+class _Read:
+    """All of the store has been handed over; `taken` is set when it is taken in."""
+
+    taken: threading.Event = field(default_factory=threading.Event)
+
+
+News = Change | list[Change] | Rulings
 
 
 class Upkeep:
@@ -45,11 +64,11 @@ class Upkeep:
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
-        self._changes: queue.SimpleQueue[Change | list[Change] | Rulings | threading.Event | None] = (
-            queue.SimpleQueue()
-        )
-        self._answers = Answers.of(self._merger, MergedMap.empty())
-        self._dirty = False
+        self._changes: queue.SimpleQueue[News | threading.Event | _Read | None] = queue.SimpleQueue()
+        self._fresh: dict[NodeId, Node] = {}
+        self._answers = self._answers_from(MergedMap.empty())
+        self._compared = self._answers.merged
+        self._dirty = self._reading = False
         self._event = ""
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
@@ -75,13 +94,34 @@ class Upkeep:
         self._thread.start()
 
     def take(self, change: Change) -> None:
-        """Take note of a change, in the order of its log. Returns at once."""
+        """Take note of a change, in the order of its log. Returns at once.
+
+        A new place can be found from now on, however long a merge goes on: whoever merges takes the change in
+        when its turn comes, and what it makes of the index then is what holds.
+        """
+        if self._by_itself and isinstance(change.body, NodePut):
+            self._fresh[change.body.node.id] = change.body.node
+            self._merger.index.add(change.body.node)
         self._put(change)
 
     def read(self, changes: Iterable[Change]) -> None:
-        """Take note of many changes at once, map by map in the order of its log."""
-        if many := list(changes):
-            self._put(many)
+        """Take in all that is in a store, map by map in the order of its log, once this has started.
+
+        Returns when every place can be found. The maps are compared with each other afterwards.
+
+        Raises:
+            InvalidFile: the store is damaged.
+        """
+        rest = iter(changes)
+        self._reading = True
+        try:
+            while some := list(islice(rest, READ_AT_ONCE)):
+                self._put(some)
+        finally:
+            self._reading = False
+            end = _Read()
+            self._changes.put(end)
+        end.taken.wait()
 
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others. Returns at once."""
@@ -98,7 +138,7 @@ class Upkeep:
         self._changes.put(None)
         self._thread.join(30.0)
 
-    def _put(self, news: Change | list[Change] | Rulings) -> None:
+    def _put(self, news: News) -> None:
         with self._counting:
             self._came += 1
         self._changes.put(news)
@@ -108,9 +148,13 @@ class Upkeep:
         while True:
             pause = max(rest_until - time.monotonic(), 0.0)
             try:
-                waits = self._dirty and self._by_itself
+                # What comes in pieces is merged when it is whole.
+                waits = self._dirty and self._by_itself and not self._reading
                 change = self._changes.get(timeout=pause + 0.02 if waits else None)
             except queue.Empty:
+                if self._merger.uncompared:
+                    self._look_around()
+                    continue
                 began = time.monotonic()
                 self._merge()
                 spent = time.monotonic() - began
@@ -118,6 +162,11 @@ class Upkeep:
                 continue
             if change is None:
                 return
+            if isinstance(change, _Read):
+                change.taken.set()
+                if self._by_itself and self._merger.uncompared >= LONG:
+                    self._tell_apart()
+                continue
             if isinstance(change, threading.Event):
                 if self._dirty:
                     self._merge()
@@ -129,10 +178,17 @@ class Upkeep:
                 self._read(change)
             else:
                 self._apply(change)
+                if isinstance(change.body, NodePut):
+                    # A newer one of the same place may wait already.
+                    self._forget(change.body.node)
             self._applied += 1
             self._dirty = True
             if time.monotonic() > rest_until + 2.0:
                 rest_until = time.monotonic()
+
+    def _forget(self, node: Node) -> None:
+        if self._fresh.get(node.id) is node:
+            del self._fresh[node.id]
 
     def _read(self, changes: list[Change]) -> None:
         try:
@@ -150,12 +206,35 @@ class Upkeep:
         except Exception:  # a defect with one change must not end all merging
             log.exception("change %s of %s is not merged", change.sequence, change.map)
 
+    def _answers_from(self, merged: MergedMap) -> Answers:
+        return Answers.of(self._merger, merged, self._node)
+
+    def _node(self, node_id: NodeId) -> Node | None:
+        """A node, also one that is not with the merger yet."""
+        return self._fresh.get(node_id) or self._merger.node(node_id)
+
+    def _look_around(self) -> None:
+        """A little of what comes before the first merge: it must not hold up what comes."""
+        self._event = f"{self._merger.uncompared} nodes are still to be compared with others"
+        try:
+            self._merger.look_around(LOOK_AT_ONCE)
+        except Exception:  # the merge tries again, and says so if it cannot
+            log.exception("nodes could not be compared")
+            self._merge()
+
+    def _tell_apart(self) -> None:
+        """Answer from each map by itself, as its robot made it, until all are compared with each other."""
+        try:
+            self._answers = self._answers_from(self._merger.apart())
+        except Exception:  # as below
+            log.exception("the maps could not be told of one by one")
+
     def _merge(self) -> None:
         self._dirty = False
-        before = self._answers.merged
+        before = self._compared
         try:
             merged = self._merger.merged()
-            self._answers = Answers.of(self._merger, merged)
+            self._answers, self._compared = self._answers_from(merged), merged
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("the merged map could not be made anew")
             self._event = "the merged map could not be made anew: see the server's log"

@@ -50,6 +50,10 @@ class Children:
                 [sys.executable, "-m", "mapweave", *arguments], stdout=output, stderr=subprocess.STDOUT
             )
 
+    def pid(self, name: str) -> int:
+        """The process's number."""
+        return self._running[name].pid
+
     def check(self) -> None:
         """Raise ChildFailed if one has ended, with the last line that it said."""
         for name, process in self._running.items():

@@ -37,7 +37,7 @@ class Two:
                 self.merger.on_change(Change(map_id, number, 0, body))
 
     def answers(self) -> Answers:
-        return Answers.of(self.merger, self.merger.merged())
+        return Answers.of(self.merger, self.merger.merged(), self.merger.node)
 
     def view(self, map_id: MapId) -> View:
         return take_view(self.worlds[map_id], Pose2(2.1, 1.95, 0.15), np.random.default_rng(1))[0]
@@ -86,7 +86,7 @@ def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
     faded = replace(merged, faded={one: gone})
     shown = without_faded(node, faded)
     assert np.array_equal(shown.landmarks.pixels, node.landmarks.pixels[~gone])
-    answers = Answers.of(two.merger, faded)
+    answers = Answers.of(two.merger, faded, two.merger.node)
     legs = answers.router.route(NodeId("a", 1, 1), NodeId("a", 1, 5)).legs
     assert [len(leg.node.landmarks) for leg in legs if leg.node.id == one] == [len(shown.landmarks)]
     assert LivingPlaces(two.merger.index, two.merger.node, merged).node(one) is node

@@ -8,12 +8,16 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
+from benchmarks.synthetic import World, room, take_map, take_view
 from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
-from hybridmap.node import MapId
+from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
+from hybridmap.query import Certainty
 from hybridmap.ruling import Ruling, Rulings
+from mapserver import upkeep as module
 from mapserver.merger import Merger
+from mapserver.placeindex import PlaceIndex
+from mapserver.relocalization import NOWHERE
 from mapserver.upkeep import Upkeep
 from merge.merged import MergedMap
 
@@ -64,12 +68,12 @@ def test_a_store_that_is_read_at_once_merges_like_its_changes_one_by_one(
     merged = []
     for at_once in (True, False):
         upkeep = Upkeep(1.0)
+        upkeep.start()
         if at_once:
             upkeep.read(iter(changes))
         else:
             for change in changes:
                 upkeep.take(change)
-        upkeep.start()
         assert upkeep.settle(30)
         merged.append(upkeep.answers.merged)
         upkeep.close()
@@ -80,3 +84,98 @@ def test_a_store_that_is_read_at_once_merges_like_its_changes_one_by_one(
     for node, placement in one.postures.items():
         there = two.postures[node].merged_from_robot.mean
         assert placement.merged_from_robot.mean.distance(there) < 1e-9
+
+
+def mapped_room(agents: tuple[str, ...]) -> tuple[World, list[Pose2], list[Change]]:
+    """A room, where each robot stood in it, and their logs."""
+    rng = np.random.default_rng(1)
+    world = room(0, 0, 5, 4, 600, rng)
+    tour, changes = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)], []
+    for agent in agents:
+        bodies = [body for made in take_map(world, MapId(agent, 1), tour, rng) for body in made]
+        bodies = [NodePut(one) if isinstance(one, Node) else EdgePut(one) for one in bodies]
+        changes += [Change(MapId(agent, 1), k + 1, 0, body) for k, body in enumerate(bodies)]
+    return world, tour, changes
+
+
+def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, tour, changes = mapped_room(("a",))
+    view, _ = take_view(world, tour[1], np.random.default_rng(3))
+    entered, go, real = threading.Event(), threading.Event(), Merger.merged
+
+    def held(merger: Merger) -> MergedMap:
+        entered.set()
+        assert go.wait(20)
+        return real(merger)
+
+    monkeypatch.setattr(Merger, "merged", held)
+    upkeep = Upkeep(1.0)
+    upkeep.start()
+    upkeep.rule(Rulings())
+    assert entered.wait(20)
+    assert upkeep.answers.relocalizer.answer(view).certainty is Certainty.UNKNOWN
+    for change in changes:
+        upkeep.take(change)
+    began = time.monotonic()
+    answer = upkeep.answers.relocalizer.answer(view)
+    assert time.monotonic() - began < 1.0 and answer.certainty is Certainty.FOUND
+    best = answer.candidates[0]
+    assert best.component == NOWHERE and best.merged_from_robot is None
+    go.set()
+    assert upkeep.settle(20)
+    merged = upkeep.answers.relocalizer.answer(view).candidates[0]
+    assert merged.node == best.node and merged.component == 0 and merged.merged_from_robot is not None
+    upkeep.close()
+
+
+def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, tour, changes = mapped_room(("a", "b"))
+    view, _ = take_view(world, tour[1], np.random.default_rng(3))
+    go, real = threading.Event(), Merger.look_around
+
+    def held(merger: Merger, most: int | None = None) -> None:
+        assert go.wait(20)
+        real(merger, most)
+
+    monkeypatch.setattr(Merger, "look_around", held)
+    monkeypatch.setattr(module, "LONG", 1)
+    upkeep = Upkeep(1.0)
+    upkeep.start()
+    upkeep.read(iter(changes))
+    end = time.monotonic() + 20
+    while len(upkeep.answers.merged.components) != 2:
+        assert time.monotonic() < end
+        time.sleep(0.001)
+    assert not upkeep.settled and not upkeep.answers.merged.links
+    answer = upkeep.answers.relocalizer.answer(view)
+    assert {one.node.agent for one in answer.candidates} == {"a", "b"}
+    assert len({one.component for one in answer.candidates}) == 2
+    assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
+    go.set()
+    assert upkeep.settle(30)
+    answer = upkeep.answers.relocalizer.answer(view)
+    assert answer.certainty is Certainty.FOUND and len(upkeep.answers.merged.components) == 1
+    upkeep.close()
+
+
+def test_in_lockstep_the_index_takes_nothing_out_of_turn() -> None:
+    _, _, changes = mapped_room(("a",))
+    index = PlaceIndex()
+    upkeep = Upkeep(1.0, by_itself=False, index=index)
+    for change in changes:
+        upkeep.take(change)
+    assert len(index) == 0
+    upkeep.start()
+    assert upkeep.settle(20) and len(upkeep.answers.merged.postures) == len(index) == 4
+    upkeep.close()
+
+
+def test_an_index_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
+    """Whoever gave it saves it: a server's first start must leave a saved index, too."""
+    _, _, changes = mapped_room(("a",))
+    index = PlaceIndex()
+    upkeep = Upkeep(1.0, index=index)
+    upkeep.start()
+    upkeep.read(iter(changes))
+    assert len(index) == 4
+    upkeep.close()
