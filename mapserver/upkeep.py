@@ -25,8 +25,6 @@ log = logging.getLogger(__name__)
 
 READ_AT_ONCE = 1024
 """Changes of a store that are taken in at once: while these are, the next are decoded."""
-LONG = 500
-"""Nodes whose comparing takes so long that until then each map is told of by itself."""
 LOOK_AT_ONCE = 20
 """Nodes for which is looked what is like them, before what has come meanwhile is taken in."""
 MOST_WORDS = 1000
@@ -107,7 +105,8 @@ class Upkeep:
     def read(self, changes: Iterable[Change]) -> None:
         """Take in all that is in a store, map by map in the order of its log, once this has started.
 
-        Returns when every place can be found. The maps are compared with each other afterwards.
+        Returns when every place can be found, and lies in the frame of its own map. Maps are compared
+        with each other afterwards.
 
         Raises:
             InvalidFile: the store is damaged.
@@ -163,9 +162,9 @@ class Upkeep:
             if change is None:
                 return
             if isinstance(change, _Read):
-                change.taken.set()
-                if self._by_itself and self._merger.uncompared >= LONG:
+                if self._by_itself and self._merger.uncompared:
                     self._tell_apart()
+                change.taken.set()
                 continue
             if isinstance(change, threading.Event):
                 if self._dirty:
