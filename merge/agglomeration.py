@@ -9,7 +9,8 @@ piece are tested against it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
+from typing import TypeVar
 
 import networkx as nx
 
@@ -26,6 +27,8 @@ from merge.witnesses import FalseWitnesses
 Key = tuple[NodeId, NodeId]
 """Names of two pieces of map, smaller first."""
 
+P = TypeVar("P", NodeId, int)
+"""A piece of map, by whatever it is called."""
 CONTRADICTION = "contradicts better supported links by way of other maps"
 
 
@@ -72,11 +75,11 @@ def agglomerate(
             key: _beyond_chance(_sorted(links, key, groups, by_node, s), own[key], heard[key[0].map], s)
             for key, links in group_links(waiting, by_node).items()
         }
-        joined = _joined(pooled)
-        if not joined:
+        chosen = joined({key: found.weight for key, found in pooled.items() if found.kept}, pooled)
+        if not chosen:
             break
-        kept += [link for key in joined for link in pooled[key].kept]
-        through = {link.canonical().pair for key in joined for link in pooled[key].kept}
+        kept += [link for key in chosen for link in pooled[key].kept]
+        through = {link.canonical().pair for key in chosen for link in pooled[key].kept}
         waiting = [link for link in waiting if link.canonical().pair not in through]
     for found in pooled.values():
         refused |= {r.pair: r for r in found.refused if r.pair not in refused}
@@ -149,14 +152,45 @@ def _beyond_chance(
     return found.beyond_chance(heard.without(FalseWitnesses.of(one.supports[0] for one in own)), s)
 
 
-def _joined(pooled: Mapping[Key, Sorted]) -> list[Key]:
-    """Which pieces are joined in this round: those of which each is the other's best supported one."""
-    ranked = [key for key, found in sorted(pooled.items(), key=lambda x: (-x[1].weight, x[0])) if found.kept]
-    best: dict[NodeId, Key] = {}
-    for key in ranked:
-        for name in key:
-            best.setdefault(name, key)
-    return [key for key in ranked if best[key[0]] == best[key[1]] == key]
+def best_supported(weights: Mapping[tuple[P, P], float]) -> dict[P, tuple[P, P]]:
+    """Of each piece the two that are joined by the greatest weight: it and another one."""
+    best: dict[P, tuple[P, P]] = {}
+    for key in _ranked(weights):
+        for piece in key:
+            best.setdefault(piece, key)
+    return best
+
+
+def joined(weights: Mapping[tuple[P, P], float], tied: Container[tuple[P, P]]) -> list[tuple[P, P]]:
+    """Which pieces are joined in this round: those of which each is the other's best supported one.
+
+    A piece of which the other one has a better supported one is joined to it too, if no links at all tie it
+    to any of those: then they have nothing to say to each other, and whichever comes first is the same.
+
+    Args:
+        weights: behind the links that would join two pieces, the smaller first.
+        tied: pieces between which there are links at all.
+
+    Returns:
+        Best supported first.
+    """
+    best = best_supported(weights)
+    better: dict[P, list[P]] = {}
+    out = []
+    for key in _ranked(weights):
+        for one, other in (key, key[::-1]):
+            if best[one] == key and not any(
+                (min(one, rival), max(one, rival)) in tied for rival in better.get(other, ())
+            ):
+                out.append(key)
+                break
+        for one, other in (key, key[::-1]):
+            better.setdefault(one, []).append(other)
+    return out
+
+
+def _ranked(weights: Mapping[tuple[P, P], float]) -> list[tuple[P, P]]:
+    return sorted(weights, key=lambda key: (-weights[key], key))
 
 
 def _borne_out(
@@ -175,12 +209,33 @@ def _borne_out(
         inside.setdefault(piece.name, (piece.graph, []))[1].append(link)
     out: list[Link] = []
     for graph, here in inside.values():
-        fits = misfits(here, graph, s) < s.gate
-        known = standpoints(here, graph, kept=False)
-        out += [
-            link
-            for link, good, found in zip(here, fits, known, strict=True)
-            if found.log_factor > max(0.0, s.least_evidence - heard[link.a.map].log_odds)
-            or (good and link.canonical().pair in agreed)
-        ]
+        least = max(0.0, s.least_evidence - heard[here[0].a.map].log_odds)
+        good = borne_out(here, graph, agreed, least, s)
+        out += [link for link, yes in zip(here, good, strict=True) if yes]
+    return out
+
+
+def borne_out(
+    links: Sequence[Link],
+    graph: PoseGraph,
+    agreed: Container[tuple[NodeId, NodeId]],
+    least: float,
+    s: ConsistencySettings,
+) -> list[bool]:
+    """Of links within one piece, which it bears out.
+
+    Args:
+        links: with both ends in the piece.
+        graph: the piece.
+        agreed: links that others of their group agree with.
+        least: natural logarithm of Bayes' factor from which any other one is likely enough.
+        s: when links are believed.
+    """
+    if not s.cliques or not links:
+        return [True for _ in links]
+    fits = misfits(links, graph, s) < s.gate
+    out = [bool(good) and link.canonical().pair in agreed for link, good in zip(links, fits, strict=True)]
+    asked = [k for k, good in enumerate(out) if not good]
+    for k, found in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
+        out[k] = bool(found.log_factor > least)
     return out

@@ -8,6 +8,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.node import NodeId
 from merge.links import Link
 
 
@@ -45,8 +46,16 @@ def best_clique(agree: NDArray[np.bool_], weights: NDArray[np.int64], exact: int
     return best
 
 
-def independent_links(links: Sequence[Link]) -> int:
-    """How many links can be chosen of which no two have a node in common."""
+def independent_links(links: Sequence[Link], enough: int) -> int:
+    """How many links can be chosen of which no two have a node in common; it is not counted beyond enough."""
+    used: set[NodeId] = set()
+    chosen = 0
+    for link in links:
+        if used.isdisjoint(link.pair):
+            used.update(link.pair)
+            chosen += 1
+            if chosen >= enough:
+                return enough
     graph: nx.Graph = nx.Graph()
     graph.add_edges_from(link.pair for link in links)
-    return len(nx.max_weight_matching(graph, maxcardinality=True))
+    return min(len(nx.max_weight_matching(graph, maxcardinality=True)), enough)

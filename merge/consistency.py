@@ -254,7 +254,7 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
     telling = [link for link in kept if link.telling]
     if not telling or not place_told(kept):
         return f"what links show is found at other places too ({len(kept)} that agree)"
-    independent = independent_links(telling)
+    independent = independent_links(telling, s.least_links)
     if independent >= s.least_links:
         return ""
     for link in telling:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.sparse.linalg import splu
 
 from hybridmap.pose import Array
 from hybridmap.pose_arrays import adjoints, compose_poses, inverse_poses
-from merge.posegraph import Measurement
+from merge.posegraph import Measurement, factorized
 
 Rows = NDArray[np.int64]
 
@@ -194,20 +194,25 @@ def relax(
     """
     fixed = np.zeros(len(means), np.bool_)
     fixed[held] = True
-    before, wanted = means, s.least
-    while len(touched):
-        rows = factors.around(touched, wanted, len(means))
-        means = _moved(factors, means, rows[~fixed[rows]], huber, s)
+    if not len(touched):
+        return means, touched
+    before, rows = means, factors.around(touched, s.least, len(means))
+    # How far the change reaches is seen before it is worked out to the last digit.
+    rough = replace(s, step=max(s.step, 0.5 * min(s.rim_xy, s.rim_heading)))
+    while True:
+        means = _moved(factors, means, rows[~fixed[rows]], huber, rough)
         inside = np.zeros(len(means), np.bool_)
         inside[rows] = True
         index = factors.at(rows)
         a, b = factors.a[index], factors.b[index]
         rim = np.unique(np.concatenate([a[~inside[b]], b[~inside[a]]]))
         off = np.abs(compose_poses(inverse_poses(before[rim]), means[rim]))
-        if (off[:, :2] < s.rim_xy).all() and (off[:, 2] < s.rim_heading).all():
-            return means, rows
-        wanted = s.growth * len(rows)
-    return means, touched
+        moves = (off[:, :2] >= s.rim_xy).any(axis=1) | (off[:, 2] >= s.rim_heading)
+        if not moves.any():
+            return _moved(factors, means, rows[~fixed[rows]], huber, s), rows
+        # Where the rim stays, nothing more has to be moved.
+        more = math.ceil((s.growth - 1) * len(rows) * moves.mean())
+        rows = np.union1d(rows, factors.around(rim[moves], more, len(means)))
 
 
 def _moved(factors: Factors, means: Array, free: Rows, huber: float, s: RelaxSettings) -> Array:
@@ -224,7 +229,8 @@ def _moved(factors: Factors, means: Array, free: Rows, huber: float, s: RelaxSet
     for _ in range(s.rounds):
         information, pull = part.system(here, huber)
         inner = information[:n, :n]
-        step = splu((inner + sparse.diags(damping * inner.diagonal())).tocsc()).solve(pull[:n]).reshape(-1, 3)
+        damped = inner + sparse.diags(damping * inner.diagonal()) if damping else inner
+        step = factorized(damped).solve(pull[:n]).reshape(-1, 3)
         moved = here.copy()
         moved[: len(free)] = compose_poses(here[: len(free)], step)
         after = part.cost(moved, huber)

@@ -7,18 +7,21 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array
 from hybridmap.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 from merge.incremental_factors import Factors, Rows
-from merge.posegraph import ANCHOR_SIGMA, PoseGraph
+from merge.posegraph import ANCHOR_SIGMA, PoseGraph, factorized
 
 NEARBY = 300
-"""Nodes around a pair whose measurements say how the two stand to each other; more, if none joins them."""
-PAIRS_AT_ONCE = 64
+"""Nodes around pairs whose measurements say how these stand to each other; more, if none joins them ..."""
+AROUND = 4
+"""... and so many at least for each node of the pairs."""
+ROWS_AT_ONCE = 96
+"""Nodes for which it is worked out together."""
 
 
 class WideGraph(PoseGraph):
@@ -63,26 +66,53 @@ class WideGraph(PoseGraph):
         i, j = self.index(starts), self.index(ends)
         means = compose_poses(inverse_poses(self.means[i]), self.means[j])
         covariances = np.zeros((len(i), 3, 3))
-        left, wanted = np.flatnonzero(i != j), NEARBY
+        left, least = np.flatnonzero(i != j), NEARBY
         while len(left):
-            rows = self.factors.around(np.array([i[left[0]], j[left[0]]]), wanted, len(self.nodes))
-            order = np.full(len(self.nodes), len(rows))
-            order[rows] = np.arange(len(rows))
-            part = self._within(rows, order)
-            piece = _pieces(part, len(rows))
-            if piece[order[i[left[0]]]] != piece[order[j[left[0]]]]:
-                if len(rows) < wanted:
-                    raise ValueError(f"nothing joins {starts[left[0]]} and {ends[left[0]]}")
-                wanted = 4 * len(rows)
-                continue
-            # Pairs at the rim have too little around them: they get a neighbourhood of their own.
-            inner = np.maximum(order[i[left]], order[j[left]]) < max(len(rows) // 2, 2)
-            inner[0] = True
-            here = left[inner]
-            here = here[piece[order[i[here]]] == piece[order[j[here]]]]
-            covariances[here] = self._covariances(part, rows, order[i[here]], order[j[here]], means[here])
-            left, wanted = left[~np.isin(left, here)], NEARBY
+            apart = []
+            # Rows of one map are together, and what is near each other shares its surroundings.
+            for some in _shares(left[np.lexsort([j[left], i[left]])], i, j):
+                covariances[some], joined = self._covariances(i[some], j[some], means[some], least)
+                apart.append(some[~joined])
+            left = np.concatenate(apart)
+            if len(left) and least >= len(self.nodes):
+                k = int(left[0])
+                raise ValueError(f"nothing joins {starts[k]} and {ends[k]}")
+            least *= 4
         return PoseGaussians(means, covariances)
+
+    def _covariances(self, i: Rows, j: Rows, means: Array, least: int) -> tuple[Array, NDArray[np.bool_]]:
+        """Of pairs of rows, by what was measured around all of them.
+
+        Args:
+            i: (K,) rows.
+            j: (K,) rows.
+            means: (K, 3) of j in i.
+            least: nodes at least that are around them.
+
+        Returns:
+            (K, 3, 3); and (K,) whether what is around joins a pair: else its covariance means nothing.
+        """
+        seats, which = np.unique(np.concatenate([i, j]), return_inverse=True)
+        rows = self.factors.around(seats, max(least, AROUND * len(seats)), len(self.nodes))
+        order = np.full(len(self.nodes), len(rows))
+        order[rows] = np.arange(len(rows))
+        part = self._within(rows, order)
+        piece = _pieces(part, len(rows))
+        # Only differences count: one node of each piece is held.
+        held = np.zeros((len(rows), 3))
+        held[np.unique(piece, return_index=True)[1]] = ANCHOR_SIGMA**-2
+        information = part.system(self.means[rows], self.huber)[0] + sparse.diags(held.ravel())
+        columns = (3 * order[seats][:, None] + np.arange(3)).ravel()
+        right = np.zeros((3 * len(rows), len(columns)))
+        right[columns, np.arange(len(columns))] = 1.0
+        joint = factorized(information).solve(right)[columns]
+        joint = (0.5 * (joint + joint.T)).reshape(len(seats), 3, len(seats), 3)
+        one, two = np.split(which, 2)
+        ad = -adjoints(inverse_poses(means))
+        cross = ad @ joint[one, :, two, :]
+        out = ad @ joint[one, :, one, :] @ ad.transpose(0, 2, 1) + joint[two, :, two, :]
+        joined = piece[order[i]] == piece[order[j]]
+        return out + cross + cross.transpose(0, 2, 1), joined
 
     def _within(self, rows: Rows, order: Rows) -> Factors:
         """Measurements with both ends among the rows."""
@@ -90,28 +120,19 @@ class WideGraph(PoseGraph):
         both = (order[self.factors.a[index]] < len(rows)) & (order[self.factors.b[index]] < len(rows))
         return self.factors.take(index[both], order)
 
-    def _covariances(self, part: Factors, rows: Rows, i: Rows, j: Rows, means: Array) -> Array:
-        """(K, 3, 3) of pairs of rows of a part."""
-        information = part.system(self.means[rows], self.huber)[0]
-        # Only differences count: one node of each piece is held.
-        held = np.zeros((len(rows), 3))
-        held[np.unique(_pieces(part, len(rows)), return_index=True)[1]] = ANCHOR_SIGMA**-2
-        factor = splu(sparse.csc_matrix(information + sparse.diags(held.ravel())))
-        out = np.zeros((len(i), 3, 3))
-        for k in range(0, len(i), PAIRS_AT_ONCE):
-            some = slice(k, k + PAIRS_AT_ONCE)
-            seats, which = np.unique(np.concatenate([i[some], j[some]]), return_inverse=True)
-            columns = (3 * seats[:, None] + np.arange(3)).ravel()
-            right = np.zeros((3 * len(rows), len(columns)))
-            right[columns, np.arange(len(columns))] = 1.0
-            joint = factor.solve(right)[columns]
-            joint = (0.5 * (joint + joint.T)).reshape(len(seats), 3, len(seats), 3)
-            one, two = np.split(which, 2)
-            ad = -adjoints(inverse_poses(means[some]))
-            cross = ad @ joint[one, :, two, :]
-            out[some] = ad @ joint[one, :, one, :] @ ad.transpose(0, 2, 1) + joint[two, :, two, :]
-            out[some] += cross + cross.transpose(0, 2, 1)
-        return out
+
+def _shares(pairs: Rows, i: Rows, j: Rows) -> list[Rows]:
+    """Pairs of rows i and j, in their order, so many at a time that few rows are involved."""
+    out: list[list[int]] = []
+    involved: set[int] = set()
+    for k in pairs.tolist():
+        here = {int(i[k]), int(j[k])}
+        if not out or len(involved | here) > ROWS_AT_ONCE:
+            out.append([])
+            involved = set()
+        involved |= here
+        out[-1].append(k)
+    return [np.array(some, np.int64) for some in out]
 
 
 def _pieces(part: Factors, count: int) -> Rows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
@@ -173,21 +174,22 @@ class Assembly:
         names = [self._sheets[one].nodes for one in self._maps]
         return [names[seat][k] for seat, k in zip(seats.tolist(), local, strict=True)]
 
-    def move(self, before: Assembly, first: NodeId, second: NodeId, first_from_second: Pose2) -> None:
-        """Lay a component beside another one: the smaller of the two is moved.
+    def lay_together(self, before: Assembly, joins: Iterable[tuple[NodeId, NodeId, Pose2]]) -> None:
+        """Lay components beside each other: of two the smaller one is moved.
 
         Args:
-            before: the graph in which they are two components.
-            first: a node of the one.
-            second: a node of the other.
-            first_from_second: how the two nodes stand to each other.
+            before: the graph in which they are apart.
+            joins: a node of one component, a node of another, and how the second stands to the first.
         """
-        a, b = self.row(first), self.row(second)
-        sizes = [int((before.labels == before.labels[row]).sum()) for row in (a, b)]
-        if sizes[0] < sizes[1]:
-            a, b, first_from_second = b, a, first_from_second.inverse()
-        wanted = Pose2.from_vector(self.means[a]) @ first_from_second
-        self._carry(before.labels == before.labels[b], b, wanted)
+        labels = before.labels.copy()
+        for first, second, first_from_second in joins:
+            a, b = self.row(first), self.row(second)
+            some, others = labels == labels[a], labels == labels[b]
+            if some.sum() < others.sum():
+                a, b, some, others = b, a, others, some
+                first_from_second = first_from_second.inverse()
+            self._carry(others, b, Pose2.from_vector(self.means[a]) @ first_from_second)
+            labels[others] = labels[a]
 
     def in_their_frames(self) -> None:
         """Lay each component so that its smallest node is where its own map has it."""
@@ -205,9 +207,18 @@ class Assembly:
 
     def graph(self, label: int, huber: float) -> WideGraph:
         """A component by itself."""
-        rows = np.flatnonzero(self.labels == label)
+        rows, index = self._parts[label]
         row_of = np.zeros(len(self.labels), np.int64)
         row_of[rows] = np.arange(len(rows))
-        index = np.flatnonzero(self.labels[self.factors.a] == label)
         nodes = tuple(self.nodes_at(rows))
         return WideGraph(nodes[0], nodes, self.means[rows], self.factors.take(index, row_of), huber)
+
+    @cached_property
+    def _parts(self) -> list[tuple[Rows, Rows]]:
+        """Rows of each component, and its measurements, both ascending."""
+        count = int(self.labels.max(initial=-1)) + 1
+        parts = []
+        for labels in (self.labels, self.labels[self.factors.a]):
+            order = np.argsort(labels, kind="stable")
+            parts.append(np.split(order, np.cumsum(np.bincount(labels, minlength=count))[:-1]))
+        return list(zip(*parts, strict=True))

@@ -23,7 +23,7 @@ from merge.groups import LinkGroup
 from merge.incremental_clashes import clashing, neighbours
 from merge.incremental_factors import RelaxSettings, Rows, relax
 from merge.incremental_graph import WideGraph
-from merge.incremental_judgement import Judge
+from merge.incremental_joining import join
 from merge.incremental_ledger import Ledger, ends_of
 from merge.incremental_memory import Memory
 from merge.incremental_sheets import Assembly, MapPair, Sheet
@@ -130,11 +130,13 @@ class Steps:
         self._assemble()
         self._follow(self._touched)
         self._touched = set()
-        self._join(fresh)
+        self._all, more = join(
+            fresh, self._all, ledger, self._sheets, self._groups, self._settings, self._memory, self._settled
+        )
+        self._since += more
         if not whole and self._since - self._rough > self._steps.optimise_share * len(self._all.factors):
             self._rough = self._since
-            self._relax(np.arange(len(self._all.means)), len(self._all.means), believed=True)
-            self._keep()
+            self._relax_all(believed=True)
         self._settle(self._all.nodes_at(self._moved), whole, changed)
         if whole:
             self._since = self._rough = 0
@@ -147,8 +149,7 @@ class Steps:
             # Limited pull lets the wrong ones stand out; in a step they were tested before.
             for believed in (False, True) if whole else (True,):
                 if whole:
-                    self._relax(np.arange(len(self._all.means)), len(self._all.means), believed)
-                    self._keep()
+                    self._relax_all(believed)
                 else:
                     self._follow(touched)
                 lost = self._strained()
@@ -213,53 +214,37 @@ class Steps:
             if means is not sheet.means:
                 self._sheets[map_id] = replace(sheet, means=means)
 
-    def _follow(self, nodes: Iterable[NodeId]) -> None:
+    def _follow(self, nodes: Iterable[NodeId], how: RelaxSettings | None = None) -> None:
         """Optimise around nodes, as far as they are still there."""
         there = [node for node in nodes if node.map in self._sheets and node in self._sheets[node.map].rows]
-        self._relax(self._all.rows(sorted(there)), self._steps.relax.least, self._plain)
+        # On the way a tenth of a millimetre does; the last word is exact.
+        how = how or replace(self._steps.relax, step=1e-4)
+        if how.least >= len(self._all.means):
+            how = replace(how, step=self._steps.relax.step)
+        self._relax(self._all.rows(sorted(there)), how, self._plain)
         self._keep()
 
-    def _relax(self, rows: Rows, least: int, believed: bool) -> None:
-        # On the way a tenth of a millimetre does; the last word is exact.
-        step = self._steps.relax.step if least >= len(self._all.means) else 1e-4
-        held, how = self._all.anchors(), replace(self._steps.relax, least=least, step=step)
+    def _relax_all(self, believed: bool) -> None:
+        count = len(self._all.means)
+        self._relax(np.arange(count), replace(self._steps.relax, least=count), believed)
+        self._keep()
+
+    def _relax(self, rows: Rows, how: RelaxSettings, believed: bool) -> None:
+        held = self._all.anchors()
         huber = math.inf if believed else self._settings.huber
         self._all.means, moved = relax(self._all.factors, self._all.means, held, rows, huber, how)
         self._moved = np.union1d(self._moved, np.concatenate([moved, rows]))
 
-    def _join(self, fresh: Iterable[MapPair]) -> None:
-        """Believe links that the components bear out, and join components, as long as any can be."""
-        judge = Judge(self._settings, self._memory, self._sheets, self._groups)
-        for maps in [maps for maps in self._groups if maps not in self._ledger.waiting]:
-            del self._groups[maps]
-        open_, heard, last = set(fresh), set(fresh), False
-        while True:
-            standing = {
-                maps: (self._ledger.believed(maps), self._ledger.waiting.get(maps, {}))
-                for maps in sorted(open_)
-            }
-            believed, refused, joins = judge.round(self._all, standing, self._ledger.waiting, last)
-            self._ledger.tell(refused)
-            if not believed:
-                if last:
-                    return
-                open_, last = set(heard), True
-                continue
-            before = self._all
-            self._since += self._ledger.accept(believed)
-            self._all = Assembly(self._sheets, self._ledger.bundles)
-            for first, second, second_from_first in joins:
-                self._all.move(before, first, second, second_from_first)
-            self._all.in_their_frames()
-            self._follow({node for link in believed for node in link.pair})
-            # What has come to lie within one component can be tested now.
-            open_ = {
-                maps
-                for maps, links in self._ledger.waiting.items()
-                if (last and maps in heard)
-                or any(before.label(link.a) != before.label(link.b) for link in links.values())
-            }
-            heard |= open_
+    def _settled(self, whole: Assembly, nodes: set[NodeId], last: bool) -> Assembly:
+        """Optimise between two rounds of joining; all at once, if what was refused is heard once more."""
+        self._all = whole
+        if self._plain:
+            self._follow(nodes)
+        elif last:
+            self._relax_all(believed=False)
+        else:
+            self._follow(nodes, replace(self._steps.relax, rim_xy=3e-3, rim_heading=1e-3, step=1e-3))
+        return self._all
 
     def _strained(self) -> list[Link]:
         """Refuse the link that strains the most where something has moved, if it is too much."""

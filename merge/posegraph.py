@@ -86,7 +86,7 @@ class PoseGraph:
     @cached_property
     def _factor(self) -> Any:
         """Sparse factor of the information, for as many covariances as are asked for."""
-        return splu(self.information)
+        return factorized(self.information)
 
     def index(self, nodes: Sequence[NodeId]) -> NDArray[np.int64]:
         """(K,) rows of nodes."""
@@ -145,6 +145,16 @@ class PoseGraph:
         cross = ad @ joint[i, :, j, :]
         covariances = ad @ joint[i, :, i, :] @ ad.transpose(0, 2, 1) + joint[j, :, j, :]
         return PoseGaussians(means, covariances + cross + cross.transpose(0, 2, 1))
+
+
+def factorized(information: sparse.spmatrix) -> Any:
+    """Sparse factor of a symmetric positive definite matrix, which needs no pivots."""
+    return splu(
+        sparse.csc_matrix(information),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 def solve_graph(

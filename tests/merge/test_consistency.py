@@ -141,8 +141,8 @@ def test_links_at_one_node_are_one_witness() -> None:
     two = Two(6)
     found = sort_links([two.true_link(2, 2), two.true_link(2, 3)], two.a, two.b)
     assert not found.kept
-    assert independent_links([two.true_link(2, 2), two.true_link(2, 3)]) == 1
-    assert independent_links([two.true_link(2, 2), two.true_link(2, 3), two.true_link(3, 2)]) == 2
+    assert independent_links([two.true_link(2, 2), two.true_link(2, 3)], 9) == 1
+    assert independent_links([two.true_link(2, 2), two.true_link(2, 3), two.true_link(3, 2)], 9) == 2
 
 
 def test_loops_within_a_map_must_agree_with_its_own_way() -> None:

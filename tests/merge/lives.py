@@ -1,0 +1,130 @@
+"""Random lives of fleets, whose merges in steps are held against merges made anew."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.merge_fleets import FleetSettings, draw_fleet
+from hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.ruling import Ruling, Rulings
+from merge.candidates import Pair
+from merge.incremental_factors import RelaxSettings, relax
+from merge.incremental_graph import WideGraph
+from merge.incremental_verdicts import Verdict, Verdicts
+from merge.links import Link, RefusedLink
+from merge.merged import MergedMap
+from merge.merging import merge_maps
+from merge.undoing import undo
+
+SMALL = FleetSettings(robots=5, nodes=16, side=7.0, true_links=80, apart=6)
+
+DENSE = FleetSettings(robots=4, nodes=30, side=4.0, true_links=200, apart=6)
+
+
+class Life:
+    """Maps that grow and change at random, and what is found of their pairs of nodes."""
+
+    def __init__(self, seed: int, false_share: float, settings: FleetSettings = SMALL) -> None:
+        self.rng = np.random.default_rng(seed)
+        fleet = draw_fleet(false_share, self.rng, settings)
+        self.bodies = {map_id: list(one.contents()) for map_id, one in fleet.maps.items()}
+        for map_id in self.bodies:  # each node, then the edge that leads to it
+            nodes = [b for b in self.bodies[map_id] if isinstance(b, NodePut)]
+            edges = [b for b in self.bodies[map_id] if isinstance(b, EdgePut)]
+            self.bodies[map_id] = [b for two in zip(nodes, [None, *edges], strict=True) for b in two if b]
+        self.coming = {link.pair: link for link in fleet.links}
+        self.truth = fleet.truth
+        self.maps: dict[MapId, HybridMap] = {}
+        self.known: dict[Pair, Verdict] = {}
+        self.verdicts = Verdicts()
+        self.touched: set[MapId] = set()
+        self.rulings = Rulings()
+        self.number = 0
+
+    def there(self, pair: Pair) -> bool:
+        return all(node.map in self.maps and node in self.maps[node.map].nodes for node in pair)
+
+    def change(self, map_id: MapId, body: NodePut | EdgePut | NodeRetired | EdgeRetired) -> None:
+        one = HybridMap(self.maps[map_id].contents()) if map_id in self.maps else HybridMap()
+        one.apply(body)
+        self.maps[map_id] = one
+        self.touched.add(map_id)
+        for pair in [pair for pair in self.known if not self.there(pair)]:
+            self.tell(pair, None)
+
+    def tell(self, pair: Pair, verdict: Verdict | None) -> None:
+        if verdict is None:
+            self.known.pop(pair, None)
+            self.verdicts.drop(pair)
+        else:
+            self.known[pair] = verdict
+            self.verdicts.put(pair, verdict)
+        self.touched |= {pair[0].map, pair[1].map}
+
+    def step(self, quiet: bool = False) -> None:
+        """Something happens; most often the maps grow, always if it is quiet."""
+        rng, what = self.rng, 0.0 if quiet else self.rng.random()
+        open_ = [map_id for map_id, bodies in self.bodies.items() if bodies]
+        known = list(self.known)
+        if what < 0.7 and open_:
+            map_id = open_[int(rng.integers(len(open_)))]
+            for _ in range(min(4, len(self.bodies[map_id]))):
+                self.change(map_id, self.bodies[map_id].pop(0))
+            for pair in [pair for pair in self.coming if self.there(pair)]:
+                self.tell(pair, self.coming.pop(pair))
+        elif what < 0.78 and known:
+            pair = known[int(rng.integers(len(known)))]
+            self.tell(pair, RefusedLink(*pair, "looked again") if rng.random() < 0.5 else None)
+        elif what < 0.86 and self.maps:
+            map_id = sorted(self.maps)[int(rng.integers(len(self.maps)))]
+            nodes = sorted(self.maps[map_id].nodes)
+            if len(nodes) > 3:
+                self.change(map_id, NodeRetired(nodes[int(rng.integers(len(nodes)))]))
+        elif what < 0.94 and self.maps:
+            self._loop()
+        elif known:
+            pair = known[int(rng.integers(len(known)))]
+            ends = pair if rng.random() < 0.7 or pair[0].map == pair[1].map else (pair[0].map, pair[1].map)
+            self.number += 1
+            ruling = Ruling(ends, bool(rng.random() < 0.6), "anna", self.number)
+            self.rulings = self.rulings + Rulings([ruling])
+
+    def _loop(self) -> None:
+        """A robot recognises a place of its own, or drives there, and may be mistaken."""
+        rng = self.rng
+        map_id = sorted(self.maps)[int(rng.integers(len(self.maps)))]
+        nodes = sorted(self.maps[map_id].nodes)
+        if len(nodes) < 4:
+            return
+        a, b = (nodes[k] for k in sorted(rng.choice(len(nodes), 2, replace=False)))
+        off = Pose2.from_vector(rng.normal(0.0, 0.02 if rng.random() < 0.8 else 2.0, 3))
+        a_from_b = PoseGaussian.from_sigmas(self.truth[a].inverse() @ self.truth[b] @ off, 0.03, 0.02)
+        self.number += 1
+        kind = EdgeKind.LOOP if rng.random() < 0.6 else EdgeKind.DRIVEN
+        others = sorted(n for one in self.maps.values() for n in one.nodes if n.map != map_id)
+        if kind is EdgeKind.DRIVEN and others and rng.random() < 0.5:
+            b = others[int(rng.integers(len(others)))]
+        edge = Edge(EdgeId(map_id.agent, 1, 1000 + self.number), a, b, a_from_b, kind)
+        self.change(map_id, EdgePut(edge))
+
+    def anew(self) -> MergedMap:
+        links = [v for v in self.known.values() if isinstance(v, Link)]
+        refused = [v for v in self.known.values() if isinstance(v, RefusedLink)]
+        undone = undo(self.maps, links, self.rulings)
+        return undone.completed(merge_maps(undone.maps, undone.links, [*refused, *undone.refused]))
+
+
+def polished(merged: MergedMap, anew: MergedMap) -> dict[NodeId, Pose2]:
+    """Where the merge made anew has the nodes, optimised further: GTSAM stops a little before."""
+    found: dict[NodeId, Pose2] = {}
+    for graph in merged.graphs:
+        assert isinstance(graph, WideGraph)
+        means = np.array([anew.pose(node).vector for node in graph.nodes])
+        anchor = np.array([graph.rows[graph.anchor]])
+        everything = np.arange(len(means))
+        means, _ = relax(graph.factors, means, anchor, everything, graph.huber, RelaxSettings())
+        found |= {node: Pose2.from_vector(mean) for node, mean in zip(graph.nodes, means, strict=True)}
+    return found
