@@ -172,7 +172,8 @@ class Pipeline:
             case Carried() if self._passenger is None:
                 self._passenger = Passenger(self._mapper, self._settings.passenger)
             case GoTo(goal):
-                self._lose()
+                self._mapper.lose()
+                self._restart()
                 self._navigator = Navigator(
                     self._description, self._lens, self._sift, self.map, goal, self._settings.navigator,
                     self._settings.seed,
@@ -214,7 +215,7 @@ class Pipeline:
         started = self._mapper.started
         self._mapper.step(observation)
         if started and not self._mapper.started:
-            self._lose()
+            self._restart()
 
     def _map(
         self, observation: Observation, answers: tuple[Answer, ...]
@@ -247,9 +248,8 @@ class Pipeline:
         self._resumption = None
         return Command()
 
-    def _lose(self) -> None:
-        """Nobody knows any more where the robot is."""
-        self._mapper.lose()
+    def _restart(self) -> None:
+        """The mapper does not know any more where the robot is."""
         if self.map.nodes:
             if self._explorer is not None:
                 self._explorer.restart()

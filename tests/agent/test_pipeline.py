@@ -212,6 +212,15 @@ def test_what_the_wheels_did_without_a_mission_is_not_forgotten(walls):
         assert edge.a_from_b.mean.distance(true) < 0.05
 
 
+def test_who_is_carried_off_before_the_first_node_begins_anew(walls):
+    """There is no map yet to look on; what is seen there is where the map begins."""
+    pipeline, elsewhere = on(Carried()), np.rot90(still(walls).image, 2)
+    for tick in range(60):
+        image = still(walls).image if tick < 3 else elsewhere
+        status = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), image)).status
+    assert status.doing == "mapping while carried" and status.tracked > 20
+
+
 # Questions
 
 
