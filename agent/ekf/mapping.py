@@ -17,6 +17,7 @@ from agent.ekf.gating import MEDIAN, Judgement, believe, believe_some, pixel_gat
 from agent.ekf.landmarks import Ids, LandmarkEstimates
 from agent.ekf.motion import WheelNoise
 from agent.ekf.moving_state import MovingState, Step
+from agent.ekf.nod import evident_nod
 from agent.ekf.pixel_noise import PixelNoise
 from agent.ekf.report import Health, UpdateReport
 from agent.ekf.settings import FilterSettings
@@ -135,12 +136,13 @@ class MappingFilter:
         if not len(seen.slots):
             self._watch.saw(Health.BLIND, "no landmark of the filter is in view")
             return UpdateReport.blind(ids, "no landmark of the filter is in view")
-        by_wheels, variances = self._step, self._noise.variances
-        if by_wheels is not None and s.relinearisations and len(seen.slots) >= s.least_agreeing:
-            self._step, found = by_wheels.glanced(seen.slots, seen.slopes, variances, s.slip_sigmas)
-        else:
-            expected = self.state
-            found = kernels.examine(expected.rays, expected.covariance, seen.slots, seen.slopes, variances)
+        by_wheels = self._step
+        self._step, found = seen.compared(by_wheels, self._settled, self._noise.variances, s)
+        if not found[2] <= self._gate:
+            nod = evident_nod(found[0], self._spread(seen.slots), seen.slopes)
+            if nod is not None:
+                seen = seen._replace(slopes=seen.slopes - nod)
+                self._step, found = seen.compared(by_wheels, self._settled, self._noise.variances, s)
         judged = self._judge(seen, *found)
         nis, health, reason = math.nan, judged.health, judged.reason
         if judged.agreeing:

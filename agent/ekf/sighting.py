@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from agent.ekf import kernels
 from agent.ekf.landmarks import Ids
+from agent.ekf.moving_state import Examined, MovingState, Step
 from agent.ekf.report import Health, UpdateReport
+from agent.ekf.settings import FilterSettings
 from hybridmap.camera import Camera
 from hybridmap.pose import Array
 
@@ -71,6 +73,25 @@ class Sighting(NamedTuple):
             pinhole.focal,
         )
         return Sighting(ids, slots, rows, slopes, pinhole.focal)
+
+    def compared(
+        self, step: Step | None, settled: MovingState, variances: Array, settings: FilterSettings
+    ) -> tuple[Step | None, Examined]:
+        """Hold an image beside what was expected of it.
+
+        Args:
+            step: that brought the robot to where the image was taken, if there was one.
+            settled: the state before it.
+            variances: (2,) of a slope.
+            settings: of the filter.
+
+        Returns:
+            The step, linearised where it seems to have gone, and what came out.
+        """
+        if step is not None and settings.relinearisations and len(self.slots) >= settings.least_agreeing:
+            return step.glanced(self.slots, self.slopes, variances, settings.slip_sigmas)
+        expected = settled if step is None else step.state
+        return step, kernels.examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)
 
     def report(
         self, believed: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
