@@ -62,9 +62,38 @@ class Cells:
             part = slice(start, start + BLOCK)
             self._put(block.codes[part].astype(np.float32), block.ids[part], block.cells[part])
 
-    def remove(self, first: int, last: int) -> None:
-        """Forget the ids from first to last, that one left out."""
-        self._index.remove_ids(faiss.IDSelectorRange(first, last))
+    def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
+        """Forget the ids from first to last, that one left out.
+
+        Args:
+            first: id.
+            last: id.
+            codes: (N, 32) of all of them, in any order: says in which cells they lie. Without it, or if it
+                is not true, the ids in all cells are looked through.
+        """
+        left = None if codes is None else len(codes) - self._taken_out(first, last, codes)
+        if left != 0:
+            self._index.remove_ids(faiss.IDSelectorRange(first, last))
+
+    def _taken_out(self, first: int, last: int, codes: Codes) -> int:
+        """Forget those that lie where they should; how many they were."""
+        lists: Any = self._index.invlists
+        count = 0
+        for cell in np.unique(self.means.nearest(codes.astype(np.float32))).tolist():
+            size = lists.list_size(cell)
+            ids = faiss.rev_swig_ptr(lists.get_ids(cell), size) if size else np.zeros(0, np.int64)
+            inside = np.flatnonzero((ids >= first) & (ids < last))
+            # From the back: the last of the cell takes the place of each.
+            for at in inside[::-1].tolist():
+                size -= 1
+                lists.update_entry(
+                    cell, at, lists.get_single_id(cell, size), lists.get_single_code(cell, size)
+                )
+            if len(inside):
+                lists.resize(cell, size)
+                count += len(inside)
+        self._index.ntotal -= count
+        return count
 
     def nearest(self, codes: Codes, k: int, probes: int) -> tuple[Vectors, Ids]:
         """The k nearest landmarks in the nearest cells.

@@ -57,10 +57,11 @@ class Came(NamedTuple):
 
 
 class Gone(NamedTuple):
-    """Ids that went while cells were learned, the last one left out."""
+    """Ids that went while cells were learned, the last one left out, and their codes if they are known."""
 
     first: int
     last: int
+    codes: Codes | None
 
 
 class LandmarkIndex:
@@ -104,15 +105,15 @@ class LandmarkIndex:
                 self._flat.add_with_ids(decode(codes), ids)
             self._grow()
 
-    def remove(self, first: int, last: int) -> None:
-        """Forget the ids from first to last, that one left out."""
+    def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
+        """Forget the ids from first to last, that one left out; quickly, if all their codes are known."""
         with self.lock:
             if self._learner is not None:
-                self._missed.append(Gone(first, last))
+                self._missed.append(Gone(first, last, codes))
             if self._flat is not None:
                 self._flat.remove_ids(faiss.IDSelectorRange(first, last))
             if self._cells is not None:
-                self._cells.remove(first, last)
+                self._cells.remove(first, last, codes)
 
     def nearest(self, codes: Codes, k: int) -> tuple[Vectors, Ids]:
         """(N, k) squared distances and ids of the nearest landmarks, nearest first; id -1 is none."""
@@ -237,4 +238,4 @@ def _catch_up(cells: Cells, missed: list[Came | Gone]) -> None:
         if isinstance(one, Came):
             cells.add(one.codes, one.ids)
         else:
-            cells.remove(one.first, one.last)
+            cells.remove(one.first, one.last, one.codes)

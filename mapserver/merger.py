@@ -200,6 +200,7 @@ class Merger:
         one = self.maps.setdefault(map_id, HybridMap())
         self._touched.add(map_id)
         self._dirty = True
+        gone = one.nodes.get(body.id) if isinstance(body, NodeRetired) else None
         for edge in _dropped(one, body):
             if edge.kind is not EdgeKind.DRIVEN:
                 self._pairs.disconnect(edge.a, edge.b)
@@ -209,7 +210,7 @@ class Merger:
                 self._forget(node.id)
             case NodeRetired(node_id):
                 self._forget(node_id)
-                self.index.remove(node_id)
+                self.index.remove(node_id, None if gone is None else gone.landmarks.codes)
             case EdgePut(edge):
                 # Nodes so near to each other on a robot's way are not compared: it tells nothing new. A
                 # later drive says nothing of that; it may lead from map to map.

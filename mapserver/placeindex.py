@@ -102,13 +102,21 @@ class PlaceIndex:
             with self._lock:
                 self._take(some)
 
-    def remove(self, node_id: NodeId) -> None:
-        """Forget a node. One that is not there is no error."""
+    def remove(self, node_id: NodeId, codes: NDArray[np.uint8] | None = None) -> None:
+        """Forget a node. One that is not there is no error.
+
+        Args:
+            node_id: which.
+            codes: (N, 32) of its landmarks, if they are known: they say where in the index it is.
+        """
         with self._lock:
             slot = self._slots.pop(node_id, None)
             if slot is not None:
-                del self._nodes[slot], self._prints[slot]
-                self._landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS)
+                seal = self._prints.pop(slot)
+                del self._nodes[slot]
+                # Others than those that are there would leave some behind.
+                codes = codes if codes is not None and fingerprint(codes) == seal else None
+                self._landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS, codes)
 
     def retain(self, node_ids: Collection[NodeId]) -> int:
         """Forget all nodes but these, and say how many they were."""

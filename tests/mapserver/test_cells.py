@@ -88,3 +88,27 @@ def test_fewer_landmarks_than_cells() -> None:
     cells = filled(codes, np.arange(3), 64)
     squared, ids = cells.nearest(codes, 4, probes=64)
     assert ids[:, 0].tolist() == [0, 1, 2] and np.allclose(squared[:, 0], 0.0) and (ids[:, 3] == -1).all()
+
+
+@pytest.mark.parametrize("told", ["all", "others"])
+def test_what_is_forgotten_where_it_lies_is_gone_like_what_is_looked_for(
+    landmarks: tuple[Codes, Ids], told: str
+) -> None:
+    codes, ids = landmarks
+    ids = np.argsort(np.argsort(ids))
+    cells, searched = filled(codes, ids, 64), filled(codes, ids, 64)
+    lists = cells._index
+    for first in (0, 700, 2900):
+        gone = codes[(ids >= first) & (ids < first + 100)]
+        # Whoever is wrong about the codes makes it slow, not false.
+        cells.remove(first, first + 100, gone[::-1] if told == "all" else 63 - gone)
+        searched.remove(first, first + 100)
+    assert len(cells) == len(searched) == 2700
+    for one, other in zip(contents(cells), contents(searched), strict=True):
+        assert np.array_equal(one, other)
+    assert sum(lists.invlists.list_size(k) for k in range(lists.nlist)) == 2700
+    questions = asked(codes, 50, 4)
+    for one, other in zip(cells.nearest(questions, 8, 64), searched.nearest(questions, 8, 64), strict=True):
+        assert np.array_equal(np.sort(one, axis=1), np.sort(other, axis=1))
+    cells.add(codes[:100], np.arange(10_000, 10_100))
+    assert len(cells) == 2800

@@ -9,7 +9,7 @@ from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
 from mapserver.landmarkindex import LandmarkIndexSettings
-from mapserver.placeindex import PlaceIndex, PlaceIndexSettings
+from mapserver.placeindex import SLOT_BITS, PlaceIndex, PlaceIndexSettings
 from merge.candidates import overlaps
 
 
@@ -143,6 +143,21 @@ def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[N
     index.remove(nodes[0].id)
     index.add(nodes[0])
     assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes)
+
+
+@pytest.mark.parametrize("told", ["its own", "some of them", "another's", "none"])
+def test_a_node_is_gone_whatever_one_says_of_its_landmarks(
+    building: tuple[World, list[Node], list[Pose2]], told: str
+) -> None:
+    nodes = building[1]
+    index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=100, exact=100)))
+    index.extend(nodes)
+    before, codes = len(index.landmarks), nodes[3].landmarks.codes
+    known = {"its own": codes, "some of them": codes[:5], "another's": nodes[4].landmarks.codes, "none": None}
+    index.remove(nodes[3].id, known[told])
+    assert len(index.landmarks) == before - len(codes)
+    left = np.concatenate([block.ids >> SLOT_BITS for block in index.landmarks.blocks()])
+    assert set(left.tolist()) == set(index.slots.values())
 
 
 def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pose2]]) -> None:
