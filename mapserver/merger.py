@@ -12,6 +12,7 @@ from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
 from hybridmap.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
+from mapserver.findings import Findings, Recollection, print_of
 from mapserver.lookalikes import LookAlikes
 from mapserver.placeindex import PlaceIndex
 from merge.candidates import CandidateSettings, Pair
@@ -83,16 +84,18 @@ class Merger:
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
         self.reaches = ReachBook()
-        self._settings = settings or MergerSettings()
-        self._pairs = PairTable(self._settings.candidates)
+        self.settings = settings or MergerSettings()
+        self._before: Recollection | None = None
+        self._prints: dict[NodeId, tuple[Node, bytes]] = {}
+        self._pairs = PairTable(self.settings.candidates)
         self._uncompared: dict[NodeId, None] = {}
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._verdicts = Verdicts()
-        self._islands = Islands(self._settings.merging)
+        self._islands = Islands(self.settings.merging)
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
-        self._renewer = Renewer(self._settings.renewal, self._settings.verification, self.reaches)
-        self._fader = Fader(self._settings.fading)
+        self._renewer = Renewer(self.settings.renewal, self.settings.verification, self.reaches)
+        self._fader = Fader(self.settings.fading)
         self._rulings = Rulings()
         self._merged = MergedMap.empty()
         self._dirty = False
@@ -101,6 +104,33 @@ class Merger:
     def uncompared(self) -> int:
         """Nodes that were read and for which nobody has yet looked which others are like them."""
         return len(self._uncompared)
+
+    @property
+    def compared(self) -> tuple[int, int]:
+        """Nodes that were compared with all others, and pairs of them on which there is a verdict."""
+        nodes = sum(len(one.nodes) for one in self.maps.values())
+        return nodes - len(self._uncompared), sum(map(len, self._known.values())) // 2
+
+    @property
+    def recollecting(self) -> bool:
+        """Whether there are findings of before that no merge has taken over yet."""
+        return self._before is not None
+
+    def recollect(self, findings: Findings) -> None:
+        """Believe what was found before of nodes that are just as they were; what is not read by then."""
+        self._before = Recollection(findings)
+
+    def findings(self) -> Findings:
+        """What was found of all nodes that are compared."""
+        nodes = {n.id: n for one in self.maps.values() for n in one.nodes.values()}
+        for node_id, node in nodes.items():
+            known = self._prints.get(node_id)
+            if known is None or known[0] is not node:
+                self._prints[node_id] = node, print_of(node)
+        self._prints = {node_id: self._prints[node_id] for node_id in nodes}
+        prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
+        verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
+        return Findings(prints, self._pairs.overlaps(), verdicts)
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -161,6 +191,7 @@ class Merger:
         """The merged map of all that has come; made anew only if something has changed, and where it has."""
         if self._dirty:
             self.look_around()
+            self._take_over()
             changed = self._pairs.changed()
             self._verify(pair for pair in changed if pair in self._pairs)
             for pair in changed:
@@ -183,13 +214,23 @@ class Merger:
         """Look for what is like the nodes that were read, or like so many of them."""
         for node_id in list(islice(self._uncompared, most)):
             if (node := self.node(node_id)) is not None:
-                self._pairs.put(node_id, self.index.overlaps(node, self.node))
+                known = self._before is not None and self._before.knows(node)
+                source = self._before if known and self._before is not None else self.index
+                self._pairs.put(node_id, source.overlaps(node, self.node))
             del self._uncompared[node_id]
+
+    def _take_over(self) -> None:
+        """Take over all verdicts of before; whatever comes now is found anew."""
+        if self._before is not None:
+            for pair, verdict in self._before.verdicts(self.node):
+                if pair[1] not in self._known.get(pair[0], {}):
+                    self._judge(pair, verdict)
+            self._before = None
 
     def apart(self) -> MergedMap:
         """The merged map if nobody had compared any two maps: a component for each part of each map."""
         kept = {map_id: HybridMap(one.contents()) for map_id, one in self.maps.items()}
-        return Islands(self._settings.merging).merge(kept, Verdicts(), set(kept), self._rulings)
+        return Islands(self.settings.merging).merge(kept, Verdicts(), set(kept), self._rulings)
 
     def status(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
@@ -222,7 +263,7 @@ class Merger:
             a, b = self.node(pair[0]), self.node(pair[1])
             if pair[1] in self._known.get(pair[0], {}) or a is None or b is None:
                 continue
-            verdict = verify(a, b, self._settings.verification)
+            verdict = verify(a, b, self.settings.verification)
             self._judge(pair, verdict)
             self.counters.verified += 1
             self.counters.recognised += isinstance(verdict, Link)

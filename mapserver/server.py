@@ -20,6 +20,7 @@ from mapserver.answers import Answers
 from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.desk import Desk, DeskSettings
 from mapserver.explainer import Explainer, RulingBook
+from mapserver.findingskeeper import FindingsKeeper
 from mapserver.ingest import Ingest
 from mapserver.placekeeper import PlaceKeeper
 from mapserver.services import Services
@@ -82,7 +83,10 @@ class MapServer:
         # In lock-step all must come about again as it did, the cells of the index too.
         self._keeper = None if s.lockstep else PlaceKeeper(self._store, path)
         index = self._keeper.index if self._keeper else None
-        self._upkeep = Upkeep(s.merge_share, by_itself=not s.lockstep, index=index, merge=s.merge)
+        findings = None if s.lockstep else FindingsKeeper(path)
+        self._upkeep = Upkeep(
+            s.merge_share, by_itself=not s.lockstep, index=index, merge=s.merge, keeper=findings
+        )
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
         self._desk = Desk(replace(s.desk, workers=0) if s.lockstep else s.desk)

@@ -15,6 +15,7 @@ from hybridmap.errors import MapweaveError
 from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
+from mapserver.findingskeeper import FindingsKeeper
 from mapserver.merger import Merger, MergerSettings
 from mapserver.placeindex import PlaceIndex
 from merge.merged import MergedMap
@@ -50,6 +51,7 @@ class Upkeep:
         by_itself: bool = True,
         index: PlaceIndex | None = None,
         merge: MergeSettings | None = None,
+        keeper: FindingsKeeper | None = None,
     ) -> None:
         """Begin with nothing.
 
@@ -58,7 +60,9 @@ class Upkeep:
             by_itself: merge whenever there is something new; else only when somebody waits for it.
             index: is filled with the nodes that come; may have them already.
             merge: how maps are merged.
+            keeper: of what comparing nodes has found.
         """
+        self._keeper = keeper
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
@@ -143,6 +147,18 @@ class Upkeep:
         self._changes.put(news)
 
     def _work(self) -> None:
+        if self._keeper:
+            self._keeper.restore(self._merger)
+        try:
+            self._keep_up()
+        finally:
+            self._save(last=True)
+
+    def _save(self, last: bool = False) -> None:
+        if self._keeper:
+            self._keeper.save(self._merger, last)
+
+    def _keep_up(self) -> None:
         rest_until = 0.0
         while True:
             pause = max(rest_until - time.monotonic(), 0.0)
@@ -158,6 +174,7 @@ class Upkeep:
                 self._merge()
                 spent = time.monotonic() - began
                 rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
+                self._save()
                 continue
             if change is None:
                 return
@@ -170,6 +187,7 @@ class Upkeep:
                 if self._dirty:
                     self._merge()
                 change.set()
+                self._save()
                 continue
             if isinstance(change, Rulings):
                 self._merger.rule(change)

@@ -33,6 +33,15 @@ class PairTable:
             self._overlaps.setdefault(other, {})[node] = value
         self._stale |= {node, *overlaps}
 
+    def overlaps(self) -> dict[Pair, float]:
+        """All that are known, by (smaller id, greater id)."""
+        return {
+            (node, other): value
+            for node, others in self._overlaps.items()
+            for other, value in others.items()
+            if node < other
+        }
+
     def forget(self, node: NodeId) -> None:
         """Drop a node's overlaps: it is gone, or is known better."""
         for other in self._overlaps.pop(node, ()):
