@@ -29,6 +29,8 @@ from hybridmap.node import Landmarks, Node, NodeId
 
 AGENT = "d"
 """Of all distractors."""
+NOBODYS = -1
+"""Number of the building that donors and distractors are in."""
 CUT = (0.25, 0.75)
 """Where the cut between the two views may be, as shares of the width."""
 PIXEL_SIGMA, DEPTH_SIGMA = 1.0, 0.03
@@ -36,37 +38,57 @@ PIXEL_SIGMA, DEPTH_SIGMA = 1.0, 0.03
 
 
 @dataclass(frozen=True, eq=False)
+class Differences:
+    """What real landmarks' descriptors differed by between two real views.
+
+    Attributes:
+        vectors: (M, 32) float32, of decoded descriptors.
+        sift: (M, 128) int16, of whole ones, in the same order.
+    """
+
+    vectors: NDArray[np.float32]
+    sift: NDArray[np.int16]
+
+
+@dataclass(frozen=True, eq=False)
 class Distractors:
     """As many places as are wanted; number k is always the same.
 
     Attributes:
-        donors: nodes that a robot would make of real views.
-        differences: (M, 32) float32, what real landmarks' decoded descriptors differed by between two views.
+        donors: places that a robot would make of real views.
+        differences: that are put upon their descriptors.
         seed: of all.
     """
 
-    donors: Sequence[Node]
-    differences: NDArray[np.float32]
+    donors: Sequence[Place]
+    differences: Differences
     seed: int
 
-    def node(self, number: int) -> Node:
-        """A place."""
+    def place(self, number: int) -> Place:
+        """A place, with whole descriptors too; where it truly is nobody knows."""
         rng = np.random.default_rng([self.seed, 0xD157, number])
         i, j = rng.choice(len(self.donors), 2, replace=False).tolist()
         left, right = self.donors[i], self.donors[j]
-        cut = left.camera.width * rng.uniform(*CUT)
-        a, b = left.landmarks, right.landmarks
-        a, b = a.take(a.pixels[:, 0] < cut), b.take(b.pixels[:, 0] >= cut)
+        cut = left.node.camera.width * rng.uniform(*CUT)
+        a, b = left.node.landmarks, right.node.landmarks
+        of_left, of_right = a.pixels[:, 0] < cut, b.pixels[:, 0] >= cut
+        a, b = a.take(of_left), b.take(of_right)
         n = len(a) + len(b)
-        vectors = decode(np.concatenate([a.codes, b.codes]))
-        vectors += self.differences[rng.integers(0, len(self.differences), n)]
+        chosen = rng.integers(0, len(self.differences.vectors), n)
+        vectors = decode(np.concatenate([a.codes, b.codes])) + self.differences.vectors[chosen]
+        sift = np.concatenate([left.sift[of_left], right.sift[of_right]]) + self.differences.sift[chosen]
         pixels = np.concatenate([a.pixels, b.pixels]) + rng.normal(0, PIXEL_SIGMA, (n, 2)).astype(np.float32)
         scales = (1 + rng.normal(0, DEPTH_SIGMA, n)).astype(np.float32)
         landmarks = Landmarks(
             pixels, quantise(vectors), np.concatenate([a.depths, b.depths]) * scales,
             np.concatenate([a.depth_sigmas, b.depth_sigmas]) * scales,
         )  # fmt: skip
-        return Node(NodeId(AGENT, 1, number), 0, left.map_from_robot, left.camera, landmarks)
+        node = Node(NodeId(AGENT, 1, number), 0, left.node.map_from_robot, left.node.camera, landmarks)
+        return Place(node, left.world_from_node, NOBODYS, np.clip(sift, 0, 255).astype(np.uint8))
+
+    def node(self, number: int) -> Node:
+        """A place's node."""
+        return self.place(number).node
 
 
 def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -> Distractors:
@@ -78,21 +100,21 @@ def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -
         seed: of the buildings.
         progress: called once a view.
     """
-    donors: list[Node] = []
+    donors: list[Place] = []
     for number, site in enumerate(donor_sites(seed)):
         rng = np.random.default_rng([seed, 0xD0, number])
         wishes = [
             Wish(site.world.plan.random_free_pose(rng, CLEARANCE)) for _ in range(round(site.share * count))
         ]
-        made = [placed(p, NodeId("donor", 1, 1), -1, rng).node for p in photographed(site, wishes, progress)]
-        donors += [node for node in made if len(node.landmarks) >= LEAST_LANDMARKS]
+        made = [placed(p, NodeId("donor", 1, 1), NOBODYS, rng) for p in photographed(site, wishes, progress)]
+        donors += [place for place in made if len(place.node.landmarks) >= LEAST_LANDMARKS]
     return Distractors(donors, differences(places, seed), seed)
 
 
-def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> NDArray[np.float32]:
-    """(M, 32) of landmarks that two nodes share, by matches that the geometry confirms."""
+def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> Differences:
+    """Of landmarks that two nodes share, by matches that the geometry confirms."""
     rng = np.random.default_rng([seed, 0xD1F])
-    found: list[NDArray[np.float32]] = []
+    found, whole = list[NDArray[np.float32]](), list[NDArray[np.int16]]()
     for k in rng.permutation(len(places))[: 4 * pairs].tolist():
         one = places[k]
         near = [
@@ -107,10 +129,12 @@ def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> NDArray
         there = one.world_from_node.inverse() @ other.world_from_node
         at = other.node.camera.project(there.inverse().apply(a.points_in_robot(one.node.camera)))
         right = np.linalg.norm(at - b.pixels, axis=1) < 4.0
-        found.append(decode(a.codes[right]) - decode(b.codes[right]))
+        found.append((decode(a.codes[right]) - decode(b.codes[right])).astype(np.float32))
+        mine, theirs = matches[right].T
+        whole.append(one.sift[mine].astype(np.int16) - other.sift[theirs].astype(np.int16))
         if len(found) == pairs:
             break
-    return np.concatenate(found).astype(np.float32)
+    return Differences(np.concatenate(found), np.concatenate(whole))
 
 
 def _alike(one: Place, other: Place) -> bool:

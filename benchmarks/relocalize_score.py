@@ -146,6 +146,18 @@ def recall_by_kind(replies: Sequence[Reply]) -> dict[str, float]:
     return {kind: share([r for r in replies if r.query.kind == kind], lambda r: r.recalled) for kind in kinds}
 
 
+def wrong_by_kind(replies: Sequence[Reply]) -> dict[str, float]:
+    """Share of each kind of view that was told "here" wrongly; of strangers any such answer is wrong."""
+    kinds = dict.fromkeys(r.query.kind for r in replies)
+    return {
+        kind: share(
+            [r for r in replies if r.query.kind == kind],
+            lambda r: _found(r) and (r.query.kind in STRANGERS or not r.near),
+        )
+        for kind in kinds
+    }
+
+
 def _found(reply: Reply) -> bool:
     return reply.certainty is Certainty.FOUND
 

@@ -103,14 +103,27 @@ class Regions:
         """Take what is known; which nodes look alike outlives the merged map."""
         self._index, self._node_of, self._merged = index, node_of, merged
         self._alike, self._settings = alike, settings
+        self._left: list[NodeId] | None = None
 
-    def prepare(self, node_id: NodeId) -> bool:
-        """Find out what a node looks like before anybody asks; False if that was known, or it is gone."""
-        node = self._node_of(node_id)
-        if node is None or self._alike.knows(node):
-            return False
-        self._look_alikes(node)
-        return True
+    def prepare(self, most: int) -> int:
+        """Find out what some nodes of the map look like before anybody asks; not by two threads at once.
+
+        Args:
+            most: nodes that are not known yet.
+
+        Returns:
+            How many nodes are left to be looked at.
+        """
+        if not self._settings.least_nodes:
+            return 0
+        if self._left is None:
+            self._left = sorted(self._merged.postures, reverse=True)
+        while self._left and most > 0:
+            node = self._node_of(self._left.pop())
+            if node is not None and not self._alike.knows(node):
+                self._look_alikes(node)
+                most -= 1
+        return len(self._left)
 
     def counterpart(self, seen: Sighting, ranked: Sequence[NodeId] = ()) -> Counterpart | None:
         """Where else a robot may be.

@@ -73,9 +73,9 @@ class Relocalizer:
         self._node_of = node_of
         self._merged = merged
         self._settings = settings or RelocalizationSettings()
-        self._alike = alike or LookAlikes(self._settings.recognition)
+        self.alike = alike or LookAlikes(self._settings.recognition)
         self.judge = Judge(merged, self._settings.judgement)
-        self._regions = Regions(index, node_of, merged, self._alike, self._settings.regions)
+        self._regions = Regions(index, node_of, merged, self.alike, self._settings.regions)
 
     def answer(self, view: View) -> RelocalizeAnswer:
         """Say where a view was taken, or that it is not known, with the reason in words."""
@@ -151,9 +151,9 @@ class Relocalizer:
         seen = Sighting(found.node, recognition)
         return SeenPlace([seen], found.node_from_robot, found.features, found.nodes)
 
-    def prepare(self, node: NodeId) -> bool:
-        """Find out what a node looks like before anybody asks; False if there is nothing to find out."""
-        return self._regions.prepare(node)
+    def prepare(self, most: int) -> int:
+        """Find out what at most so many nodes look like before anybody asks, and say how many are left."""
+        return self._regions.prepare(most)
 
     def _closer(self, view: View, one: Sighting) -> Sighting:
         """A sighting with the posture that the pixels give at the noise that they have."""
@@ -175,7 +175,7 @@ class Relocalizer:
                 left = unexplained(double, pairs, node.landmarks.pixels, node.camera, mapped, s.explained_px)
                 if left < s.recognition.least_inliers:
                     continue
-            likeness = self._alike.compare(double, node)
+            likeness = self.alike.compare(double, node)
             if likeness is None or (mapped is not None and same_place(mapped, likeness.node_from_robot.mean)):
                 continue
             sighting = carried(double, likeness, best, view, s.recognition.matching, s.explained_px)

@@ -28,6 +28,8 @@ READ_AT_ONCE = 1024
 """Changes of a store that are taken in at once: while these are, the next are decoded."""
 LOOK_AT_ONCE = 20
 """Nodes for which is looked what is like them, before what has come meanwhile is taken in."""
+PREPARED_AT_ONCE = 4
+"""Nodes of which is found out what they look like, likewise."""
 MOST_WORDS = 1000
 """Characters of an event in a status message."""
 
@@ -70,7 +72,7 @@ class Upkeep:
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._compared = self._answers.merged
-        self._dirty = self._reading = False
+        self._dirty = self._reading = self._curious = False
         self._event = ""
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
@@ -164,14 +166,17 @@ class Upkeep:
             pause = max(rest_until - time.monotonic(), 0.0)
             try:
                 # What comes in pieces is merged when it is whole.
-                waits = self._dirty and self._by_itself and not self._reading
+                waits = (self._dirty or self._curious) and self._by_itself and not self._reading
                 change = self._changes.get(timeout=pause + 0.02 if waits else None)
             except queue.Empty:
                 if self._merger.uncompared:
                     self._look_around()
                     continue
                 began = time.monotonic()
-                self._merge()
+                if self._dirty:
+                    self._merge()
+                else:
+                    self._prepare(PREPARED_AT_ONCE)
                 spent = time.monotonic() - began
                 rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
                 self._save()
@@ -186,6 +191,8 @@ class Upkeep:
             if isinstance(change, threading.Event):
                 if self._dirty:
                     self._merge()
+                if self._curious and not self._by_itself:
+                    self._prepare(len(self._answers.merged.postures))
                 change.set()
                 self._save()
                 continue
@@ -246,6 +253,14 @@ class Upkeep:
         except Exception:  # as below
             log.exception("the maps could not be told of one by one")
 
+    def _prepare(self, most: int) -> None:
+        """Find out what nodes look like, so that who asks where he is need not wait for that."""
+        self._curious = False
+        try:
+            self._curious = self._answers.relocalizer.prepare(most) > 0
+        except Exception:  # it is found out when somebody asks
+            log.exception("what nodes look like could not be found out beforehand")
+
     def _merge(self) -> None:
         self._dirty = False
         before = self._compared
@@ -258,6 +273,7 @@ class Upkeep:
             return
         finally:
             self._done = self._applied
+        self._curious = True
         for words in joinings(before, merged):
             log.info("%s", words)
             self._event = words

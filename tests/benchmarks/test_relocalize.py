@@ -10,13 +10,13 @@ import pytest
 
 from benchmarks import relocalize_pictures
 from benchmarks.fit_belief import fit, reliability
-from benchmarks.relocalize_distractors import Distractors
-from benchmarks.relocalize_exhaustive import Exhaustive
+from benchmarks.relocalize_distractors import Differences, Distractors
+from benchmarks.relocalize_exhaustive import Exhaustive, asked_of, lost
 from benchmarks.relocalize_peer import Vocabulary, WordIndex
 from benchmarks.relocalize_pictures import Disturbance, Photographer, Picture, Wish, taken
 from benchmarks.relocalize_places import Place, placed, spread_out, twin_lookouts
 from benchmarks.relocalize_queries import Query, beside
-from benchmarks.relocalize_score import ask, figures, judged, spent
+from benchmarks.relocalize_score import Reply, ask, figures, judged, spent
 from benchmarks.synthetic import CAMERA, room, take_map, take_view
 from hybridmap.descriptor import decode, root_sift
 from hybridmap.matching import MatchSettings, match_vectors
@@ -43,7 +43,7 @@ def nodes_of(seed: int, count: int) -> list[Node]:
     return take_map(room(0, 0, 5, 4, 400, rng), MapId("a", 1), tour, rng)[0]
 
 
-def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match() -> None:
+def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     own = rng.integers(0, 255, (60, 128))
     places = []
@@ -51,8 +51,11 @@ def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match() -> None:
         seen = np.clip(own[rng.permutation(60)[:40]] + rng.normal(0, 8 * (k + 1), (40, 128)), 0, 255)
         places.append(placed(picture_of(seen.astype(np.uint8)), NodeId("m", 1, k + 1), 0, rng))
     asked = picture_of(np.clip(own + rng.normal(0, 8, own.shape), 0, 255).astype(np.uint8))
-    ceiling = Exhaustive(places, Relocalizer(PlaceIndex(), lambda _: None, MergedMap.empty()))
-    counts = ceiling._may_match(root_sift(asked.sift))
+    judge = Relocalizer(PlaceIndex(), lambda _: None, MergedMap.empty())
+    empty = picture_of(np.zeros((1, 128), np.uint8))
+    views = [root_sift(one.sift) for one in (empty, asked)]
+    monkeypatch.setattr("benchmarks.relocalize_exhaustive.NODES_AT_ONCE", 4)
+    counts = Exhaustive(places.__getitem__, len(places), judge).may_match(views)[1]
     matches = [len(match_vectors(root_sift(p.sift), root_sift(asked.sift), MatchSettings())) for p in places]
     assert max(matches) > 20 and min(matches) < max(matches)
     assert (counts >= matches).all()
@@ -80,16 +83,43 @@ def test_the_bag_of_words_is_tf_idf_and_cosine() -> None:
 
 
 def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
-    donors = nodes_of(5, 6)
-    made = Distractors(donors, np.zeros((1, 32), np.float32), 7)
-    one, again, other = made.node(3), made.node(3), made.node(4)
-    assert np.array_equal(one.landmarks.codes, again.landmarks.codes) and one.id == NodeId("d", 1, 3)
-    assert not np.array_equal(one.landmarks.codes, other.landmarks.codes)
-    owners = [
-        next(k for k, donor in enumerate(donors) if (donor.landmarks.codes == code).all(axis=1).any())
-        for code in one.landmarks.codes
+    rng = np.random.default_rng(5)
+    donors = [
+        Place(node, Pose2(), 0, rng.integers(0, 256, (len(node.landmarks), 128)).astype(np.uint8))
+        for node in nodes_of(5, 6)
     ]
+    none = Differences(np.zeros((1, 32), np.float32), np.full((1, 128), 3, np.int16))
+    made = Distractors(donors, none, 7)
+    one, again, other = made.place(3), made.place(3), made.place(4)
+    codes = one.node.landmarks.codes
+    assert np.array_equal(codes, again.node.landmarks.codes) and np.array_equal(one.sift, again.sift)
+    assert one.node.id == NodeId("d", 1, 3) and not np.array_equal(codes, other.node.landmarks.codes)
+    owners = []
+    for code, sift in zip(codes, one.sift, strict=True):
+        (owner,) = [k for k, d in enumerate(donors) if (d.node.landmarks.codes == code).all(axis=1).any()]
+        landmark = int((donors[owner].node.landmarks.codes == code).all(axis=1).argmax())
+        # The whole descriptor is of the same landmark, changed by its own difference.
+        assert np.array_equal(sift, np.minimum(donors[owner].sift[landmark].astype(int) + 3, 255))
+        owners.append(owner)
     assert 1 <= len(set(owners)) <= 2
+
+
+def test_what_the_index_has_lost_is_told_of_the_same_views() -> None:
+    picture = picture_of(np.zeros((0, 128), np.uint8))
+    query = Query("near", picture, 0)
+
+    def replies(recalled: str) -> list[Reply]:
+        return [
+            Reply(query, Certainty.FOUND if one == "y" else Certainty.UNKNOWN, 1, 0, 0, 1) for one in recalled
+        ]
+
+    told = lost(replies("yyyyyynnnn"), replies("yyyyynyynn"))
+    assert told["only_exhaustive"] == 2 and told["only_index"] == 1 and told["recall_lost"] == 0.1
+    assert told["recall_lost_low"] < 0 < 0.1 < told["recall_lost_high"]
+    many = lost(replies("y" * 400), replies("y" * 400))
+    assert -0.02 < many["recall_lost_low"] < 0 < many["recall_lost_high"] < 0.02
+    asked = asked_of([query] * 200, 10_000)
+    assert len(asked_of([query] * 200, 1000)) == 200 and 20 < len(asked) < 100
 
 
 def test_pictures_are_taken_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic import room, take_node, take_view
+from hybridmap.change import Change, NodePut
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
@@ -19,8 +20,10 @@ from mapserver.placeindex import PlaceIndex
 from mapserver.regions import RegionSettings
 from mapserver.relocalization import RelocalizationSettings, Relocalizer
 from mapserver.seenplaces import Sighting
+from mapserver.upkeep import PREPARED_AT_ONCE, Upkeep
 from merge.merged import MergedMap, Placement
 from merge.posegraph import Measurement, solve_graph
+from tests.waiting import eventually
 
 ROOM = room(0, 0, 5, 4, 700, np.random.default_rng(1))
 OTHER = room(0, 0, 5, 4, 700, np.random.default_rng(2))
@@ -175,14 +178,38 @@ def test_a_merge_that_is_undone_is_noticed() -> None:
         assert (again.id in {one.other.id for one in found}) == (again.id in expected)
 
 
-@pytest.mark.parametrize("least_nodes", [0, 2])
-def test_what_is_prepared_is_not_looked_for_when_somebody_asks(least_nodes: int) -> None:
+def test_what_is_prepared_is_not_looked_for_when_somebody_asks() -> None:
     nodes = here_and_there()
-    service = asked(nodes, joined(nodes), least_nodes=least_nodes)
+    service = asked(nodes, joined(nodes))
     index = service._index
     assert isinstance(index, OnlyTheFirst)
-    assert [service.prepare(one.id) for one in nodes] == [True] * 5
-    assert not service.prepare(nodes[0].id) and not service.prepare(NodeId("gone", 1, 1))
-    before = index.asked
-    service.answer(VIEW)
-    assert index.asked == before == 5
+    assert [service.prepare(2) for _ in range(4)] == [3, 1, 0, 0]
+    assert index.asked == 5
+    assert service.answer(VIEW).certainty is Certainty.AMBIGUOUS
+    assert index.asked == 5
+    assert asked(nodes, joined(nodes), least_nodes=0).prepare(9) == 0
+
+
+@pytest.mark.parametrize("by_itself", [True, False])
+def test_a_server_finds_out_by_itself_what_nodes_look_like(
+    by_itself: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes, looked = here_and_there(), list[int]()
+
+    def noted(service: Relocalizer, most: int) -> int:
+        looked.append(most)
+        return prepare(service, most)
+
+    prepare = Relocalizer.prepare
+    monkeypatch.setattr(Relocalizer, "prepare", noted)
+    upkeep = Upkeep(1.0, by_itself)
+    upkeep.start()
+    for k, one in enumerate(nodes):
+        upkeep.take(Change(one.id.map, k + 1, 0, NodePut(one)))
+    assert upkeep.settle(20.0)
+    if by_itself:
+        eventually(lambda: all(upkeep._merger.alike.knows(one) for one in nodes))
+    # Where nothing happens by itself, it is done when everything else is.
+    assert all(upkeep._merger.alike.knows(one) for one in nodes)
+    upkeep.close()
+    assert max(looked) == (PREPARED_AT_ONCE if by_itself else len(nodes))
