@@ -15,6 +15,7 @@ from hybridmap.ruling import Rulings
 from mapserver.findings import Findings, Recollection, print_of
 from mapserver.lookalikes import LookAlikes
 from mapserver.placeindex import PlaceIndex
+from mapserver.succession import Succession
 from merge.candidates import CandidateSettings, Pair
 from merge.fading import Fader, FadingSettings
 from merge.incremental import Islands
@@ -67,15 +68,16 @@ class Merger:
     """Holds every robot's map, the overlaps of their nodes and the verdicts on pairs of them.
 
     Work is done where it is cheapest: a new node is compared with its best candidates when it comes; the
-    merged map is made when it is asked for and something has changed, and then only where it has. The
-    outcome depends on what the maps hold, not on the order in which it came.
+    merged map is made when it is asked for and something has changed, and then only where it has. Candidates
+    are living nodes alone. But for that the outcome depends on what the maps hold, not on the order in which
+    it came: a node that is superseded in one merge is not looked for by those that come later.
     """
 
     def __init__(self, index: PlaceIndex | None = None, settings: MergerSettings | None = None) -> None:
         """Start with no maps.
 
         Args:
-            index: is filled with the nodes that come; give it to a Relocalizer too.
+            index: is filled with the nodes that come, but for superseded ones; give it to a Relocalizer too.
             settings: how.
         """
         # An index in which there is nothing yet is one.
@@ -88,6 +90,7 @@ class Merger:
         self._before: Recollection | None = None
         self._prints: dict[NodeId, tuple[Node, bytes]] = {}
         self._pairs = PairTable(self.settings.candidates)
+        self._succession = Succession(self.index, self._pairs, self.node)
         self._uncompared: dict[NodeId, None] = {}
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._verdicts = Verdicts()
@@ -147,10 +150,11 @@ class Merger:
 
     def apply(self, map_id: MapId, body: ChangeBody) -> None:
         """Take in a change without comparing nodes yet."""
+        before = self._pairs.of(body.node.id) if isinstance(body, NodePut) else []
         self._replay(map_id, body)
         if isinstance(body, NodePut):
             self.index.add(body.node)
-            self._pairs.put(body.node.id, self.index.overlaps(body.node, self.node))
+            self._pairs.put(body.node.id, self._succession.overlaps(body.node, before))
 
     def read(
         self,
@@ -204,7 +208,9 @@ class Merger:
                 # Copies: a merged map stays as it was when later changes come.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
             merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
-            self._merged = self._fader.fade(self._renewer.renewed(merged))
+            renewed = self._renewer.renewed(merged)
+            self._succession.follow(renewed.superseded)
+            self._merged = self._fader.fade(renewed)
             self.counters.merges += 1
             self._touched = set()
             self._dirty = False
@@ -276,6 +282,7 @@ class Merger:
         """Drop what was found out about a node: it is gone, or is known better."""
         self._pairs.forget(node_id)
         self._uncompared.pop(node_id, None)
+        self._succession.replaced(node_id)
         for other in self._known.pop(node_id, {}):
             del self._known[other][node_id]
 

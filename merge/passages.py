@@ -64,14 +64,20 @@ class Passages:
         """Take a node in again."""
         self._gone.discard(node)
 
-    def around(self, node: NodeId, reach: float) -> list[NodeId]:
-        """Other nodes that are left, of the same component, within a distance, m; in the order of ids."""
+    def around(self, node: NodeId, reach: float, also_gone: bool = False) -> list[NodeId]:
+        """Other nodes that are left, of the same component, within a distance, m; in the order of ids.
+
+        Args:
+            node: in the middle.
+            reach: m.
+            also_gone: those that were left out too.
+        """
         graph = self._graph(node)
         if graph.anchor not in self._trees:
             self._trees[graph.anchor] = cKDTree(graph.means[:, :2])
         found = self._trees[graph.anchor].query_ball_point(graph.means[graph.rows[node], :2], reach)
         near = (graph.nodes[k] for k in found)
-        return sorted(other for other in near if other != node and other not in self._gone)
+        return sorted(other for other in near if other != node and (also_gone or other not in self._gone))
 
     def spare(self, node: NodeId, successor: NodeId, detour: float) -> bool:
         """Whether every neighbour of a node is reached from its successor without the node.

@@ -1,15 +1,20 @@
-"""Renewal: nodes that newer ones of the same place stand for, so that a map does not grow with every drive.
+"""Renewal: nodes that others of the same place stand for, so that a map does not grow with every drive.
 
-A node is superseded if a robot that stood there would know itself by a newer one and could servo to it: the
+A node is superseded if a robot that stood there would know itself by another one and could servo to it: the
 two were verified to show the same, enough common landmarks stay in view between them, and they stand within
-the servo's basin. Besides, the newer one must know about as many depths; nothing that the old one stood for
-may be left without; and no way between its neighbours may become much longer without it.
+the servo's basin. Besides, the other one must know about as many depths; whatever the node stood for itself
+must have somebody else to stand for it; and no way between its neighbours may become much longer without it.
+
+What is left dominates all nodes (each is covered by a living one, directly) and holds none that could be
+spared. To find the fewest is NP-hard; here nodes go one by one, those first that stand for little and of
+which newer views were taken since.
 
 Superseded nodes stay where they are: they tie postures, and come back if what supersedes them does not stand.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -33,12 +38,12 @@ SECOND = 1_000_000_000
 
 @dataclass(frozen=True)
 class RenewalSettings:
-    """When a newer node stands for an older one.
+    """When a node stands for another one.
 
     Attributes:
-        reach: the servo's basin: from the older node's place it brings a robot to the newer one.
+        reach: the servo's basin: from the one node's place it brings a robot to the one that stands for it.
         found: landmarks that both show and that stay in view between them.
-        depths: the newer one knows at least this share of the number of depths that the older one knows,
+        depths: it knows at least this share of the number of depths that the other one knows,
         enough: or at least this many.
         again: s, that lie between them if both belong to one map: views of one visit complete each other.
         detour: m, by which a way between neighbours may become longer.
@@ -82,6 +87,7 @@ class Renewer:
         self._linked: set[tuple[NodeId, NodeId]] = set()
         self._graphs: tuple[PoseGraph, ...] = ()
         self._foreign = ForeignEdges()
+        self._firm: dict[NodeId, NodeId] = {}
 
     def renewed(self, merged: MergedMap) -> MergedMap:
         """The same map with the nodes that are superseded.
@@ -104,7 +110,7 @@ class Renewer:
             s = self._settings
             foreign = self._foreign.of(merged.maps)
             passages = Passages(merged, links, self._reaches, s.near, foreign, self._fates)
-            this = _Round(merged, nodes, links, self._fates, passages, self._comparisons, s)
+            this = _Round(merged, nodes, links, self._fates, self._firm, passages, self._comparisons, s)
             this.look_at(fresh | this.revive())
         return replace(merged, superseded=dict(sorted(self._fates.items())))
 
@@ -118,6 +124,7 @@ class Renewer:
                     # Known still, if it is in another component now.
                     if merged.component_of(node) is None:
                         self._seen.pop(node, None)
+                        self._firm.pop(node, None)
         self._graphs = merged.graphs
         return {
             node: merged.maps[node.map].nodes[node]
@@ -136,11 +143,12 @@ class _Round:
         nodes: dict[NodeId, Node],
         links: Iterable[Link],
         fates: dict[NodeId, Superseded],
+        firm: dict[NodeId, NodeId],
         passages: Passages,
         comparisons: Comparisons,
         settings: RenewalSettings,
     ) -> None:
-        self._merged, self._nodes, self._fates = merged, nodes, fates
+        self._merged, self._nodes, self._fates, self._firm = merged, nodes, fates, firm
         self._settings = settings
         self._comparisons = comparisons
         self._links = {link.pair: link for link in links}
@@ -169,64 +177,85 @@ class _Round:
         return gone
 
     def look_at(self, fresh: Iterable[NodeId]) -> None:
-        """See what new nodes stand for, the oldest first, and whether they are needed themselves."""
-        for node in sorted(fresh, key=lambda one: (self._nodes[one].stamp_ns, one)):
-            if node in self._fates:
-                continue
-            near = self._passages.around(node, self._settings.reach.farthest)
-            for other in sorted(near, key=lambda one: (self._unlikeness(node, one), one)):
-                old, new = self._by_age(node, other)
-                if old not in self._fates and new not in self._fates:
-                    self._try(old, new)
+        """See which nodes can be spared where something is new, the least needed first."""
+        reach = self._settings.reach.farthest
+        living = {node for node in fresh if node not in self._fates}
+        for node in tuple(living):
+            living.update(self._passages.around(node, reach))
+        since = {node: self._since(node) for node in living}
 
-    def _try(self, old: NodeId, new: NodeId) -> None:
-        fate = self._covers(old, new)
-        if fate is None:
-            return
-        heirs = {}
-        for orphan in sorted(self._stands_for.get(old, ())):
-            heir = self._heir(orphan, old, new)
+        def need(node: NodeId) -> tuple[int, int, NodeId]:
+            # It is worth what it stands for; each later view of its place makes it as much less so.
+            return len(self._stands_for.get(node, ())) - since[node], self._nodes[node].stamp_ns, node
+
+        queue = [need(node) for node in living]
+        heapq.heapify(queue)
+        while queue:
+            node = queue[0][-1]
+            # What it stands for may have become more since; it never becomes less.
+            if (now := need(node)) != queue[0]:
+                heapq.heapreplace(queue, now)
+                continue
+            heapq.heappop(queue)
+            self._try(node)
+
+    def _since(self, node: NodeId) -> int:
+        """How many newer nodes of other visits, superseded or not, are within the basin."""
+        one, count = self._nodes[node], 0
+        for other in self._passages.around(node, self._settings.reach.farthest, also_gone=True):
+            newer = is_older(one, self._nodes[other]) and not self._one_visit(one, self._nodes[other])
+            count += newer and abs(self._between(node, other).heading) <= self._settings.reach.widest
+        return count
+
+    def _try(self, node: NodeId) -> None:
+        """Leave a node out if others stand for it, and for all that it stood for."""
+        heirs: dict[NodeId, Superseded] = {}
+        # What could not be left to others the last time comes first.
+        for orphan in sorted(
+            self._stands_for.get(node, ()), key=lambda one: (one != self._firm.get(node), one)
+        ):
+            heir = self._heir(orphan, node)
             if heir is None:
+                self._firm[node] = orphan
                 return
             heirs[orphan] = heir
-        if not self._passages.spare(old, new, self._settings.detour):
+        fate = self._heir(node, node)
+        if fate is None or not self._passages.spare(node, fate.by, self._settings.detour):
             return
-        self._passages.remove(old)
-        self._stands_for.pop(old, None)
-        for node, one in ((old, fate), *heirs.items()):
-            self._fates[node] = one
-            self._stands_for.setdefault(one.by, set()).add(node)
+        self._passages.remove(node)
+        self._stands_for.pop(node, None)
+        self._firm.pop(node, None)
+        for one, heir in ((node, fate), *heirs.items()):
+            self._fates[one] = heir
+            self._stands_for.setdefault(heir.by, set()).add(one)
 
-    def _heir(self, orphan: NodeId, old: NodeId, new: NodeId) -> Superseded | None:
-        """Who stands for a node from now on that an old one stood for."""
-        fate = self._covers(orphan, new)
-        if fate is not None:
-            return fate
+    def _heir(self, orphan: NodeId, but: NodeId) -> Superseded | None:
+        """Who stands for a node if it is not the one given: the living one that is most like it."""
         around = self._passages.around(orphan, self._settings.reach.farthest)
         for other in sorted(around, key=lambda one: (self._unlikeness(orphan, one), one)):
-            if other not in (old, new) and self._by_age(orphan, other) == (orphan, other):
+            if other != but:
                 fate = self._covers(orphan, other)
                 if fate is not None:
                     return fate
         return None
 
-    def _covers(self, old: NodeId, new: NodeId) -> Superseded | None:
-        """Whether the one stands for the other."""
-        s, a, b = self._settings, self._nodes[old], self._nodes[new]
-        between = self._between(old, new)
+    def _covers(self, one: NodeId, other: NodeId) -> Superseded | None:
+        """Whether the other one can stand for the one."""
+        s, a, b = self._settings, self._nodes[one], self._nodes[other]
+        between = self._between(one, other)
         distance, turn = between.distance(Pose2()), abs(between.heading)
         if distance > s.reach.farthest or turn > s.reach.widest:
             return None
-        if old.map == new.map and abs(a.stamp_ns - b.stamp_ns) < s.again * SECOND:
+        if self._one_visit(a, b):
             return None
         if b.landmarks.has_depth.sum() < min(s.depths * a.landmarks.has_depth.sum(), s.enough):
             return None
-        link = self._links.get(_ordered(old, new)) or self._compare(a, b)
+        link = self._links.get(_ordered(one, other)) or self._compare(a, b)
         if link is None:
             return None
-        link = link if link.a == old else link.turned()
+        link = link if link.a == one else link.turned()
         found = least_in_view(link.shared, a, b, between, s.reach.stops)
-        return Superseded(new, found, distance, turn) if found >= s.found else None
+        return Superseded(other, found, distance, turn) if found >= s.found else None
 
     def _compare(self, a: Node, b: Node) -> Link | None:
         """A link between two nodes that the merge had no need to compare; one that it refused is none."""
@@ -242,8 +271,8 @@ class _Round:
         spread = verdict.a_from_b.covariance + there.covariance + np.diag(np.square(s.floor))
         return verdict if float(off @ np.linalg.solve(spread, off)) < s.gate else None
 
-    def _by_age(self, one: NodeId, other: NodeId) -> tuple[NodeId, NodeId]:
-        return (one, other) if is_older(self._nodes[one], self._nodes[other]) else (other, one)
+    def _one_visit(self, a: Node, b: Node) -> bool:
+        return a.id.map == b.id.map and abs(a.stamp_ns - b.stamp_ns) < self._settings.again * SECOND
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2:
         return self._merged.pose(a).inverse() @ self._merged.pose(b)

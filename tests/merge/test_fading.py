@@ -14,9 +14,10 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from mapserver.living import without_faded
-from mapserver.merger import Merger
+from mapserver.merger import Merger, MergerSettings
 from merge.fading import Fader, FadingSettings, Look, expected, presence
 from merge.links import Link
+from merge.renewal import RenewalSettings
 
 S = FadingSettings()
 SHARP = Sensing(unknown_depth=0.0, clutter=5, most=150)
@@ -99,14 +100,15 @@ def test_furniture_that_is_moved_fades_and_comes_back() -> None:
     thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
     other = replace(world, vectors=world.vectors.copy())
     other.vectors[thing] = random_vectors(len(thing), rng)
-    merger = Merger()
+    # Nothing is superseded: what has been is linked with no later view.
+    merger = Merger(settings=MergerSettings(renewal=RenewalSettings(found=10_000)))
     epochs = [world, *[other] * 8, *[world] * 3]
     told: dict[int, np.ndarray] = {}
     first: np.ndarray | None = None
     for epoch, now in enumerate(epochs, start=1):
         tour = [Pose2(2.6 + 0.5 * k, 2.0 + rng.normal(0, 0.04), 0.05 * k) for k in range(2)]
         _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
-        merged = Fader().fade(replace(merger.merged(), superseded={}))
+        merged = Fader().fade(merger.merged())
         node = merged.maps[MapId("r1", 1)].nodes[NodeId("r1", 1, 1)]
         if first is None:
             first = _behind(world, tour[0], node.points_in_robot, thing)

@@ -13,11 +13,12 @@ from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
+from hybridmap.reach import least_in_view
 from hybridmap.reach_book import ReachBook
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.living import LivingPlaces
 from mapserver.mapfiles import map_file_of, merged_of
-from mapserver.merger import Merger
+from mapserver.merger import Merger, MergerSettings
 from mapserver.relocalization import Relocalizer
 from mapserver.roadmap import Roadmap
 from mapserver.routes import Router
@@ -170,3 +171,58 @@ def test_drive_after_drive_the_living_stay_few(drives: Drives) -> None:
             merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
         counts.append(len(living(merger.merged())))
     assert counts[0] == 4 and max(counts) <= 8, counts
+
+
+def test_superseded_nodes_are_looked_for_no_more_until_they_live_again(drives: Drives) -> None:
+    merger = drives.merger(OLD, NEW, OTHER)
+    merged = merger.merged()
+    assert merged.superseded
+    assert {node for node in merged.postures if node in merger.index} == living(merged)
+    # Known better, it is judged anew, and superseded again.
+    old = next(iter(merged.superseded))
+    node = merger.node(old)
+    assert node is not None
+    before = {link.pair for link in merged.links}
+    merger.apply(OLD, NodePut(node))
+    merged = merger.merged()
+    assert {one for one in merged.postures if one in merger.index} == living(merged)
+    assert {link.pair for link in merged.links} == before, "what tied it ties it still"
+    merger.rule(Rulings([Ruling((OLD, NEW), True, "anna", 1), Ruling((OTHER, NEW), True, "anna", 1)]))
+    merged = merger.merged()
+    assert not merged.superseded and all(one in merger.index for one in merged.postures)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(seed: int) -> None:
+    """Where ways do not matter: each node has a living one that covers it, and none can be spared."""
+    rng = np.random.default_rng(seed)
+    world = room(0, 0, 6, 4, 1200, rng)
+    # Whoever stands in one place gets there: all the room is one.
+    s = RenewalSettings(near=100.0, detour=1000.0)
+    merger = Merger(settings=MergerSettings(renewal=s))
+    for epoch in range(1, 5):
+        tour = [Pose2(*rng.uniform([1.5, 1.5], [3.5, 2.5]), rng.uniform(-0.6, 0.6)) for _ in range(6)]
+        nodes, edges = take_map(world, MapId("r0", epoch), tour, rng, sigma_xy=0.01, sigma_heading=0.01)
+        for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
+            merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
+        merged = merger.merged()
+        alive, stood_for = living(merged), dict[NodeId, list[NodeId]]()
+        for node, fate in merged.superseded.items():
+            assert covers(merged, node, fate.by, s)
+            stood_for.setdefault(fate.by, []).append(node)
+        for one in alive:
+            whom = [one, *stood_for.get(one, [])]
+            spare = all(any(covers(merged, node, by, s) for by in alive - {one}) for node in whom)
+            assert not spare, f"{one} could be spared"
+    assert len(alive) < 18
+
+
+def covers(merged: MergedMap, one: NodeId, other: NodeId, s: RenewalSettings) -> bool:
+    a, b = (merged.maps[node.map].nodes[node] for node in (one, other))
+    between = merged.pose(one).inverse() @ merged.pose(other)
+    link = verify(*sorted((a, b), key=lambda node: node.id))
+    if one.map == other.map or not isinstance(link, Link) or abs(between.heading) > s.reach.widest:
+        return False
+    shared = link.shared if link.a == one else link.shared[:, ::-1]
+    depths = b.landmarks.has_depth.sum() >= min(s.depths * a.landmarks.has_depth.sum(), s.enough)
+    return bool(depths and least_in_view(shared, a, b, between) >= s.found)
