@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -125,12 +125,11 @@ class Merger:
 
     def findings(self) -> Findings:
         """What was found of all nodes that are compared."""
-        nodes = {n.id: n for one in self.maps.values() for n in one.nodes.values()}
-        for node_id, node in nodes.items():
-            known = self._prints.get(node_id)
-            if known is None or known[0] is not node:
-                self._prints[node_id] = node, print_of(node)
-        self._prints = {node_id: self._prints[node_id] for node_id in nodes}
+        before, self._prints = self._prints, {}
+        for node_id, node in ((n.id, n) for one in self.maps.values() for n in one.nodes.values()):
+            known = before.get(node_id)
+            same = known is not None and known[0] is node
+            self._prints[node_id] = known if known and same else (node, print_of(node))
         prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
         return Findings(prints, self._pairs.overlaps(), verdicts)
@@ -193,7 +192,7 @@ class Merger:
 
     def merged(self) -> MergedMap:
         """The merged map of all that has come; made anew only if something has changed, and where it has."""
-        if self._dirty:
+        if self._dirty or self._islands.decided:
             self.look_around()
             self._take_over()
             changed = self._pairs.changed()
@@ -216,12 +215,21 @@ class Merger:
             self._dirty = False
         return self._merged
 
+    def again(self) -> Callable[[], None] | None:
+        """What should be decided again as a whole, by any thread; the next merge takes it up."""
+        task = self._islands.again(self._kept, self._verdicts)
+        return None if task is None else task.run
+
+    def give_up(self) -> None:
+        """What was to be decided again could not be."""
+        self._islands.give_up()
+
     def look_around(self, most: int | None = None) -> None:
         """Look for what is like the nodes that were read, or like so many of them."""
         for node_id in list(islice(self._uncompared, most)):
             if (node := self.node(node_id)) is not None:
-                known = self._before is not None and self._before.knows(node)
-                source = self._before if known and self._before is not None else self.index
+                before = self._before
+                source = before if before is not None and before.knows(node) else self.index
                 self._pairs.put(node_id, source.overlaps(node, self.node))
             del self._uncompared[node_id]
 

@@ -6,7 +6,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -41,6 +41,13 @@ class _Read:
     taken: threading.Event = field(default_factory=threading.Event)
 
 
+@dataclass(frozen=True)
+class _Decided:
+    """What was to be decided again as a whole is decided, or could not be."""
+
+    well: bool
+
+
 News = Change | list[Change] | Rulings
 
 
@@ -68,7 +75,9 @@ class Upkeep:
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
-        self._changes: queue.SimpleQueue[News | threading.Event | _Read | None] = queue.SimpleQueue()
+        self._changes: queue.SimpleQueue[News | threading.Event | _Read | _Decided | None] = (
+            queue.SimpleQueue()
+        )
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._compared = self._answers.merged
@@ -180,6 +189,7 @@ class Upkeep:
                 spent = time.monotonic() - began
                 rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
                 self._save()
+                self._decide_again()
                 continue
             if change is None:
                 return
@@ -187,6 +197,11 @@ class Upkeep:
                 if self._by_itself and self._merger.uncompared:
                     self._tell_apart()
                 change.taken.set()
+                continue
+            if isinstance(change, _Decided):
+                self._dirty |= change.well
+                if not change.well:
+                    self._merger.give_up()
                 continue
             if isinstance(change, threading.Event):
                 if self._dirty:
@@ -209,6 +224,22 @@ class Upkeep:
             self._dirty = True
             if time.monotonic() > rest_until + 2.0:
                 rest_until = time.monotonic()
+
+    def _decide_again(self) -> None:
+        """Where maps are large, a thread beside this one decides everything again now and then."""
+        if (decide := self._merger.again()) is not None:
+            threading.Thread(target=self._decided, args=(decide,), name="decide", daemon=True).start()
+
+    def _decided(self, decide: Callable[[], None]) -> None:
+        began = time.monotonic()
+        try:
+            decide()
+        except Exception:  # steps go on from what stands
+            log.exception("the merged map could not be decided again as a whole")
+            self._changes.put(_Decided(well=False))
+            return
+        log.info("the merged map is decided again as a whole, in %.0f s", time.monotonic() - began)
+        self._changes.put(_Decided(well=True))
 
     def _forget(self, node: Node) -> None:
         if self._fresh.get(node.id) is node:

@@ -14,9 +14,11 @@ import networkx as nx
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Rulings
+from merge.incremental_again import Again
 from merge.incremental_memory import Memory
+from merge.incremental_settings import StepSettings
 from merge.incremental_sheets import MapPair
-from merge.incremental_steps import Steps, StepSettings
+from merge.incremental_steps import Steps
 from merge.incremental_verdicts import Verdict, Verdicts
 from merge.links import Link, RefusedLink
 from merge.merged import MergedMap, Postures
@@ -41,6 +43,31 @@ class Islands:
         self._merged: dict[frozenset[MapId], MergedMap] = {}
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
         self._rulings = Rulings()
+        self._again: Again | None = None
+
+    @property
+    def decided(self) -> bool:
+        """Whether something was decided again that the next merge takes up."""
+        return self._again is not None and self._again.done
+
+    def again(self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts) -> Again | None:
+        """What should be decided again, by whoever has the time; None if nothing, or if that is under way.
+
+        Args:
+            maps: as they were merged last.
+            verdicts: likewise.
+        """
+        stale = [island for island, steps in self._steps.items() if steps.stale]
+        if self._again is not None or not stale:
+            return None
+        island = max(stale, key=lambda one: (len(one), min(one)))
+        inside = {one: maps[one] for one in sorted(island)}
+        self._again = Again(self._settings, self._how, inside, verdicts.copy(), self._rulings)
+        return self._again
+
+    def give_up(self) -> None:
+        """What was to be decided again could not be."""
+        self._again = None
 
     def merge(
         self,
@@ -67,6 +94,15 @@ class Islands:
             news.add((one, other))
             touched = touched | {one, other}
         self._rulings = rulings
+        if self._again is not None:
+            self._again.missed(news)
+        if self._again is not None and self._again.done:
+            steps, missed = self._again.outcome()
+            self._again = None
+            key = max(self._steps, key=lambda one: len(one & steps.maps), default=None)
+            if key is not None and key & steps.maps:
+                self._steps[key] = steps
+                touched, news = touched | steps.maps, news | missed
         islands = self._ties(maps, verdicts)
         before, self._merged = self._merged, {}
         for island in islands:

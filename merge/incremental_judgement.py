@@ -146,9 +146,11 @@ class Judge:
         if self._heard is None:
             groups = [g for some in self._groups.values() for g in some if g.first is not g.second]
             self._heard = FalseWitnesses.of(group.sorted.supports[0] for group in groups)
-            first = whole.rows(group.first.name for group in groups)
-            second = whole.rows(group.second.name for group in groups)
-            self._between = first, second, [group.sorted for group in groups]
+            # A piece that was sorted may have lost nodes since, or be gone.
+            ends = [[whole.one_of(piece.nodes) for piece in (g.first, g.second)] for g in groups]
+            here = [k for k, (a, b) in enumerate(ends) if a is not None and b is not None]
+            first, second = np.array([ends[k] for k in here], np.int64).reshape(-1, 2).T
+            self._between = first, second, [groups[k].sorted for k in here]
             self._told = {}
         return self._heard
 

@@ -140,6 +140,12 @@ class Assembly:
         """(K,) of nodes."""
         return np.array([self.row(node) for node in nodes], np.int64)
 
+    def one_of(self, nodes: Iterable[NodeId]) -> int | None:
+        """The row of the first of some nodes that is there; None if none is."""
+        there = (n for n in nodes if n.map in self._start and n in self._sheets[n.map].rows)
+        node = next(there, None)
+        return None if node is None else self.row(node)
+
     def label(self, node: NodeId) -> int:
         """Of the component of a node."""
         return int(self.labels[self.row(node)])

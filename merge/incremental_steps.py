@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from merge.incremental_graph import WideGraph
 from merge.incremental_joining import join
 from merge.incremental_ledger import Ledger, ends_of
 from merge.incremental_memory import Memory
+from merge.incremental_settings import StepSettings
 from merge.incremental_sheets import Assembly, MapPair, Sheet
 from merge.incremental_verdicts import Verdicts
 from merge.links import Link, RefusedLink
@@ -35,28 +36,6 @@ from merge.undoing import undo
 
 ATTEMPTS = 20
 """Times that links are refused after optimisation in one step; what is left waits for the next."""
-
-
-@dataclass(frozen=True)
-class StepSettings:
-    """When and how a merge is made in steps.
-
-    Attributes:
-        anew_up_to: islands of as many nodes are merged anew whenever they change, so that the outcome is
-            exactly that of one merge.
-        whole_share: everything is decided again when so many measurements have come or gone since it was last
-            done, as a share of all.
-        whole_up_to: islands of more nodes are not decided again as a whole, which would take minutes; only
-            once, when nothing is known of them yet.
-        optimise_share: the same for optimising everything: what is left of strain after each step adds up.
-        relax: how far a change is followed.
-    """
-
-    anew_up_to: int = 600
-    whole_share: float = 0.1
-    whole_up_to: int = 3000
-    optimise_share: float = 0.01
-    relax: RelaxSettings = field(default_factory=RelaxSettings)
 
 
 class Steps:
@@ -87,6 +66,15 @@ class Steps:
     def maps(self) -> frozenset[MapId]:
         """Which maps are in it."""
         return frozenset(self._sheets)
+
+    @property
+    def stale(self) -> bool:
+        """Whether everything should be decided again, and no step does it."""
+        few = sum(len(sheet.nodes) for sheet in self._sheets.values()) <= self._steps.whole_up_to
+        return not few and self._changed_enough()
+
+    def _changed_enough(self) -> bool:
+        return self._since > self._steps.whole_share * max(len(self._all.factors), 1)
 
     def begin(self, merged: MergedMap, some: Set[MapId], verdicts: Verdicts, rulings: Rulings) -> None:
         """Take over what was merged otherwise of some maps: which links are believed, and where nodes are."""
@@ -121,7 +109,7 @@ class Steps:
             self._since += len(lost)
             self._touched |= ends_of(lost)
         few = sum(len(one.nodes) for one in maps.values()) <= self._steps.whole_up_to or not ledger.bundles
-        whole = few and self._since > self._steps.whole_share * max(len(self._all.factors), 1)
+        whole = few and self._changed_enough()
         if whole:
             changed = set(self._sheets)
             fresh = self._doubt_all(verdicts, rulings)

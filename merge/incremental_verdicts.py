@@ -22,6 +22,13 @@ class Verdicts:
         self._partners: dict[MapId, set[MapId]] = {}
         self._news: set[MapPair] = set()
 
+    def copy(self) -> Verdicts:
+        """The same as it is now; there is no news in it."""
+        other = Verdicts()
+        other._between = {maps: dict(known) for maps, known in self._between.items()}
+        other._partners = {one: set(others) for one, others in self._partners.items()}
+        return other
+
     def put(self, pair: Pair, verdict: Verdict) -> None:
         """Take note of what was found of a pair."""
         maps = pair[0].map, pair[1].map

@@ -15,7 +15,8 @@ from hybridmap.pose_arrays import compose_poses
 from merge.incremental import Islands
 from merge.incremental_factors import Factors, RelaxSettings
 from merge.incremental_graph import WideGraph
-from merge.incremental_steps import Steps, StepSettings
+from merge.incremental_settings import StepSettings
+from merge.incremental_steps import Steps
 from merge.merged import MergedMap
 from merge.merging import MergeSettings
 from merge.posegraph import Measurement, PoseGraph

@@ -17,7 +17,7 @@ from merge.consistency import Sorted
 from merge.incremental import Islands
 from merge.incremental_judgement import Judge
 from merge.incremental_pools import Pools
-from merge.incremental_steps import StepSettings
+from merge.incremental_settings import StepSettings
 from merge.incremental_verdicts import Verdicts
 from merge.links import Link
 from merge.merging import merge_maps
