@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -28,10 +29,14 @@ from mapweave.trial.recording import Recording
 from mapweave.trial.run import TrialOptions, run_trial
 from mapweave.trial.scenario import Scenario, load_scenario, scenario_path
 from mapweave.trial.score import node_truth
+from merge.links import Link
+from merge.verification import verify
 from sim.world import PanelSet
 
 VIEW = 0.5
 """Two images share a view if each shows at least this share of what the other one shows."""
+SIDE = math.radians(45.0)
+"""What two images show from directions further apart than this, they do not show from one side."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,10 @@ class Run:
         false_merges: pairs of maps in one component that stand to each other wrongly, by as much.
         shared_views: pairs of nodes of different maps that truly share a view.
         linked_views: of these, pairs that a true link joins.
+        one_side: pairs that share a view which both have from one side: what is counted lies within 45
+            degrees of the other's line of sight.
+        verified_one_side: of these, pairs that are truly recognised when one asks for them.
+        linked_one_side: of these, pairs that a true link joins.
         place_recall: as `mapweave sim run` has it: share of the chances to join a node's place to another
             map's that are taken; None without any.
         sim_s: simulated time, s.
@@ -67,6 +76,9 @@ class Run:
     false_merges: int
     shared_views: int
     linked_views: int
+    one_side: int
+    verified_one_side: int
+    linked_one_side: int
     place_recall: float | None
     sim_s: float
     wall_s: float
@@ -84,6 +96,8 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
     whole = HybridMap(recording.merged.changes)
     links = [edge for edge in whole.edges.values() if edge.kind is EdgeKind.MERGED]
     views = shared_views(recording, scenario, seed, truth)
+    one_side = shared_views(recording, scenario, seed, truth, SIDE)
+    found = [verify(whole.nodes[a], whole.nodes[b]) for a, b in sorted(sorted(pair) for pair in one_side)]
     right = {frozenset((link.a, link.b)) for link in links if not is_false(link, truth)}
     return Run(
         scenario=scenario.name,
@@ -103,6 +117,9 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
         ),
         shared_views=len(views),
         linked_views=len(views & right),
+        one_side=len(one_side),
+        verified_one_side=sum(isinstance(one, Link) and not is_false(one.edge(), truth) for one in found),
+        linked_one_side=len(one_side & right),
         place_recall=figures.link_recall,
         sim_s=figures.sim_s,
         wall_s=round(figures.wall_s, 1),
@@ -110,7 +127,11 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
 
 
 def shared_views(
-    recording: Recording, scenario: Scenario, seed: int, truth: Mapping[NodeId, Pose2]
+    recording: Recording,
+    scenario: Scenario,
+    seed: int,
+    truth: Mapping[NodeId, Pose2],
+    most_angle: float = math.pi,
 ) -> set[frozenset[NodeId]]:
     """Pairs of nodes of different maps whose images truly show the same surfaces.
 
@@ -119,11 +140,12 @@ def shared_views(
         scenario: that was tried.
         seed: of its world.
         truth: `world_from_robot` of each node.
+        most_angle: rad, between the lines of sight to what counts as shared.
     """
     panels = PanelSet.of(scenario.world(seed).panels)
     nodes = sorted(truth)
     camera = scenario.robots[0].camera.intrinsics
-    both = views_shared(panels, camera, [truth[node] for node in nodes], VIEW) >= VIEW
+    both = views_shared(panels, camera, [truth[node] for node in nodes], VIEW, most_angle) >= VIEW
     pairs = ((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(both, 1)))
     return {frozenset(pair) for pair in pairs if pair[0].map != pair[1].map}
 

@@ -1,16 +1,19 @@
 """Which images truly show the same surfaces: rays from one camera, looked for in the other, by brute force.
 
 A grid of rays goes through each image to the nearest surface. The point where it ends is seen by another
-camera too if it lies in that one's image and the ray from there to it ends at it, not before. Robots stand
-in nobody's way here: they were elsewhere a moment later.
+camera too if it lies in that one's image and the ray from there to it ends at it, not before. If both shall
+see it from one side, the two rays also meet at no more than a given angle: the walls of a corridor are seen
+from either end, and look alike to nobody. Robots hide nothing here: a moment later they were elsewhere.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2
@@ -26,7 +29,9 @@ FAR = 1e6
 """A ray that meets nothing is as long, m."""
 
 
-def views_shared(panels: PanelSet, camera: Camera, poses: Sequence[Pose2], least: float = 0.0) -> Array:
+def views_shared(
+    panels: PanelSet, camera: Camera, poses: Sequence[Pose2], least: float = 0.0, most_angle: float = math.pi
+) -> Array:
     """How much of what either of two images shows the other one shows too, whichever is less.
 
     Args:
@@ -34,6 +39,7 @@ def views_shared(panels: PanelSet, camera: Camera, poses: Sequence[Pose2], least
         camera: that took all the images.
         poses: N, `world_from_robot`.
         least: what is less than this need not be known.
+        most_angle: rad; what the two look at from directions further apart is not shared.
 
     Returns:
         (N, N), symmetric: of the rays of the one image that end somewhere, the share that ends where the
@@ -60,27 +66,32 @@ def views_shared(panels: PanelSet, camera: Camera, poses: Sequence[Pose2], least
         share = 1.0
         for one, other in ((i, j), (j, i)):
             if share >= least:
-                share = min(share, _share(panels, camera, poses[other], eyes[other], seen[one], least))
+                points = seen[one]
+                there = _seen(panels, camera, poses[other], eyes[other], points, least)
+                ways = points - eyes[one], points - eyes[other]
+                cosines = (ways[0] * ways[1]).sum(axis=1) / np.linalg.norm(ways, axis=2).prod(axis=0)
+                there &= cosines >= math.cos(most_angle) - 1e-9
+                share = min(share, float(there.mean()) if len(points) else 0.0)
         shared[i, j] = shared[j, i] = share if share >= least else 0.0
     return shared
 
 
-def _share(
+def _seen(
     panels: PanelSet, camera: Camera, pose: Pose2, origin: Array, points: Array, least: float
-) -> float:
-    """Of some points, the share that a camera sees; an upper bound if that is less than `least`."""
-    if not len(points):
-        return 0.0
+) -> NDArray[np.bool_]:
+    """(N,) which of some points a camera sees; where fewer than `least` can be, which are in its image."""
     flat = pose.inverse().apply(points[:, :2])
-    found = np.asarray(camera.contains(camera.project(np.column_stack([flat, points[:, 2]]))))
-    if found.mean() < max(least, 1e-9):
-        return float(found.mean())
+    found: NDArray[np.bool_] = np.array(
+        camera.contains(camera.project(np.column_stack([flat, points[:, 2]])))
+    )
+    if not found.any() or found.mean() < least:
+        return found
     inside = np.flatnonzero(found)
     ways = points[inside] - origin
     distances = np.linalg.norm(ways, axis=1)
     short = 1.0 - MARGIN_SHARE - MARGIN / np.maximum(distances, MARGIN)
     found[inside] = lengths(panels, origin, ways) >= short
-    return float(found.mean())
+    return found
 
 
 def lengths(panels: PanelSet, origin: Array, directions: Array) -> Array:

@@ -21,7 +21,7 @@ from sim.texture import Texture
 from sim.world import PanelSet, World
 from sim.worlds.catalog import make_world
 
-RUN = Run("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 40, 8, 0.7, 150.0, 90.0)
+RUN = Run("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 40, 8, 10, 8, 7, 0.7, 150.0, 90.0)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +69,24 @@ def test_views_are_shared_by_those_that_look_at_one_thing(world: World) -> None:
     assert shared[0, 1] > 0.6 and shared[0, 2] == 0.0
     wanted = views_shared(panels, WEBCAM, [here, near, back], least=0.5)
     assert np.allclose(wanted, np.where(shared >= 0.5, shared, 0.0))
+
+
+def test_a_wall_is_not_seen_from_one_side_by_who_looks_along_it_from_either_end() -> None:
+    """A wall of 20 m along x, and two cameras that look at each other along it."""
+    corner, along, down = (
+        np.array([[-10.0, 0.5, 1.5]]),
+        np.array([[20.0, 0.0, 0.0]]),
+        np.array([[0, 0, -1.5]]),
+    )
+    panels = PanelSet(corner, along, down, [Texture.plain(90)])
+    if (lengths(panels, np.array([0.0, 0.0, 0.3]), np.array([[0.0, 1.0, 0.0]])) > 50.0).all():
+        panels = PanelSet(corner + along, -along, down, [Texture.plain(90)])
+    poses = [Pose2(-4.0, 0.0, 0.3), Pose2(4.0, 0.0, np.pi - 0.3), Pose2(-3.6, 0.0, 0.3)]
+    any_side, one_side = (
+        views_shared(panels, WEBCAM, poses, most_angle=angle) for angle in (np.pi, np.pi / 4)
+    )
+    assert any_side[0, 1] > 0.3 and one_side[0, 1] < 0.05
+    assert one_side[0, 2] == pytest.approx(any_side[0, 2], abs=0.05) and one_side[0, 2] > 0.3
 
 
 def test_what_stands_between_hides() -> None:
@@ -135,9 +153,10 @@ def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.Monkey
 
 
 def test_median_and_sums_over_runs() -> None:
-    other = Run("office", 4, 60, 3, 2, 0.04, 5, 1, 1, 20, 4, None, 150.0, 80.0)
+    other = Run("office", 4, 60, 3, 2, 0.04, 5, 1, 1, 20, 4, 0, 0, 0, None, 150.0, 80.0)
     found = figures([RUN, other])
     assert found["merged_ate_m_median"] == pytest.approx(0.03)
     assert found["components"] == 1.5 and found["whole"] == 0.5
     assert found["false_merges"] == 1 and found["false_links"] == 1
     assert found["link_recall"] == pytest.approx(12 / 60) and found["place_recall"] == 0.7
+    assert found["link_recall_one_side"] == pytest.approx(0.7) and found["verified_one_side"] == 0.8
