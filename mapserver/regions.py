@@ -2,7 +2,8 @@
 
 A view of one of two rooms that look the same may be like no node of the other room, since nobody has looked
 there from that side. But the nodes around the place that was recognised have their doubles there, and all of
-them imply one and the same motion from room to room. Where that takes the robot it may be as well.
+them imply one and the same motion from room to room. Where that takes the robot it may be as well: if what it
+sees lies on what is there twice, or if nobody has looked there at where it would lie.
 """
 
 from __future__ import annotations
@@ -19,9 +20,13 @@ from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from mapserver.doubles import between, same_place
 from mapserver.lookalikes import LookAlike, LookAlikes, Retrieval
-from mapserver.seenplaces import Sighting
+from mapserver.seenplaces import THING_SIGMA, Sighting, extent
 from merge.merged import MergedMap
 
+WELL_INSIDE = 0.85
+"""Of a camera's semi-aperture: of what is nearer to the edge of its image a node keeps little."""
+ALIKE_TURN, ALIKE_TIMES = math.radians(35.0), 1.6
+"""A thing looks about the same from directions that differ less, and up to so many times as far away."""
 UNTOLD_XY, UNTOLD_HEADING = 0.1, 0.05
 """m and rad, what a way between two nodes of a map that is not merged may be off."""
 
@@ -33,16 +38,17 @@ class RegionSettings:
     Attributes:
         least_nodes: nodes around it whose doubles imply the same motion. 0: regions are not looked at.
         least_share: of the landmarks that the view shows, how many must lie on what these doubles show.
+        most_looked_at: how many of them may lie, in the other region, where somebody has looked and has not
+            seen them, if the doubles show less. Then they must show more than one thing.
         nodes: around a place that are asked at most.
-        first: that are asked before it is left, if none of them looks like anything.
         reach: nodes farther from the robot are not asked, m.
         beside: a landmark nearer than this to one that a double shows is shown by it too, m.
     """
 
     least_nodes: int = 2
     least_share: float = 0.5
+    most_looked_at: float = 0.2
     nodes: int = 8
-    first: int = 3
     reach: float = 3.0
     beside: float = 0.35
 
@@ -54,7 +60,7 @@ class Counterpart:
     Attributes:
         node: the nearest there of those that look like a node here.
         node_from_robot: posture there.
-        features: of the view, on what is there twice.
+        features: of the view, on what is or may be there twice.
         nodes: how many nodes here say so.
     """
 
@@ -149,11 +155,37 @@ class Regions:
         best: tuple[list[_Vote], NDArray[np.bool_]] | None = None
         for party in self._parties(votes):
             shown = np.concatenate([vote.shown for vote in party])
-            away = np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1)
-            twice = away < s.beside
-            if twice.mean() >= s.least_share and (best is None or twice.sum() > best[1].sum()):
+            twice = np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1) < s.beside
+            if twice.mean() < s.least_share:
+                best_told = max(party, key=lambda vote: (len(vote.shown), vote.alike.other.id))
+                missed = self._looked_at(best_told, robot, points, node) & ~twice
+                if missed.mean() > s.most_looked_at or extent(shown) < THING_SIGMA:
+                    continue
+                twice = np.logical_not(missed)
+            if best is None or twice.sum() > best[1].sum():
                 best = party, twice
         return None if best is None else self._told(seen, node, best[0], features[best[1]])
+
+    def _looked_at(self, vote: _Vote, robot: Pose2, points: Array, node: Node) -> NDArray[np.bool_]:
+        """(K,) which points somebody would have seen in the other region, about as the robot sees them.
+
+        Args:
+            vote: says where the other region is.
+            robot: `frame_from_robot`, here.
+            points: (K, 3) m, what it sees, in the frame here.
+            node: whose camera stands for all.
+        """
+        if not isinstance(vote.frame, int):
+            return np.ones(len(points), np.bool_)
+        there = (vote.robot @ robot.inverse()).apply(points)
+        nodes, means = self._near(vote.frame, vote.robot)
+        living = [self._node_of(one) is not None for one in nodes]
+        own, own_bearings = _ways(there, vote.robot.vector[None])
+        away, bearings = _ways(there, means[living])
+        inside = np.cos(bearings - means[living, 2:]) > math.cos(WELL_INSIDE * node.camera.semi_aperture)
+        alike = np.cos(bearings - own_bearings) > math.cos(ALIKE_TURN)
+        alike &= (away < ALIKE_TIMES * own) & (own < ALIKE_TIMES * away)
+        return np.asarray((inside & alike).any(axis=0), np.bool_)
 
     def _told(
         self, seen: Sighting, node: Node, party: Sequence[_Vote], features: NDArray[np.int64]
@@ -179,37 +211,33 @@ class Regions:
             points: (K, 3) m, what the robot sees, in the frame.
             ranked: where to look for neighbours in a map that is not merged.
         """
-        s = self._settings
         if isinstance(frame, int):
-            graph = self._merged.graphs[frame]
-            away = np.hypot(graph.means[:, 0] - robot.x, graph.means[:, 1] - robot.y)
-            near = np.flatnonzero(away < s.reach)
-            near = near[np.argsort(away[near], kind="stable")][: 3 * s.nodes]
-            ids, means = [graph.nodes[k] for k in near.tolist()], graph.means[near]
+            ids, means = self._near(frame, robot)
         else:
             same = [one for one in ranked if one.map == frame and self._merged.component_of(one) is None]
             nodes = [one for one in map(self._node_of, same) if one is not None]
-            ids, means = (
-                [one.id for one in nodes],
-                np.array([one.map_from_robot.mean.vector for one in nodes]),
-            )
+            ids = [one.id for one in nodes]
+            means = np.array([one.map_from_robot.mean.vector for one in nodes]).reshape(-1, 3)
         yield node
-        if not ids:
-            return
-        way = points[None, :, :2] - means[:, None, :2]
-        bearings = np.arctan2(way[..., 1], way[..., 0]) - means[:, None, 2]
+        bearings = _ways(points, means)[1] - means[:, 2:]
         seen = np.cos(bearings) > math.cos(node.camera.semi_aperture)
-        for k in np.argsort(-seen.sum(axis=1), kind="stable")[: s.nodes].tolist():
+        for k in np.argsort(-seen.sum(axis=1), kind="stable")[: self._settings.nodes].tolist():
             one = self._node_of(ids[k])
             if one is not None and one.id != node.id:
                 yield one
 
+    def _near(self, component: int, at: Pose2) -> tuple[list[NodeId], Array]:
+        """The nodes nearest to a posture in a component, within reach, and (N, 3) their postures."""
+        graph = self._merged.graphs[component]
+        away = np.hypot(graph.means[:, 0] - at.x, graph.means[:, 1] - at.y)
+        near = np.flatnonzero(away < self._settings.reach)
+        near = near[np.argsort(away[near], kind="stable")][: 3 * self._settings.nodes]
+        return [graph.nodes[k] for k in near.tolist()], graph.means[near]
+
     def _votes(self, around: Iterable[Node], frame: Frame, robot: Pose2) -> list[_Vote]:
-        """What the doubles of nodes say: none of the first few has one, and no others are asked."""
+        """What the doubles of nodes say."""
         votes: list[_Vote] = []
-        for k, one in enumerate(around):
-            if k == self._settings.first and not votes:
-                break
+        for one in around:
             frame_from_one = self._placed(one)[1]
             for alike in self._look_alikes(one):
                 other_frame, there = self._placed(alike.other)
@@ -243,3 +271,9 @@ class Regions:
 
     def _look_alikes(self, node: Node) -> list[LookAlike]:
         return self._alike.of(node, self._index, self._node_of, partial(between, self._merged))
+
+
+def _ways(points: Array, postures: Array) -> tuple[Array, Array]:
+    """(N, K) m and rad, how far and in which direction (K, 3) points are from (N, 3) postures."""
+    way = points[None, :, :2] - postures[:, None, :2]
+    return np.hypot(way[..., 0], way[..., 1]), np.arctan2(way[..., 1], way[..., 0])

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridmap.camera import Camera
 from hybridmap.node import Node, NodeId
-from hybridmap.pose import PoseGaussian
+from hybridmap.pose import Array, PoseGaussian
 from hybridmap.recognition import Recognition
 from mapserver.belief import Support
 
@@ -80,13 +80,20 @@ def is_lonely(node: Node, camera: Camera, found: Recognition) -> bool:
     agreeing = np.zeros(len(points), np.bool_)
     agreeing[found.pairs[:, 0]] = True
     on_it = points[agreeing & np.isfinite(points[:, 0])]
-    if len(on_it) < 3 or np.linalg.eigvalsh(np.cov(on_it[:, :2].T))[-1] > THING_SIGMA**2:
+    if len(on_it) < 3 or extent(on_it) > THING_SIGMA:
         return False
     there = found.node_from_robot.mean.inverse().apply(points)
     expected = points[camera.contains(camera.project(there)) & ~agreeing]
     away = np.linalg.norm(expected[:, None] - on_it[None], axis=2).min(axis=1) > BESIDE
     seen = min(found.evidence["seen"], 0.9)
     return float(away.sum()) * math.log(1.0 - seen) < math.log(MISSING_BY_CHANCE)
+
+
+def extent(points: Array) -> float:
+    """m, largest standard deviation of (K, 3) points seen from above."""
+    if len(points) < 2:
+        return 0.0
+    return math.sqrt(max(float(np.linalg.eigvalsh(np.cov(points[:, :2].T))[-1]), 0.0))
 
 
 def supported(places: Sequence[SeenPlace]) -> list[Support]:

@@ -101,6 +101,34 @@ def test_neighbours_tell_that_a_room_is_there_twice() -> None:
     assert here.probability + there.probability < 1.0 + 1e-9
 
 
+AROUND = (Pose2(0.0, 0.05, 1.55), Pose2(0.05, 0.0, -0.95), Pose2(0.0, 0.0, 2.8))
+"""From the stop: what shows nothing of what the view shows."""
+
+
+def test_where_nobody_has_looked_it_may_be_the_same() -> None:
+    """The nodes around have doubles, all in one direction; where the view's own would be there is none."""
+    here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate([SEEN, *AROUND])]
+    there = [
+        taken(5 + k, STOP @ look @ Pose2(0.06, 0.04, 0.05), AWAY, 20 + k) for k, look in enumerate(AROUND)
+    ]
+    nodes = [*here, *there]
+    answer = asked(nodes, joined(nodes)).answer(VIEW)
+    assert answer.certainty is Certainty.AMBIGUOUS
+    assert answer.candidates[1].node in {one.id for one in there}
+    # Somebody who looks there and sees other things settles it; one who looks from elsewhere does not.
+    for turn, told in ((0.0, Certainty.FOUND), (0.9, Certainty.AMBIGUOUS)):
+        other = taken(9, STOP @ SEEN @ Pose2(0.05, 0.0, turn), AWAY, 30, world=OTHER)
+        more = [*nodes, other]
+        assert asked(more, joined(more)).answer(VIEW).certainty is told
+    # One thing that is there twice says nothing of what lies beside it.
+    thing = [
+        replace(one, landmarks=one.landmarks.take(np.abs(one.landmarks.pixels[:, 0] - 160.0) < 35.0))
+        for one in there
+    ]
+    few = [*here[:2], thing[0]]
+    assert asked(few, joined(few), least_nodes=1).answer(VIEW).certainty is Certainty.FOUND
+
+
 def test_what_is_there_once_is_told() -> None:
     for nodes in (here_and_there(OTHER), here_and_there()[:3]):
         assert asked(nodes, joined(nodes)).answer(VIEW).certainty is Certainty.FOUND
@@ -111,7 +139,9 @@ def test_how_many_nodes_must_say_so_and_of_how_much_is_a_setting() -> None:
     merged = joined(nodes)
     # The node that was recognised and one neighbour have a double, the same one.
     assert asked(nodes, merged, least_nodes=3).answer(VIEW).certainty is Certainty.FOUND
-    assert asked(nodes, merged, least_share=0.9).answer(VIEW).certainty is Certainty.FOUND
+    assert (
+        asked(nodes, merged, least_share=0.9, most_looked_at=-1.0).answer(VIEW).certainty is Certainty.FOUND
+    )
     told = asked(nodes, merged, least_nodes=2, least_share=0.3).answer(VIEW)
     assert told.certainty is Certainty.AMBIGUOUS
 
