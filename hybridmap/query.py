@@ -36,6 +36,8 @@ class Certainty(StrEnum):
     """What a relocalization says of itself."""
 
     FOUND = "found"
+    PLACE = "place"
+    """The place is known, but not how far from its node the view was taken: the node has no depths."""
     AMBIGUOUS = "ambiguous"
     UNKNOWN = "unknown"
 
@@ -51,6 +53,7 @@ class Whereabouts:
         component: number of the node's component in the merged map.
         inliers: landmarks that agree.
         probability: that this place is the right one, 0 to 1.
+        distance_known: if not, only heading and direction are known, and the covariance says as much.
     """
 
     node: NodeId
@@ -59,6 +62,7 @@ class Whereabouts:
     component: int
     inliers: int
     probability: float
+    distance_known: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ def answer_record(answer: RelocalizeAnswer) -> dict[str, Any]:
     Returns:
         `certainty`, `reason` and `candidates`, best first: `node`; `node_from_robot` and `merged_from_robot`
         (None if the node lies nowhere yet), [m, m, rad]; `sigma` of the first, [m, m, rad]; `component`,
-        `inliers` and `probability`.
+        `inliers`, `probability` and `distance_known`.
     """
     candidates = []
     for place in answer.candidates:
@@ -28,5 +28,6 @@ def answer_record(answer: RelocalizeAnswer) -> dict[str, Any]:
             "component": place.component,
             "inliers": place.inliers,
             "probability": place.probability,
+            "distance_known": place.distance_known,
         })  # fmt: skip
     return {"certainty": str(answer.certainty), "reason": answer.reason, "candidates": candidates}

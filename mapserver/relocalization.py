@@ -20,6 +20,7 @@ from hybridmap.matching import match
 from hybridmap.node import Node, NodeId
 from hybridmap.query import RelocalizeAnswer, View
 from hybridmap.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
+from mapserver.appearance import Appearance, AppearanceSettings
 from mapserver.doubles import between, carried, elsewhere, same_place, unexplained
 from mapserver.judgement import Judge, JudgementSettings, unknown
 from mapserver.lookalikes import LookAlikes, Retrieval
@@ -36,6 +37,7 @@ class RelocalizationSettings:
         recognition: when a view counts as recognised.
         judgement: when a place that was recognised is told.
         regions: when a place counts as being there twice, by its surroundings.
+        appearance: when a node without depths is recognised.
         candidates: nodes that are compared with the view.
         explained_px: a match nearer than this to where a posture found elsewhere expects it speaks for that.
         faint: a node that looks so much less like the view than one that was recognised is not looked at.
@@ -44,6 +46,7 @@ class RelocalizationSettings:
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
     judgement: JudgementSettings = field(default_factory=JudgementSettings)
     regions: RegionSettings = field(default_factory=RegionSettings)
+    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     candidates: int = 16
     explained_px: float = 12.0
     faint: float = 0.25
@@ -75,6 +78,7 @@ class Relocalizer:
         self._settings = settings or RelocalizationSettings()
         self.alike = alike or LookAlikes(self._settings.recognition)
         self.judge = Judge(merged, self._settings.judgement)
+        self._appearance = Appearance(node_of, merged, self._settings.appearance)
         self._regions = Regions(index, node_of, merged, self.alike, self._settings.regions)
 
     def answer(self, view: View) -> RelocalizeAnswer:
@@ -86,7 +90,10 @@ class Relocalizer:
         if not ranked:
             return unknown("no node of any map has features like these")
         sightings, refusals = self.look(view, ranked)
-        return self.conclude(view, sightings, ranked) if sightings else unknown(_best_refusal(refusals))
+        if sightings:
+            return self.conclude(view, sightings, ranked)
+        by_looks = self._appearance.answer(view, [node_id for node_id, _ in ranked])
+        return by_looks or unknown(_best_refusal(refusals))
 
     def look(
         self, view: View, ranked: Sequence[tuple[NodeId, float]]

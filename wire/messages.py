@@ -188,7 +188,7 @@ def decode_known_answer(data: bytes) -> KnownAnswer:
 
 def _candidate(place: Whereabouts) -> list[object]:
     merged = b"" if place.merged_from_robot is None else pack_posture(place.merged_from_robot)
-    return [
+    parts = [
         list(place.node),
         pack_posture(place.node_from_robot),
         merged,
@@ -196,6 +196,7 @@ def _candidate(place: Whereabouts) -> list[object]:
         place.inliers,
         float(place.probability),
     ]
+    return parts if place.distance_known else [*parts, 0]
 
 
 def _read_candidate(reader: Reader, value: Any) -> Whereabouts:
@@ -211,6 +212,7 @@ def _read_candidate(reader: Reader, value: Any) -> Whereabouts:
         component=reader.as_integer(parts[3], "component", -1, MAX_NUMBER),
         inliers=reader.as_integer(parts[4], "inliers", 0, MAX_LANDMARKS),
         probability=reader.as_number(parts[5], "probability", 0.0, 1.0),
+        distance_known=len(parts) < 7 or reader.as_integer(parts[6], "distance known", 0, 1) == 1,
     )
 
 

@@ -30,6 +30,8 @@ REACH = 1.5
 """A place counts as mapped if the mapping robot has been this near to it, m,"""
 TURN = math.radians(20.0)
 """and looked into that direction, within this, rad."""
+NEAR = (LEVELS[-1][0], math.degrees(TURN))
+"""A node is the right place if it is that near, m and degrees."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,14 @@ class DriveMap:
                 best = answer.candidates[0]
                 place = str(best.node)
                 error_m, error_deg = self._error(best.node, best.node_from_robot.mean, true)
+            elif answer.certainty is Certainty.PLACE:
+                best = answer.candidates[0]
+                place = str(best.node)
+                error_m, error_deg = self._error(best.node, Pose2(), true)
             known = math.isfinite(error_m)
-            coarse = LEVELS[-1]
+            coarse = (
+                LEVELS[-1] if answer.certainty is Certainty.FOUND else (LEVELS[-1][0], math.degrees(TURN))
+            )
             yield Verdict(
                 query=f"{observation.stamp_ns / 1e9:.3f} s",
                 expected=None if true is None else self._covers(true),

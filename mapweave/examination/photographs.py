@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from agent.drivers.image_file import read_grey
@@ -27,36 +26,25 @@ from agent.vision.sift import Sift
 from hybridmap.bearing_recognition import recognise_bearings
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError
-from hybridmap.evidence import cells
-from hybridmap.matching import match
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
+from mapserver.appearance import agreeing, rivals
 from mapserver.placeindex import PlaceIndex
 from mapweave.examination.verdict import Verdict
 
 
 @dataclass(frozen=True)
 class PhotographSettings:
-    """When an image counts as recognised; the numbers are as in BearingRecognitionSettings where it has them.
+    """How questions are asked.
 
     Attributes:
         candidates: places that are compared with a question.
-        gate_px: largest distance from an epipolar line.
-        least_inliers: matches that agree.
-        least_share: of all matches.
-        least_cells: cells of the 6 x 4 grid with an inlier, in either image.
-        least_evidence: how much likelier than chance, nats.
         apart: places further from each other than so many images are not neighbours,
         comparable: and with this share of the best one's inliers the other one makes it ambiguous.
     """
 
     candidates: int = 8
-    gate_px: float = 2.0
-    least_inliers: int = 12
-    least_share: float = 0.5
-    least_cells: int = 4
-    least_evidence: float = 20.0
     apart: int = 2
     comparable: float = 0.6
 
@@ -107,35 +95,10 @@ def planar(node: Node, view: View) -> int:
     return 0 if found is None else found.inliers
 
 
-def general(node: Node, view: View, settings: PhotographSettings | None = None) -> int:
-    """By the fundamental matrix, which leaves a camera free in all six directions (OpenCV's RANSAC)."""
-    s = settings or PhotographSettings()
-    pairs = match(node.landmarks.codes, view.codes)
-    if len(pairs) < s.least_inliers:
-        return 0
-    here, there = node.landmarks.pixels[pairs[:, 0]], view.pixels[pairs[:, 1]]
-    _, mask = cv2.findFundamentalMat(here, there, cv2.FM_RANSAC, s.gate_px, 0.999, 2000)
-    agreeing = np.zeros(len(pairs), bool) if mask is None else mask[:, 0].astype(bool)
-    count = int(agreeing.sum())
-    if count < max(s.least_inliers, s.least_share * len(pairs)):
-        return 0
-    if evidence(count, len(pairs), s.gate_px, view.camera.height) < s.least_evidence:
-        return 0
-    spread = min(cells(here[agreeing], node.camera), cells(there[agreeing], view.camera))
-    return count if spread >= s.least_cells else 0
-
-
-def evidence(
-    inliers: int, matches: int, gate_px: float, height_px: int, used: int = 7, tries: int = 2000
-) -> float:
-    """Nats: Chernoff's bound on so many wrong matches near their lines, without those that made the lines."""
-    inliers, matches = inliers - used, matches - used
-    chance = 2.0 * gate_px / height_px
-    if matches <= 0 or inliers <= chance * matches:
-        return 0.0
-    share = inliers / matches
-    rest = (1.0 - share) * math.log((1.0 - share) / (1.0 - chance)) if share < 1.0 else 0.0
-    return matches * (share * math.log(share / chance) + rest) - math.log(tries)
+def general(node: Node, view: View) -> int:
+    """By the fundamental matrix, as a map server does (mapserver.appearance)."""
+    found = agreeing(node, view)
+    return 0 if found is None else len(found)
 
 
 GEOMETRIES: dict[str, Geometry] = {"general": general, "planar": planar}
@@ -193,11 +156,11 @@ class AppearanceMap:
     def _judge(self, ranked: list[int], view: View, geometry: Geometry) -> tuple[Certainty, int | None]:
         s = self._settings
         inliers = {number: geometry(self._nodes[number], view) for number in ranked}
-        best = max(ranked, key=lambda number: inliers[number], default=None)
-        if best is None or not inliers[best]:
+        seen = {number: count for number, count in inliers.items() if count}
+        if not seen:
             return Certainty.UNKNOWN, None
-        rivals = [n for n in ranked if abs(n - best) > s.apart and inliers[n] >= s.comparable * inliers[best]]
-        return (Certainty.AMBIGUOUS if rivals else Certainty.FOUND), best
+        best, *others = rivals(seen, lambda one, other: abs(one - other) <= s.apart, s.comparable)
+        return (Certainty.AMBIGUOUS if others else Certainty.FOUND), best
 
     def _view(self, path: Path) -> View:
         return self._sift.extract(read_grey(path, self._camera)).view(self._camera)

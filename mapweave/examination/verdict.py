@@ -11,6 +11,8 @@ import numpy as np
 
 from hybridmap.query import Certainty
 
+SURE = (Certainty.FOUND, Certainty.PLACE)
+"""Answers that name one place."""
 LEVELS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 """Position (m) and heading (degrees) within which an answer is fine, medium, coarse (Sattler et al. 2018)."""
 
@@ -56,14 +58,16 @@ def figures(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     Returns:
         `recall_at_1`, of the questions whose place is mapped, those answered FOUND and right;
         `retrieved_at_1`, those whose first candidate is right, before it is verified; `precision`, of the
-        answers FOUND, those that are right; `unknown_share` and `ambiguous_share` of all questions;
-        `false_accept`, of the questions whose place is not mapped, those answered FOUND and wrongly; errors
-        of the answers FOUND; times.
+        answers FOUND, those that are right; `by_looks`, answers PLACE, and how many of them are right;
+        `place_at_1`, of the questions whose place is mapped, FOUND or PLACE and right; `unknown_share` and
+        `ambiguous_share` of all questions; `false_accept`, of the questions whose place is not mapped, those
+        answered FOUND or PLACE and wrongly; errors of the answers FOUND; times.
     """
     expected = [v for v in verdicts if v.expected]
     elsewhere = [v for v in verdicts if v.expected is False]
     found = [v for v in verdicts if v.certainty is Certainty.FOUND]
     told = [v for v in found if v.right is not None]
+    by_looks = [v for v in verdicts if v.certainty is Certainty.PLACE]
     report: dict[str, Any] = {
         "queries": len(verdicts),
         "expected": len(expected),
@@ -71,9 +75,12 @@ def figures(verdicts: Sequence[Verdict]) -> dict[str, Any]:
         "recall_at_1": _share([v.certainty is Certainty.FOUND and bool(v.right) for v in expected]),
         "retrieved_at_1": _share([bool(v.first) for v in expected if v.first is not None]),
         "precision": _share([bool(v.right) for v in told]),
+        "by_looks": len(by_looks),
+        "by_looks_precision": _share([bool(v.right) for v in by_looks if v.right is not None]),
+        "place_at_1": _share([v.certainty in SURE and bool(v.right) for v in expected]),
         "unknown_share": _share([v.certainty is Certainty.UNKNOWN for v in verdicts]),
         "ambiguous_share": _share([v.certainty is Certainty.AMBIGUOUS for v in verdicts]),
-        "false_accept": _share([v.certainty is Certainty.FOUND and v.right is False for v in elsewhere]),
+        "false_accept": _share([v.certainty in SURE and v.right is False for v in elsewhere]),
     }
     if any(math.isfinite(v.error_m) for v in found):
         for metres, degrees in LEVELS:

@@ -16,8 +16,8 @@ import skimage.data
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
+from mapserver.appearance import evidence
 from mapweave.cli import main
-from mapweave.examination.photographs import evidence
 from mapweave.examination.verdict import Verdict, figures
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
