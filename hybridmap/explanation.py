@@ -75,7 +75,8 @@ class PairExplanation:
         residuals_px: (K,) px, how far these are from where the posture predicts them (NaN: behind the image).
         a_from_b: the posture that the landmarks give; None if they agree on none.
         evidence: numbers of hybridmap.recognition, empty without a posture.
-        probability: that the link is right, see merge.credence; None without a posture.
+        probability: that the link is right, see merge.credence; None without a posture, or where
+            nothing joins the two.
         misfit: against the merged map; None if nothing joins the two.
         witnesses: other links between the same two pieces of map.
         claims: what the robots themselves say of the two by their edges, whether the servo could drive them,

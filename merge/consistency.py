@@ -197,8 +197,8 @@ def sort_links(
         rivals = sets
     # One of two stories that would each be believed alone is false: landmarks and links do not tell which.
     elif not reason and not _too_little(sets[1], s) and own.witnesses < s.dominance * others.witnesses:
-        places = f"{own.witnesses:.1f} independent places support one way of joining"
-        reason = f"ambiguous: {places}, {others.witnesses:.1f} another"
+        places = f"{own.witnesses:.1f} and {others.witnesses:.1f} independent places"
+        reason = f"ambiguous: two ways of joining contradict each other, with {places} behind"
         rivals = sets
     for k, link in enumerate(links):
         if k not in best:
@@ -253,7 +253,8 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
         return "no links"
     telling = [link for link in kept if link.telling]
     if not telling or not place_told(kept):
-        return f"what links show is found at other places too ({len(kept)} that agree)"
+        agree = "the link shows" if len(kept) == 1 else f"the {len(kept)} links that agree show"
+        return f"most of what {agree} is found at other places too"
     independent = independent_links(telling, s.least_links)
     if independent >= s.least_links:
         return ""

@@ -173,14 +173,14 @@ def _others(count: int) -> str:
     return f"and {more} between the same pieces of map agree{'s' if count == 1 else ''}"
 
 
-def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, float]:
-    odds = prior_odds(merged)
+def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, float | None]:
     component = merged.component_of(link.a)
     if component is None or component != merged.component_of(link.b):
-        return None, probability(0.0, odds)
+        # How many links of all stand tells nothing of these: maps that show alike things bring many.
+        return None, None
     (found,) = standpoints([link], merged.graphs[component], kept=kept)
     misfit = Misfit(found.merged_a_from_b, found.off, found.strain2, found.alone)
-    return misfit, probability(found.log_factor, odds)
+    return misfit, probability(found.log_factor, prior_odds(merged))
 
 
 def _witnesses(merged: MergedMap, link: Link, consistency: ConsistencySettings | None) -> tuple[Witness, ...]:

@@ -127,7 +127,10 @@ def _why_apart(
         return f"{head}: {reason_of(ruling)}"
     if refused:
         reasons = Counter(r.reason for r in refused)
-        told = [f"{reason} ({count} of them)" for reason, count in reasons.most_common(2)]
+        told = [
+            reason if count == len(refused) else f"{reason} ({count} of them)"
+            for reason, count in reasons.most_common(2)
+        ]
         many = (
             "1 link was found and does not stand"
             if len(refused) == 1

@@ -122,7 +122,7 @@ def test_one_place_is_not_believed_for_its_many_links_where_another_contradicts_
     assert len(sort_links(alike, two.a, two.b).kept) == 5
     found = sort_links([*alike, *true], two.a, two.b)
     assert not found.kept and len(found.rivals) == 2
-    assert all("ambiguous: 1.0 independent places" in one.reason for one in found.refused)
+    assert all("with 1.0 and 1.0 independent places" in one.reason for one in found.refused)
     # One link that contradicts is no other story; and two further places decide between the two.
     assert len(sort_links([*alike, true[0]], two.a, two.b).kept) == 5
     more = [two.true_link(k, k, 50) for k in (0, 1, 14, 15)]
