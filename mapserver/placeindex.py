@@ -206,13 +206,16 @@ class PlaceIndex:
             slots: where each node's landmarks are. Landmarks of no node are forgotten.
             landmarks: filled, with the ids of those slots.
         """
-        prints = np.zeros(max(slots.values(), default=-1) + 2, np.uint64)
+        ours = np.zeros(max(slots.values(), default=-1) + 2, np.bool_)
+        ours[np.fromiter(slots.values(), np.int64, len(slots))] = True
+        prints, strays = np.zeros(len(ours), np.uint64), set[int]()
         for block in landmarks.blocks():
-            slot = np.minimum(block.ids >> SLOT_BITS, len(prints) - 1)
+            # The last one is nobody's.
+            slot = np.minimum(block.ids >> SLOT_BITS, len(ours) - 1)
             np.add.at(prints, slot, landmark_prints(block.codes, block.ids & ((1 << SLOT_BITS) - 1)))
-        strays = np.setdiff1d(_slots_of(landmarks), np.fromiter(slots.values(), np.int64, len(slots)))
-        for slot in strays.tolist():
-            landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS)
+            strays.update((block.ids[~ours[slot]] >> SLOT_BITS).tolist())
+        for stray in sorted(strays):
+            landmarks.remove(stray << SLOT_BITS, (stray + 1) << SLOT_BITS)
         self._landmarks, self._lock = landmarks, landmarks.lock
         self._slots = dict(slots)
         self._nodes = {slot: node_id for node_id, slot in slots.items()}
@@ -239,8 +242,3 @@ class PlaceIndex:
         """Take in what was collected, and empty the lists."""
         self._landmarks.add(np.concatenate(codes), np.concatenate(ids))
         del codes[1:], ids[1:]
-
-
-def _slots_of(landmarks: LandmarkIndex) -> NDArray[np.int64]:
-    found = [np.unique(block.ids >> SLOT_BITS) for block in landmarks.blocks()]
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *found]))
