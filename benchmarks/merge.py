@@ -20,8 +20,8 @@ too, over that of GTSAM's batch optimum; null where the graph ended in pieces. W
 holds one g2o file of a graph in space for each robot: how many links between robots there are, and which of
 them pairwise consistency keeps, as pairs of keys.
 
-Without false links and step by step (see `benchmarks.merge_steps`), `steps` tells what it costs to optimise as
-a map of 1000 nodes grows, beside GTSAM's iSAM2 with its usual settings and with exact ones: ms of the
+Without false links and step by step (see `benchmarks.merge_steps`), `steps` tells what it costs to optimise
+as a map of 1000 nodes grows, beside GTSAM's iSAM2 with its usual settings and with exact ones: ms of the
 processor for a step, and `cost_ratio` to the batch optimum at the end.
 
 With `--scale` only that is measured: fleets of maps of 100 nodes (see `benchmarks.merge_scale`), and by the
