@@ -79,6 +79,12 @@ class LookAlikes:
         entry = self._known.get(node.id)
         return entry is not None and unchanged(entry.node, node)
 
+    def in_place(self, a: Node, b: Node, a_from_b: Pose2) -> int:
+        """How many landmarks match, and lie where a posture has them."""
+        marks = b.landmarks
+        pairs = match(a.landmarks.codes, marks.codes, self._recognition.matching)
+        return len(pairs) - unexplained(a, pairs, marks.pixels, b.camera, a_from_b, EXPLAINED_PX)
+
     def of(
         self,
         node: Node,

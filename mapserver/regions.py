@@ -27,6 +27,8 @@ WELL_INSIDE = 0.85
 """Of a camera's semi-aperture: of what is nearer to the edge of its image a node keeps little."""
 ALIKE_TURN, ALIKE_TIMES = math.radians(35.0), 1.6
 """A thing looks about the same from directions that differ less, and up to so many times as far away."""
+IN_COMMON = 3
+"""Matches that are in place: about one in 150 wrong ones is so by chance."""
 UNTOLD_XY, UNTOLD_HEADING = 0.1, 0.05
 """m and rad, what a way between two nodes of a map that is not merged may be off."""
 
@@ -158,7 +160,7 @@ class Regions:
             twice = np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1) < s.beside
             if twice.mean() < s.least_share:
                 best_told = max(party, key=lambda vote: (len(vote.shown), vote.alike.other.id))
-                missed = self._looked_at(best_told, robot, points, node) & ~twice
+                missed = self._looked_at(best_told, frame_from_node, robot, points, node) & ~twice
                 if missed.mean() > s.most_looked_at or extent(shown) < THING_SIGMA:
                     continue
                 twice = np.logical_not(missed)
@@ -166,26 +168,40 @@ class Regions:
                 best = party, twice
         return None if best is None else self._told(seen, node, best[0], features[best[1]])
 
-    def _looked_at(self, vote: _Vote, robot: Pose2, points: Array, node: Node) -> NDArray[np.bool_]:
+    def _looked_at(
+        self, vote: _Vote, frame_from_node: Pose2, robot: Pose2, points: Array, node: Node
+    ) -> NDArray[np.bool_]:
         """(K,) which points somebody would have seen in the other region, about as the robot sees them.
+
+        Who has a few landmarks in common with the node here, where they should be, has not looked in vain.
 
         Args:
             vote: says where the other region is.
+            frame_from_node: where the node is.
             robot: `frame_from_robot`, here.
             points: (K, 3) m, what it sees, in the frame here.
-            node: whose camera stands for all.
+            node: that was recognised; its camera stands for all.
         """
+        seen = np.ones(len(points), np.bool_)
         if not isinstance(vote.frame, int):
-            return np.ones(len(points), np.bool_)
-        there = (vote.robot @ robot.inverse()).apply(points)
-        nodes, means = self._near(vote.frame, vote.robot)
-        living = [self._node_of(one) is not None for one in nodes]
+            return seen
+        seen[:] = False
+        there_from_here = vote.robot @ robot.inverse()
+        there = there_from_here.apply(points)
         own, own_bearings = _ways(there, vote.robot.vector[None])
-        away, bearings = _ways(there, means[living])
-        inside = np.cos(bearings - means[living, 2:]) > math.cos(WELL_INSIDE * node.camera.semi_aperture)
-        alike = np.cos(bearings - own_bearings) > math.cos(ALIKE_TURN)
-        alike &= (away < ALIKE_TIMES * own) & (own < ALIKE_TIMES * away)
-        return np.asarray((inside & alike).any(axis=0), np.bool_)
+        for one_id, mean in zip(*self._near(vote.frame, vote.robot), strict=True):
+            away, bearings = _ways(there, mean[None])
+            inside = np.cos(bearings - mean[2]) > math.cos(WELL_INSIDE * node.camera.semi_aperture)
+            alike = np.cos(bearings - own_bearings) > math.cos(ALIKE_TURN)
+            alike &= (away < ALIKE_TIMES * own) & (own < ALIKE_TIMES * away)
+            looked = (inside & alike)[0]
+            one = self._node_of(one_id) if (looked & ~seen).any() else None
+            if one is None:
+                continue
+            one_from_node = Pose2.from_vector(mean).inverse() @ there_from_here @ frame_from_node
+            if self._alike.in_place(one, node, one_from_node) < IN_COMMON:
+                seen |= looked
+        return seen
 
     def _told(
         self, seen: Sighting, node: Node, party: Sequence[_Vote], features: NDArray[np.int64]
