@@ -58,6 +58,7 @@ class FleetLink:
         answer_timeout: float = 3.0,
         server: str = "s0",
         unsent: Callable[[], int] = lambda: 0,
+        placed: Callable[[], int] = lambda: 0,
     ) -> None:
         """Announce the agent and listen for missions.
 
@@ -68,6 +69,7 @@ class FleetLink:
             answer_timeout: how long a question may take, s.
             server: the map server that `server_in_reach` speaks of.
             unsent: counts the changes that it does not have yet; called from any thread.
+            placed: counts the nodes of the map that are known to lie in the merged map; likewise.
         """
         self._bus = bus
         self._keys = keys
@@ -77,7 +79,7 @@ class FleetLink:
         self._server_alive = False
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
         self._stamp_ns = 0
-        self._unsent = unsent
+        self._unsent, self._placed = unsent, placed
         self._timeout = answer_timeout
         self._missions: queue.SimpleQueue[Mission] = queue.SimpleQueue()
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
@@ -143,7 +145,13 @@ class FleetLink:
     def _now(self) -> AgentReport:
         traffic = self._bus.traffic if isinstance(self._bus, MeteredBus) else 0
         return AgentReport(
-            self._status, self._stamp_ns, self._map.epoch, self._unsent(), traffic, self.server_in_reach()
+            self._status,
+            self._stamp_ns,
+            self._map.epoch,
+            self._unsent(),
+            traffic,
+            self.server_in_reach(),
+            self._placed(),
         )
 
     def _tell_status(self, request: Request) -> None:

@@ -30,6 +30,7 @@ class AgentReport:
         unsent: changes that no server has on its disk yet.
         traffic: bytes that it has sent and received over the fleet's network since it began.
         linked: whether it sees its map server.
+        placed: nodes of its map of which it knows where they lie in the merged map.
     """
 
     status: Status
@@ -38,6 +39,7 @@ class AgentReport:
     unsent: int = 0
     traffic: int = 0
     linked: bool = False
+    placed: int = 0
 
     @property
     def fix_node(self) -> NodeId | None:
@@ -56,6 +58,7 @@ def encode_report(report: AgentReport) -> bytes:
             "unsent": report.unsent,
             "traffic": report.traffic,
             "linked": report.linked,
+            "placed": report.placed,
             "astray": status.astray,
             "doing": _one_line(status.doing),
             "detail": _one_line(status.detail),
@@ -118,6 +121,7 @@ def decode_report(payload: bytes) -> AgentReport:
             unsent=_typed(values, "unsent", int),
             traffic=_typed(values, "traffic", int),
             linked=_typed(values, "linked", bool),
+            placed=_typed(values, "placed", int),
         )
     except (KeyError, ValueError, InvalidValue) as error:
         raise InvalidMessage(f"agent status: {error}") from None

@@ -6,6 +6,7 @@ Ingest -> Store -> Upkeep -> Answers <- Services <- robots, over the bus
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.desk import Desk, DeskSettings
 from mapserver.explainer import Explainer, RulingBook
 from mapserver.findingskeeper import FindingsKeeper
+from mapserver.herald import Herald
 from mapserver.ingest import Ingest
 from mapserver.placekeeper import PlaceKeeper
 from mapserver.services import Services
@@ -30,6 +32,8 @@ from merge.merging import MergeSettings
 from wire.bus import Bus
 from wire.keys import Keys
 from wire.log_messages import Scalar, encode_record
+
+log = logging.getLogger(__name__)
 
 SETTLE_PATIENCE = 120.0
 """In lock-step: how long a question waits for the merged map, s."""
@@ -107,6 +111,8 @@ class MapServer:
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule
         )
+        # Wall time again: what is told now and then would not repeat itself.
+        self._herald = None if self._settings.lockstep else Herald(self._bus, self._keys, self._name)
         self._teller.start()
         if self._keeper:
             self._keeper.start()
@@ -121,6 +127,8 @@ class MapServer:
         self._desk.close()
         self._ingest.close()
         self._stop.set()
+        if self._herald:
+            self._herald.close()
         self._upkeep.close()
         if self._keeper:
             self._keeper.close()
@@ -177,3 +185,8 @@ class MapServer:
     def _tell(self) -> None:
         while not self._stop.wait(self._settings.status_every):
             self._bus.publish(self._keys.server_status(self._name), encode_record(self.status()))
+            if self._herald:
+                try:
+                    self._herald.tell(self._upkeep.answers.merged)
+                except Exception:  # a defect here must not end the status messages
+                    log.exception("agents are not told where their nodes lie")

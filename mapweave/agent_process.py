@@ -16,6 +16,7 @@ from agent.drivers.robot import Robot
 from agent.fleet import FleetLink
 from agent.journal import Journal
 from agent.kept import Kept
+from agent.merged_postures import MergedPostures
 from agent.mission import Idle, Mission
 from agent.observation import Observation, RobotDescription
 from agent.pipeline import Pipeline, PipelineSettings, Step
@@ -134,9 +135,15 @@ class Agent:
         self.replicator = Replicator(self._bus, self._keys, self.journal, map_id, servers=(options.server,))
         # In lock-step a slow machine must not turn an answer into none.
         patience = LOCKSTEP_PATIENCE if options.lockstep else 3.0
-        self._fleet = FleetLink(
-            self._bus, self._keys, map_id, patience, options.server, self.replicator.unacknowledged
+        # What comes by the clock would not repeat itself.
+        listening = not options.lockstep
+        self.merged_postures = (
+            MergedPostures(self._bus, self._keys, options.name, options.server) if listening else None
         )
+        self._fleet = FleetLink(
+            self._bus, self._keys, map_id, patience, options.server,
+            self.replicator.unacknowledged, self._placed,
+        )  # fmt: skip
         self.runner = Runner(pipeline, self._fleet, self.replicator, options.lockstep, self._on_step)
 
     @property
@@ -177,8 +184,13 @@ class Agent:
         write_map_file(path, MapFile("agent", str(self.map_id), contents, {}))
         return path
 
+    def _placed(self) -> int:
+        return self.merged_postures.count(self.map_id) if self.merged_postures else 0
+
     def _leave(self) -> None:
         self._fleet.close()
+        if self.merged_postures:
+            self.merged_postures.close()
         self.replicator.flush(10.0)
         self.replicator.close()
 

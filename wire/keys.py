@@ -7,6 +7,7 @@
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk
+    mapweave/1/<fleet>/server/<server>/postures/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, known, map, explain, rule
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
@@ -108,6 +109,14 @@ class Keys:
     def acks(self, agent: str) -> str:
         """Pattern: what any server says to an agent."""
         return f"{self.root}/server/*/ack/{check_name(agent)}"
+
+    def postures(self, server: str, agent: str) -> str:
+        """Where a server tells an agent how its nodes lie in the merged map, and answers for all of them."""
+        return f"{self.root}/server/{check_name(server)}/postures/{check_name(agent)}"
+
+    def all_postures(self, server: str) -> str:
+        """Pattern: what a server tells every agent."""
+        return f"{self.root}/server/{check_name(server)}/postures/*"
 
     def relocalize(self, server: str) -> str:
         """Where a server tells from which place a view was taken."""
@@ -229,6 +238,11 @@ class Keys:
     def parse_ack(self, key: str) -> tuple[str, str]:
         """Which server, to which agent."""
         server, agent = self._parse_names("server/*/ack/*", key)
+        return server, agent
+
+    def parse_postures(self, key: str) -> tuple[str, str]:
+        """Which server, to which agent."""
+        server, agent = self._parse_names("server/*/postures/*", key)
         return server, agent
 
     def parse_server_alive(self, key: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import msgpack
@@ -59,6 +60,7 @@ from wire.messages import (
     encode_route_request,
     encode_view,
 )
+from wire.posture_messages import MergedPosture, PostureNews
 from wire.ruling_codec import decode_rulings, encode_rulings
 
 Decoder = Callable[[bytes], object]
@@ -78,6 +80,7 @@ def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
         (decode_body, encode_body(NodePut(some.node(5)))),
         (Mark.decode, Mark(7, 2**63).encode()),
         (Head.decode, Head(5, 7, {"s0": 3, "s1": 7}).encode()),
+        (partial(PostureNews.decode, agent="r0"), postures(node, NodeId("r0", 4, 9)).encode("r0")),
         (Ack.decode, Ack(some.map, 5, 7, (Refusal(3, "because"), Refusal(5, "of this"))).encode()),
         (LogRequest.decode, LogRequest(3, 200).encode()),
         (LogAnswer.decode, LogAnswer(5, 3, 6, ((3, b"abc"), (5, b""))).encode()),
@@ -92,6 +95,13 @@ def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
         (unpack_map_file, pack_map_file(MapFile("merged", "t", (NodePut(node),), {node.id: (0, here)}))),
         *explanations(some, node, here),
     ]  # fmt: skip
+
+
+def postures(node: Node, gone: NodeId) -> PostureNews:
+    """Of two maps in two frames, and one that is gone."""
+    own, other = NodeId("r0", 3, 5), NodeId("r0", 4, 2)
+    places = {own: MergedPosture(own, Pose2(1, 2, 3)), other: MergedPosture(node.id, Pose2(-1, 0.5, 0))}
+    return PostureNews(2**63, 4, 5, places, (gone,))
 
 
 def explanations(some: SimpleNamespace, a: Node, posture: PoseGaussian) -> list[tuple[Decoder, bytes]]:
@@ -224,3 +234,10 @@ def messages_once(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
     if not _once:
         _once.extend(messages(some))
     return _once
+
+
+def test_postures_come_back_as_they_were(some: SimpleNamespace) -> None:
+    news = postures(some.node(3), NodeId("r0", 4, 9))
+    assert PostureNews.decode(news.encode("r0"), "r0") == news
+    with pytest.raises(InvalidMessage, match="r0's nodes, not of r1's"):
+        PostureNews.decode(news.encode("r0"), "r1")

@@ -41,6 +41,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
         KEYS.agents_alive(): KEYS.agent_alive(one),
         KEYS.agent_statuses(): KEYS.agent_status(one.agent),
         KEYS.acks(one.agent): KEYS.ack(server, one.agent),
+        KEYS.all_postures(server): KEYS.postures(server, one.agent),
         KEYS.any_relocalize(): KEYS.relocalize(server),
         KEYS.any_route(): KEYS.route(server),
         KEYS.any_known(): KEYS.known(server),
