@@ -68,7 +68,7 @@ class Exhaustive:
             rng = np.random.default_rng(zlib.crc32(str(place.node.id).encode()))
             verdict = examine_matches(place.node, view, pairs, self._settings, rng)
             if isinstance(verdict, Recognition):
-                lonely = is_lonely(place.node, view.camera, verdict)
+                lonely = is_lonely(place.node, view, verdict)
                 sightings.append(Sighting(place.node.id, verdict, lonely=lonely))
         most = np.argsort(-counts, kind="stable")[:RIVALS].tolist()
         ranked = [(self._place_of(k).node.id, float(counts[k])) for k in most]

@@ -122,7 +122,7 @@ class Relocalizer:
             seed = zlib.crc32(view.codes.tobytes(), zlib.crc32(str(node_id).encode()))
             verdict = examine_matches(node, view, pairs, s.recognition, np.random.default_rng(seed))
             if isinstance(verdict, Recognition):
-                lonely = is_lonely(node, view.camera, verdict)
+                lonely = is_lonely(node, view, verdict)
                 sightings.append(Sighting(node_id, verdict, lonely=lonely))
                 best_score = max(best_score, score)
             else:

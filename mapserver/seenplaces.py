@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Array, PoseGaussian
+from hybridmap.query import View
 from hybridmap.recognition import Recognition
 from mapserver.belief import Support
 
@@ -19,6 +20,9 @@ THING_SIGMA = 0.35
 BESIDE = 0.35
 """What is farther from all landmarks on a thing is not of it, m."""
 MISSING_BY_CHANCE = 0.05
+HIDDEN_WIDTH, HIDDEN_AGREEING, HIDDEN_FEATURES = 0.4, 0.1, 3
+"""A person before the camera hides at most this share of an image's width, from top to bottom: at most this
+share of what agrees is seen there, and at least so many features of his own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +69,15 @@ class SeenPlace:
         return any(one.alike is not None for one in self.sightings)
 
 
-def is_lonely(node: Node, camera: Camera, found: Recognition) -> bool:
+def is_lonely(node: Node, view: View, found: Recognition) -> bool:
     """Whether a recognition rests on one thing, and nothing is seen of what should be seen beside it.
 
     A thing can be moved, and takes all that is told from it along. Landmarks away from it, of which each
-    would be seen as often as those on it are, are then missing.
+    would be seen as often as those on it are, are then missing. What one person may hide is not.
 
     Args:
         node: the place.
-        camera: that took the view.
+        view: the image's features.
         found: that the view shows the place.
     """
     points = node.landmarks.points_in_robot(node.camera)
@@ -83,10 +87,34 @@ def is_lonely(node: Node, camera: Camera, found: Recognition) -> bool:
     if len(on_it) < 3 or extent(on_it) > THING_SIGMA:
         return False
     there = found.node_from_robot.mean.inverse().apply(points)
-    expected = points[camera.contains(camera.project(there)) & ~agreeing]
-    away = np.linalg.norm(expected[:, None] - on_it[None], axis=2).min(axis=1) > BESIDE
+    pixels = view.camera.project(there)
+    expected = view.camera.contains(pixels) & ~agreeing
+    away = np.linalg.norm(points[expected][:, None] - on_it[None], axis=2).min(axis=1) > BESIDE
+    missing = pixels[expected][away]
     seen = min(found.evidence["seen"], 0.9)
-    return float(away.sum()) * math.log(1.0 - seen) < math.log(MISSING_BY_CHANCE)
+    count = len(missing) - hidden(missing[:, 0], view, found)
+    return count * math.log(1.0 - seen) < math.log(MISSING_BY_CHANCE)
+
+
+def hidden(missing: Array, view: View, found: Recognition) -> int:
+    """How many landmarks one person who stands in the view may hide, at most.
+
+    Args:
+        missing: (M,) px, how far to the right they should be seen.
+        view: the image's features.
+        found: that the view shows the place.
+    """
+    agreeing = np.zeros(len(view), np.bool_)
+    agreeing[found.pairs[:, 1]] = True
+    starts = missing[:, None]
+    ends = starts + HIDDEN_WIDTH * view.camera.width
+
+    def inside(across: Array) -> NDArray[np.int64]:
+        return np.asarray(((across >= starts) & (across <= ends)).sum(axis=1), np.int64)
+
+    own, others = inside(view.pixels[agreeing, 0]), inside(view.pixels[~agreeing, 0])
+    possible = (own <= HIDDEN_AGREEING * agreeing.sum()) & (others >= HIDDEN_FEATURES)
+    return int(inside(missing)[possible].max(initial=0))
 
 
 def extent(points: Array) -> float:

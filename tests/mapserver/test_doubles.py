@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import Sensing, room, take_node, take_view
+from benchmarks.synthetic import CAMERA, Sensing, room, take_node, take_view
 from hybridmap.camera import Camera
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -16,10 +16,11 @@ from hybridmap.recognition import Recognition, RecognitionSettings, recognise
 from mapserver.doubles import Doubles, carried, unexplained
 from mapserver.placeindex import PlaceIndex
 from mapserver.relocalization import Relocalizer
-from mapserver.seenplaces import Sighting, is_lonely
+from mapserver.seenplaces import Sighting, hidden, is_lonely
 from merge.merged import MergedMap, Placement
 from merge.posegraph import solve_graph
 
+NOTHING = np.zeros((0, 2))
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 AT = Pose2(2.2, 2.0, 0.3)
 WORLD = room(0, 0, 5, 4, 500, np.random.default_rng(1))
@@ -118,10 +119,13 @@ def test_what_rests_on_one_thing_is_lonely_only_if_the_rest_is_missing() -> None
     assert found is not None
     evidence = {**found.evidence, "seen": 0.4}
 
-    def resting_on(landmarks: np.ndarray, camera: Camera) -> bool:
+    def resting_on(landmarks: np.ndarray, camera: Camera, others: np.ndarray = NOTHING) -> bool:
+        """Of a view that shows these landmarks, and other features at these pixels."""
+        pixels = np.concatenate([one.landmarks.pixels[landmarks], others]).astype(np.float32)
+        seen = View(pixels, np.zeros((len(pixels), 32), np.uint8), camera)
         pairs = np.column_stack([landmarks, np.arange(len(landmarks))])
         told: Recognition = replace(found, node_from_robot=HERE, pairs=pairs, evidence=evidence)
-        return is_lonely(one, camera, told)
+        return is_lonely(one, seen, told)
 
     spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(points[near][:, :2].T))[-1]))
     assert spread < 0.35
@@ -133,3 +137,28 @@ def test_what_rests_on_one_thing_is_lonely_only_if_the_rest_is_missing() -> None
         one.camera, width=16, height=16, cx=float(one.camera.cx - u) + 8, cy=float(one.camera.cy - v) + 8
     )
     assert not resting_on(near, narrow)
+    # Where the whole view is full of other things, some of it may be hidden, not all.
+    clutter = np.random.default_rng(5).uniform(0, [320, 240], (60, 2))
+    assert resting_on(near, one.camera, clutter)
+
+
+def test_one_person_hides_what_lies_in_one_strip_where_hardly_anything_agrees() -> None:
+    """Against all strips that begin at a missing landmark, feature by feature."""
+    rng, counts = np.random.default_rng(6), set()
+    found = recognise(node(1, AT, 2), take_view(WORLD, AT, np.random.default_rng(4))[0], None, rng)
+    assert found is not None
+    for _ in range(60):
+        agree, missing = int(rng.integers(5, 20)), rng.uniform(0, 320, int(rng.integers(1, 15)))
+        across = np.concatenate([rng.normal(rng.uniform(60, 260), 40, agree), rng.uniform(0, 320, 20)])
+        pixels = np.column_stack([across, np.full(len(across), 100.0)]).astype(np.float32)
+        view = View(pixels, np.zeros((len(across), 32), np.uint8), CAMERA)
+        told = replace(found, pairs=np.column_stack([np.arange(agree)] * 2))
+        most = 0
+        for left in missing:
+            strip = [k for k, u in enumerate(pixels[:, 0]) if left <= u <= left + 128]
+            own, others = [k for k in strip if k < agree], [k for k in strip if k >= agree]
+            if len(own) <= agree / 10 and len(others) >= 3:
+                most = max(most, sum(left <= u <= left + 128 for u in missing))
+        assert hidden(missing, view, told) == most
+        counts.add(most)
+    assert len(counts) > 4 and 0 in counts
