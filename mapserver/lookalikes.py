@@ -74,6 +74,10 @@ class LookAlikes:
         """See Doubles.compare."""
         return self._doubles.compare(a, b)
 
+    def __contains__(self, node_id: NodeId) -> bool:
+        """Whether this was found out of a node, as it is or as it was."""
+        return node_id in self._known
+
     def knows(self, node: Node) -> bool:
         """Whether this was found out."""
         entry = self._known.get(node.id)

@@ -125,7 +125,9 @@ class Regions:
         if not self._settings.least_nodes:
             return 0
         if self._left is None:
-            self._left = sorted(self._merged.postures, reverse=True)
+            self._left = sorted(
+                (one for one in self._merged.postures if one not in self._alike), reverse=True
+            )
         while self._left and most > 0:
             node = self._node_of(self._left.pop())
             if node is not None and not self._alike.knows(node):
