@@ -96,12 +96,12 @@ class MergeExamination:
         }
 
     def _alone(self) -> dict[str, float | None]:
-        """Error of each robot's own map, as it came from the robot, after one rigid alignment, m."""
-        found = {}
+        """Error of each robot's own maps, as they came from it, after one rigid alignment a map, m."""
+        own: dict[str, dict[NodeId, tuple[int, Pose2]]] = {}
         for map_id, one in self.merged.maps.items():
-            own = {n.id: (0, n.map_from_robot.mean) for n in one.nodes.values()}
-            found[map_id.agent] = _rounded(score_map(own, [], self.truth).ate)
-        return found
+            placed = {n.id: (map_id.epoch, n.map_from_robot.mean) for n in one.nodes.values()}
+            own.setdefault(map_id.agent, {}).update(placed)
+        return {agent: _rounded(score_map(placed, [], self.truth).ate) for agent, placed in own.items()}
 
     def write(self, folder: Path) -> list[Path]:
         """The merged map, a table of its links, and a picture.
@@ -147,12 +147,17 @@ class MergeExamination:
 
 
 def changes(name: str, robot: Replay, settings: PipelineSettings) -> Iterator[list[Change]]:
-    """What a robot that is carried along adds to its map, image by image."""
-    map_id = MapId(name, 1)
-    pipeline = Pipeline(map_id, robot.describe(), settings)
-    pipeline.set_mission(Carried())
-    sequence = 0
+    """What a robot that is carried along adds to its map, image by image.
+
+    One that cannot find itself on its map begins another, as a robot's process does.
+    """
+    epoch, pipeline = 0, None
     while (observation := robot.sense()) is not None:
+        if pipeline is None or pipeline.lost:
+            epoch, sequence = epoch + 1, 0
+            map_id = MapId(name, epoch)
+            pipeline = Pipeline(map_id, robot.describe(), settings)
+            pipeline.set_mission(Carried())
         made = []
         for body in pipeline.step(observation, ()).changes:
             sequence += 1

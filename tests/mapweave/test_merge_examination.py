@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,8 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
+from agent.drivers.replay import Replay
+from agent.pipeline import PipelineSettings
+from agent.resumption import ResumptionSettings
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 from mapweave.cli import main
+from mapweave.examination.merging import changes
 from mapweave.examination.pieces import OVERLAP, cut
 from sim.camera import WEBCAM
 from sim.renderer import Renderer
@@ -84,6 +91,26 @@ def test_two_robots_of_one_walk_become_one_map(
     with (tmp_path / "out" / "links.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert sum(row["kept"] == "yes" for row in rows) == report["links"]
+
+
+def test_who_cannot_find_itself_begins_another_map(recording: Path, tmp_path: Path) -> None:
+    """After 60 images it stands in a world upside down, which it then drives through."""
+    folder = tmp_path / "carried off"
+    (folder / "images").mkdir(parents=True)
+    images = [cv2.imread(str(recording / "images" / f"{k}.png"), cv2.IMREAD_GRAYSCALE) for k in range(150)]
+    shown = images[:60] + [np.flipud(images[60])] * 45 + [np.flipud(image) for image in images[60:]]
+    rows = (recording / "odometry.csv").read_text().splitlines()
+    (folder / "odometry.csv").write_text("\n".join(rows[:61] + ["0,0"] * 46 + rows[62:]) + "\n")
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+    for k, image in enumerate(shown):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
+    soon = replace(PipelineSettings(), resumption=ResumptionSettings(carried_looks=3, carried_pause=0.1))
+    made = [change for some in changes("one", Replay(folder), soon) for change in some]
+    maps = {epoch: [c for c in made if c.map == MapId("one", epoch)] for epoch in (1, 2)}
+    assert len(maps[1]) + len(maps[2]) == len(made)
+    for one in maps.values():
+        assert [change.sequence for change in one] == list(range(1, len(one) + 1))
+        assert len(HybridMap([change.body for change in one]).nodes) >= 1
 
 
 def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(
