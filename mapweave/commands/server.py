@@ -9,6 +9,9 @@ from typing import Any
 
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
+LARGE = 20_000_000
+"""Bytes of a store that takes long enough to read to say so."""
+
 
 def add_to(commands: Any) -> None:
     """Declare the command."""
@@ -53,7 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         how = ServerSettings(lockstep=arguments.lockstep, desk=settings.desk, merge=merge)
         with ExitStack() as stack:
-            server = MapServer(bus, keys, arguments.data / f"{name}.sqlite", name, how)
+            path = arguments.data / f"{name}.sqlite"
+            if path.exists() and path.stat().st_size > LARGE:
+                print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
+            server = MapServer(bus, keys, path, name, how)
             stack.enter_context(server)
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
