@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from benchmarks.synthetic import CAMERA, World, room, take_map, take_view
 from hybridmap.descriptor import decode
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
+from mapserver import placeindex
+from mapserver.cells import Cells
 from mapserver.landmarkindex import LandmarkIndexSettings
 from mapserver.placeindex import SLOT_BITS, PlaceIndex, PlaceIndexSettings
 from merge.candidates import overlaps
@@ -158,6 +161,30 @@ def test_a_node_is_gone_whatever_one_says_of_its_landmarks(
     assert len(index.landmarks) == before - len(codes)
     left = np.concatenate([block.ids >> SLOT_BITS for block in index.landmarks.blocks()])
     assert set(left.tolist()) == set(index.slots.values())
+
+
+@pytest.mark.parametrize("few", [0, 1000])
+def test_what_is_not_kept_is_gone_however_much_it_is(
+    building: tuple[World, list[Node], list[Pose2]], few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(placeindex, "FEW_GONE", few)
+    searched: list[bool] = []
+    real = Cells.remove
+
+    def remove(cells: Cells, first: int, last: int, codes: NDArray[np.uint8] | None = None) -> None:
+        searched.append(codes is None)
+        real(cells, first, last, codes)
+
+    monkeypatch.setattr(Cells, "remove", remove)
+    nodes = building[1]
+    index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=100, exact=100)))
+    index.extend(nodes)
+    kept = [node.id for node in nodes[::3]]
+    assert index.retain(kept) == len(nodes) - len(kept) == len(searched)
+    assert all(searched) if few else not any(searched)
+    assert set(index.slots) == set(kept)
+    assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes[::3])
+    assert index.retain(kept) == 0
 
 
 def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pose2]]) -> None:
