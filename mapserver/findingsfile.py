@@ -1,6 +1,7 @@
 """The findings as a file (see mapserver.sealed), so that a server that starts again need not compare again.
 
-header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON), links ...
+header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON), links ...,
+    which of them are believed, places
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ from hybridmap.pose import Pose2, PoseGaussian
 from mapserver.findings import PRINT_BYTES, Findings
 from mapserver.sealed import seal, unseal
 from merge.candidates import Pair
+from merge.incremental_decided import Decided
 from merge.incremental_verdicts import Verdict
 from merge.links import Link, RefusedLink
 
 MAGIC = b"mapweave verdicts\n"
-FORMAT = 1
+FORMAT = 2
 
 
 def save(path: Path, findings: Findings, made_by: str) -> None:
@@ -94,6 +96,10 @@ def _parts(findings: Findings, made_by: str) -> Iterator[NDArray[Any]]:
     yield np.array([kinds[tuple(link.evidence)] for _, link in links], np.int64)
     yield np.cumsum([0, *(len(link.evidence) for _, link in links)])
     yield np.array([value for _, link in links for value in link.evidence.values()], np.float64)
+    yield np.array([pair in findings.decided.believed for pair, _ in links], np.bool_)
+    placed = [(row[node], pose.vector) for node, pose in findings.decided.places.items() if node in row]
+    yield np.array([k for k, _ in placed], np.int64)
+    yield np.array([vector for _, vector in placed], np.float64).reshape(-1, 3)
 
 
 def _read(parts: Iterator[NDArray[Any]]) -> Findings:
@@ -115,7 +121,10 @@ def _read(parts: Iterator[NDArray[Any]]) -> Findings:
         told = dict(zip(kinds[kind[k]], evidence[m:n], strict=True))
         posture = PoseGaussian(Pose2(*means[k]), covariances[k])
         verdicts[pair] = Link(*pair, posture, shared[i:j], told)
-    return Findings(prints, overlaps, verdicts)
+    believed = frozenset(pair for pair, yes in zip(pairs, next(parts).tolist(), strict=True) if yes)
+    placed = zip(next(parts).tolist(), next(parts).tolist(), strict=True)
+    places = {nodes[k]: Pose2(*vector) for k, vector in placed}
+    return Findings(prints, overlaps, verdicts, Decided(believed, places))
 
 
 def _known(found: Iterable[tuple[Pair, Any]], row: dict[NodeId, int]) -> list[tuple[Pair, Any]]:

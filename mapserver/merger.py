@@ -14,6 +14,7 @@ from hybridmap.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
 from mapserver.findings import Findings, Recollection, print_of
 from mapserver.lookalikes import LookAlikes
+from mapserver.merger_counters import MergerCounters
 from mapserver.placeindex import PlaceIndex
 from mapserver.succession import Succession
 from merge.candidates import CandidateSettings, Pair
@@ -45,23 +46,6 @@ class MergerSettings:
     merging: MergeSettings = field(default_factory=MergeSettings)
     renewal: RenewalSettings = field(default_factory=RenewalSettings)
     fading: FadingSettings = field(default_factory=FadingSettings)
-
-
-@dataclass
-class MergerCounters:
-    """What the merger has done since it started.
-
-    Attributes:
-        changes: taken in.
-        verified: pairs of nodes that were compared.
-        recognised: of these, pairs whose landmarks agreed.
-        merges: times the merged map was made anew.
-    """
-
-    changes: int = 0
-    verified: int = 0
-    recognised: int = 0
-    merges: int = 0
 
 
 class Merger:
@@ -132,7 +116,7 @@ class Merger:
             self._prints[node_id] = known if known and same else (node, print_of(node))
         prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
-        return Findings(prints, self._pairs.overlaps(), verdicts)
+        return Findings(prints, self._pairs.overlaps(), verdicts, self._islands.decisions())
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -239,6 +223,7 @@ class Merger:
             for pair, verdict in self._before.verdicts(self.node):
                 if pair[1] not in self._known.get(pair[0], {}):
                     self._judge(pair, verdict)
+            self._islands.resume(self._before.decided)
             self._before = None
 
     def apart(self) -> MergedMap:

@@ -15,6 +15,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Rulings
 from merge.incremental_again import Again
+from merge.incremental_decided import Decided
 from merge.incremental_memory import Memory
 from merge.incremental_settings import StepSettings
 from merge.incremental_sheets import MapPair
@@ -44,6 +45,17 @@ class Islands:
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
         self._rulings = Rulings()
         self._again: Again | None = None
+        self._resumed = Decided()
+
+    def decisions(self) -> Decided:
+        """What is decided of islands that are merged in steps."""
+        large = [merged for island, merged in self._merged.items() if island in self._steps]
+        believed = {link.pair for merged in large for link in merged.links}
+        return Decided(believed, {node: merged.pose(node) for merged in large for node in merged.postures})
+
+    def resume(self, decided: Decided) -> None:
+        """Let large islands, once they are merged, begin from what another process has decided of them."""
+        self._resumed = decided
 
     @property
     def decided(self) -> bool:
@@ -116,6 +128,7 @@ class Islands:
                     known = self._step(inside, verdicts, news, before)
             self._merged[island] = known
         self._steps = {island: one for island, one in self._steps.items() if island in self._merged}
+        self._resumed = Decided()
         island_of = {one: island for island in islands for one in island}
         return _together(list(self._merged.values()), maps, verdicts.across(island_of), rulings)
 
@@ -145,6 +158,9 @@ class Islands:
         steps = max(known, key=lambda one: len(one.maps & maps.keys()), default=None)
         if steps is None:
             steps = Steps(self._settings, self._how, self._memory)
+            if any(node in self._resumed.places for one in maps.values() for node in one.nodes):
+                steps.resume(maps, self._resumed, verdicts, self._rulings)
+                news = news | verdicts.at(maps.keys())
         strange = maps.keys() - steps.maps
         for island in sorted(before, key=min):
             if island & strange:

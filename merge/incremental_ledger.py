@@ -64,6 +64,18 @@ class Ledger:
         for maps, here in links.items():
             self._believe(maps, here)
 
+    def resume(self, believed: Iterable[Pair], verdicts: Verdicts) -> None:
+        """Believe these links, as far as they are verified and both maps are there."""
+        links: dict[MapPair, dict[Pair, Link]] = {}
+        for pair in sorted(believed):
+            maps = pair[0].map, pair[1].map
+            given = verdicts.between(maps).get(pair)
+            if isinstance(given, Link) and maps[0] in self._sheets and maps[1] in self._sheets:
+                self._links[pair] = given, given
+                links.setdefault(maps, {})[pair] = given
+        for maps, here in links.items():
+            self._believe(maps, here)
+
     def forget(self, maps: MapPair) -> None:
         """Maps that are in one island no longer."""
         for known in (self.bundles, self.waiting, self.refused):

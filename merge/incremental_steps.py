@@ -15,12 +15,13 @@ from dataclasses import replace
 import numpy as np
 
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeId, MapId, NodeId
+from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Rulings
 from merge.drives import refuse_drives
 from merge.groups import LinkGroup
 from merge.incremental_clashes import clashing, neighbours
+from merge.incremental_decided import Decided
 from merge.incremental_factors import RelaxSettings, Rows, relax
 from merge.incremental_graph import WideGraph
 from merge.incremental_joining import join
@@ -84,6 +85,18 @@ class Steps:
             # What held them where they are may not have come along.
             self._touched |= one.nodes.keys()
         self._ledger.begin(merged, verdicts)
+
+    def resume(
+        self, maps: Mapping[MapId, HybridMap], decided: Decided, verdicts: Verdicts, rulings: Rulings
+    ) -> None:
+        """Take over what another process has decided; all links are heard again, those believed stand."""
+        for map_id, one in sorted(maps.items()):
+            self._place(
+                map_id, one, rulings, {n: decided.places[n] for n in one.nodes.keys() & decided.places}
+            )
+            self._touched |= one.nodes.keys()
+        self._ledger.resume(decided.believed, verdicts)
+        self._since = self._rough = 0
 
     def step(
         self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, news: Iterable[MapPair], rulings: Rulings
@@ -167,7 +180,8 @@ class Steps:
         """Make the sheet of a map anew if it has changed."""
         s, before = self._settings, self._sheets.get(map_id)
         undone = undo({map_id: one}, (), rulings)
-        if before is not None and before.one is one and _edges(undone.refused) == _edges(before.undone):
+        gone = [r.edge for r in undone.refused]
+        if before is not None and before.one is one and gone == [r.edge for r in before.undone]:
             return False
         pieces = self._memory.fragments(undone.maps, s.consistency, s.strain)
         if known is None:
@@ -205,16 +219,15 @@ class Steps:
     def _follow(self, nodes: Iterable[NodeId], how: RelaxSettings | None = None) -> None:
         """Optimise around nodes, as far as they are still there."""
         there = [node for node in nodes if node.map in self._sheets and node in self._sheets[node.map].rows]
-        # On the way a tenth of a millimetre does; the last word is exact.
-        how = how or replace(self._steps.relax, step=1e-4)
+        how = how or replace(self._steps.relax, step=1e-4)  # The last word is exact.
         if how.least >= len(self._all.means):
             how = replace(how, step=self._steps.relax.step)
         self._relax(self._all.rows(sorted(there)), how, self._plain)
         self._keep()
 
     def _relax_all(self, believed: bool) -> None:
-        count = len(self._all.means)
-        self._relax(np.arange(count), replace(self._steps.relax, least=count), believed)
+        rows = np.arange(len(self._all.means))
+        self._relax(rows, replace(self._steps.relax, least=len(rows)), believed)
         self._keep()
 
     def _relax(self, rows: Rows, how: RelaxSettings, believed: bool) -> None:
@@ -284,7 +297,3 @@ class Steps:
             tuple(graphs),
             rulings,
         )
-
-
-def _edges(refused: Iterable[RefusedLink]) -> list[EdgeId | None]:
-    return [r.edge for r in refused]
