@@ -120,6 +120,24 @@ def test_the_rest_of_the_answer_says_on_the_wire_that_the_distance_is_not_known(
         ]
 
 
+@pytest.mark.parametrize("shape", ["one point", "two points", "a line", "a row"])
+def test_pixels_from_which_no_geometry_follows_do_no_harm(shape: str) -> None:
+    """All descriptors match. Spread along a line it is the same image; crowded it is nothing."""
+    _, node = place(4)
+    n, rng = len(node.landmarks), np.random.default_rng(1)
+    x = rng.uniform(10, 300, n)
+    pixels = {
+        "one point": np.full((n, 2), 100.0),
+        "a line": np.stack([x, 0.5 * x + 20], axis=1),
+        "a row": np.stack([x, np.full(n, 120.0)], axis=1),
+        "two points": np.where(rng.random((n, 1)) < 0.5, 50.0, 200.0) * np.ones((1, 2)),
+    }[shape].astype(np.float32)
+    flat = replace(bare(node), landmarks=replace(bare(node).landmarks, pixels=pixels))
+    view = View(pixels, node.landmarks.codes, node.camera)
+    wanted = Certainty.UNKNOWN if "point" in shape else Certainty.PLACE
+    assert told([flat], view).certainty is wanted
+
+
 def test_rivals_are_the_best_and_one_of_each_other_place() -> None:
     seen = {1: 50, 2: 45, 3: 31, 10: 40, 11: 39, 20: 29}
     assert rivals(seen, lambda a, b: abs(a - b) <= 2, 0.6) == [1, 10]
