@@ -73,3 +73,14 @@ class HybridMap:
             if best is None or relative.covariance.trace() < best.covariance.trace():
                 best = relative
         return best
+
+    def dropped_by(self, body: ChangeBody) -> Iterator[Edge]:
+        """Edges that a change would take away or replace."""
+        match body:
+            case NodeRetired(node_id) if node_id in self.graph:
+                for _, _, edge_id in self.graph.edges(node_id, keys=True):
+                    yield self.edges[edge_id]
+            case EdgePut(edge) if edge.id in self.edges:
+                yield self.edges[edge.id]
+            case EdgeRetired(edge_id) if edge_id in self.edges:
+                yield self.edges[edge_id]

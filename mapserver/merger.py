@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 
-from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
 from hybridmap.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
@@ -52,16 +52,16 @@ class Merger:
     """Holds every robot's map, the overlaps of their nodes and the verdicts on pairs of them.
 
     Work is done where it is cheapest: a new node is compared with its best candidates when it comes; the
-    merged map is made when it is asked for and something has changed, and then only where it has. Candidates
-    are living nodes alone. But for that the outcome depends on what the maps hold, not on the order in which
-    it came: a node that is superseded in one merge is not looked for by those that come later.
+    merged map is made when it is asked for and something has changed, and then only where it has. New
+    nodes are not compared with such as were superseded on another day. But for that the outcome depends on
+    what the maps hold, not on the order in which it came.
     """
 
     def __init__(self, index: PlaceIndex | None = None, settings: MergerSettings | None = None) -> None:
         """Start with no maps.
 
         Args:
-            index: is filled with the nodes that come, but for superseded ones; give it to a Relocalizer too.
+            index: is filled with the nodes that come; give it to a Relocalizer too.
             settings: how.
         """
         # An index in which there is nothing yet is one.
@@ -241,13 +241,14 @@ class Merger:
         self._touched.add(map_id)
         self._dirty = True
         gone = one.nodes.get(body.id) if isinstance(body, NodeRetired) else None
-        for edge in _dropped(one, body):
+        for edge in one.dropped_by(body):
             if edge.kind is not EdgeKind.DRIVEN:
                 self._pairs.disconnect(edge.a, edge.b)
         one.apply(body)
         match body:
             case NodePut(node):
                 self._forget(node.id)
+                self._succession.put(node)
             case NodeRetired(node_id):
                 self._forget(node_id)
                 self.index.remove(node_id, None if gone is None else gone.landmarks.codes)
@@ -275,18 +276,6 @@ class Merger:
         """Drop what was found out about a node: it is gone, or is known better."""
         self._pairs.forget(node_id)
         self._uncompared.pop(node_id, None)
-        self._succession.replaced(node_id)
+        self._succession.drop(node_id)
         for other in self._known.pop(node_id, {}):
             del self._known[other][node_id]
-
-
-def _dropped(one: HybridMap, body: ChangeBody) -> Iterator[Edge]:
-    """Edges of a map that a change takes away or replaces."""
-    match body:
-        case NodeRetired(node_id) if node_id in one.graph:
-            for _, _, edge_id in one.graph.edges(node_id, keys=True):
-                yield one.edges[edge_id]
-        case EdgePut(edge) if edge.id in one.edges:
-            yield one.edges[edge.id]
-        case EdgeRetired(edge_id) if edge_id in one.edges:
-            yield one.edges[edge_id]

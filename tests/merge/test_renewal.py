@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import networkx as nx
 import numpy as np
@@ -226,3 +227,24 @@ def covers(merged: MergedMap, one: NodeId, other: NodeId, s: RenewalSettings) ->
     shared = link.shared if link.a == one else link.shared[:, ::-1]
     depths = b.landmarks.has_depth.sum() >= min(s.depths * a.landmarks.has_depth.sum(), s.enough)
     return bool(depths and least_in_view(shared, a, b, between) >= s.found)
+
+
+def test_nodes_of_today_are_looked_for_superseded_or_not(drives: Drives) -> None:
+    """Another robot's view of the same hour is evidence; an hour later it is past."""
+    rng = np.random.default_rng(8)
+    merger = drives.merger(OLD)
+    tour = [Pose2(1.5 + 0.8 * k, 2.15, 0.25) for k in range(5)]
+    nodes, edges = take_map(drives.world, MapId("r2", 1), tour, rng, sigma_xy=0.01, sigma_heading=0.01)
+    for k, node in enumerate(nodes):
+        nodes[k] = replace(node, stamp_ns=node.stamp_ns + 10**12)
+    for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
+        merger.on_change(Change(MapId("r2", 1), k + 1, 0, body))
+    merged = merger.merged()
+    assert {node.map for node in merged.superseded} == {OLD}
+    assert all(node in merger.index for node in merged.postures)
+    far = replace(
+        nodes[0], id=NodeId("r0", 1, 99), stamp_ns=4 * 10**12, landmarks=nodes[0].landmarks.take([])
+    )
+    merger.apply(OLD, NodePut(far))
+    merged = merger.merged()
+    assert merged.superseded and not any(node in merger.index for node in merged.superseded)
