@@ -104,7 +104,9 @@ def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[
     # A map may be in several pieces, so a way over maps is no more than a hint where to look.
     way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
     over = ", ".join(map(str, way[1:-1])) or "each other's pieces"
-    return f"{first} and {second} are one map by way of {over}; no link joins the two directly"
+    apart = any(set(r.ends) == {first, second} for r in merged.rulings.in_force)
+    more = ", as was ruled; to part them undo the links of that way too" if apart else ""
+    return f"{first} and {second} are one map by way of {over}; no link joins the two directly{more}"
 
 
 def _drivable(merged: MergedMap, link: Link) -> bool:

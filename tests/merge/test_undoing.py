@@ -11,6 +11,7 @@ from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.merger import Merger
+from merge.explanation_maps import explain_maps
 from merge.merged import MergedMap
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -66,6 +67,21 @@ def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) 
     assert node is not None
     merger.on_change(Change(node.id.map, 99, 0, NodePut(node)))  # known better: its links are found anew
     assert not merger.merged().joined(A, B)
+
+
+def test_who_parts_two_maps_that_a_third_joins_is_told_how(merger: Merger) -> None:
+    rng = np.random.default_rng(3)
+    world = room(0, 0, 5, 4, 700, rng)
+    third = MapId("c", 1)
+    nodes, edges = take_map(world, third, [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)], rng)
+    for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+        merger.apply(third, body)
+    assert "links join them" in explain_maps(merger.merged(), A, B).reason
+    merger.rule(Rulings([Ruling((A, B), True, "anna", NOON)]))
+    told = explain_maps(merger.merged(), A, B).reason
+    assert "by way of c.1; no link joins the two directly, as was ruled" in told and "undo the links" in told
+    merger.rule(Rulings([Ruling((A, B), True, "anna", NOON), Ruling((A, third), True, "anna", NOON)]))
+    assert explain_maps(merger.merged(), A, B).reason.startswith("a.1 and b.1 are not one map")
 
 
 def test_a_robot_s_own_loop_can_be_undone_and_its_way_cannot(merger: Merger) -> None:
