@@ -42,6 +42,8 @@ class RegionSettings:
         least_share: of the landmarks that the view shows, how many must lie on what these doubles show.
         most_looked_at: how many of them may lie, in the other region, where somebody has looked and has not
             seen them, if the doubles show less. Then they must show more than one thing.
+        least_around: nodes whose doubles must imply the same motion then. All but one must have a double of
+            its own.
         nodes: around a place that are asked at most.
         reach: nodes farther from the robot are not asked, m.
         beside: a landmark nearer than this to one that a double shows is shown by it too, m.
@@ -50,7 +52,8 @@ class RegionSettings:
     least_nodes: int = 2
     least_share: float = 0.5
     most_looked_at: float = 0.2
-    nodes: int = 8
+    least_around: int = 4
+    nodes: int = 20
     reach: float = 3.0
     beside: float = 0.35
 
@@ -114,13 +117,9 @@ class Regions:
         self._left: list[NodeId] | None = None
 
     def prepare(self, most: int) -> int:
-        """Find out what some nodes of the map look like before anybody asks; not by two threads at once.
+        """Find out what at most so many nodes look like before anybody asks, and say how many are left.
 
-        Args:
-            most: nodes that are not known yet.
-
-        Returns:
-            How many nodes are left to be looked at.
+        Not by two threads at once.
         """
         if not self._settings.least_nodes:
             return 0
@@ -154,21 +153,31 @@ class Regions:
         landmarks, features = seen.recognition.pairs.T
         points = frame_from_node.apply(node.points_in_robot[landmarks])
         known = np.isfinite(points[:, 0])
+        if not known.any():
+            return None
         points, features = points[known], features[known]
         votes = self._votes(self._around(node, frame, robot, points, ranked), frame, robot)
         best: tuple[list[_Vote], NDArray[np.bool_]] | None = None
         for party in self._parties(votes):
             shown = np.concatenate([vote.shown for vote in party])
-            twice = np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1) < s.beside
+            twice = (
+                np.linalg.norm(points[:, None] - shown[None], axis=2).min(axis=1, initial=np.inf) < s.beside
+            )
             if twice.mean() < s.least_share:
                 best_told = max(party, key=lambda vote: (len(vote.shown), vote.alike.other.id))
                 missed = self._looked_at(best_told, frame_from_node, robot, points, node) & ~twice
-                if missed.mean() > s.most_looked_at or extent(shown) < THING_SIGMA:
+                if missed.mean() > s.most_looked_at or not self._is_wide(party, shown):
                     continue
                 twice = np.logical_not(missed)
             if best is None or twice.sum() > best[1].sum():
                 best = party, twice
         return None if best is None else self._told(seen, node, best[0], features[best[1]])
+
+    def _is_wide(self, party: Sequence[_Vote], shown: Array) -> bool:
+        """Whether a party speaks for what it does not show: many nodes, and more than one thing."""
+        here, there = {vote.here.id for vote in party}, {vote.alike.other.id for vote in party}
+        least = self._settings.least_around
+        return len(here) >= least and len(there) >= least - 1 and extent(shown) >= THING_SIGMA
 
     def _looked_at(
         self, vote: _Vote, frame_from_node: Pose2, robot: Pose2, points: Array, node: Node
@@ -220,15 +229,7 @@ class Regions:
     def _around(
         self, node: Node, frame: Frame, robot: Pose2, points: Array, ranked: Sequence[NodeId]
     ) -> Iterator[Node]:
-        """The node, then others near the robot, first those that look at most of what it sees.
-
-        Args:
-            node: that was recognised.
-            frame: in which it lies.
-            robot: `frame_from_robot`.
-            points: (K, 3) m, what the robot sees, in the frame.
-            ranked: where to look for neighbours in a map that is not merged.
-        """
+        """The node, then others near the robot, first those that look at most of the points that it sees."""
         if isinstance(frame, int):
             ids, means = self._near(frame, robot)
         else:

@@ -101,7 +101,7 @@ def test_neighbours_tell_that_a_room_is_there_twice() -> None:
     assert here.probability + there.probability < 1.0 + 1e-9
 
 
-AROUND = (Pose2(0.0, 0.05, 1.55), Pose2(0.05, 0.0, -0.95), Pose2(0.0, 0.0, 2.8))
+AROUND = (Pose2(0.0, 0.05, 1.55), Pose2(0.05, 0.0, -0.95), Pose2(0.0, 0.0, 2.8), Pose2(0.0, 0.05, -2.1))
 """From the stop: what shows nothing of what the view shows."""
 
 
@@ -109,7 +109,7 @@ def test_where_nobody_has_looked_it_may_be_the_same() -> None:
     """The nodes around have doubles, all in one direction; where the view's own would be there is none."""
     here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate([SEEN, *AROUND])]
     there = [
-        taken(5 + k, STOP @ look @ Pose2(0.06, 0.04, 0.05), AWAY, 20 + k) for k, look in enumerate(AROUND)
+        taken(6 + k, STOP @ look @ Pose2(0.06, 0.04, 0.05), AWAY, 20 + k) for k, look in enumerate(AROUND)
     ]
     nodes = [*here, *there]
     answer = asked(nodes, joined(nodes)).answer(VIEW)
@@ -117,7 +117,7 @@ def test_where_nobody_has_looked_it_may_be_the_same() -> None:
     assert answer.candidates[1].node in {one.id for one in there}
     # Somebody who looks there and sees other things settles it; one who looks from elsewhere does not.
     for turn, told in ((0.0, Certainty.FOUND), (0.9, Certainty.AMBIGUOUS)):
-        other = taken(9, STOP @ SEEN @ Pose2(0.05, 0.0, turn), AWAY, 30, world=OTHER)
+        other = taken(19, STOP @ SEEN @ Pose2(0.05, 0.0, turn), AWAY, 30, world=OTHER)
         more = [*nodes, other]
         assert asked(more, joined(more)).answer(VIEW).certainty is told
     # One thing that is there twice says nothing of what lies beside it.
@@ -126,6 +126,10 @@ def test_where_nobody_has_looked_it_may_be_the_same() -> None:
         for one in there
     ]
     few = [*here[:2], thing[0]]
+    settings = {"least_nodes": 1, "least_around": 1}
+    assert asked(few, joined(few), **settings).answer(VIEW).certainty is Certainty.FOUND
+    few[-1] = there[0]
+    assert asked(few, joined(few), **settings).answer(VIEW).certainty is Certainty.AMBIGUOUS
     assert asked(few, joined(few), least_nodes=1).answer(VIEW).certainty is Certainty.FOUND
 
 
@@ -243,3 +247,26 @@ def test_a_server_finds_out_by_itself_what_nodes_look_like(
     assert all(upkeep._merger.alike.knows(one) for one in nodes)
     upkeep.close()
     assert max(looked) == (PREPARED_AT_ONCE if by_itself else len(nodes))
+
+
+def test_landmarks_without_depths_say_nothing_of_regions() -> None:
+    nodes = here_and_there()
+    found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
+    assert found is not None
+    for blind, told in (({0}, Certainty.FOUND), ({0, 1, 2}, Certainty.FOUND), ({1, 2}, Certainty.AMBIGUOUS)):
+        fewer = [
+            replace(
+                one,
+                landmarks=replace(
+                    one.landmarks,
+                    depths=np.full_like(one.landmarks.depths, np.nan),
+                    depth_sigmas=np.full_like(one.landmarks.depths, np.nan),
+                ),
+            )
+            if k in blind
+            else one
+            for k, one in enumerate(nodes)
+        ]
+        service = asked(fewer, joined(fewer))
+        answer = service.conclude(VIEW, [Sighting(nodes[0].id, found)], [(nodes[0].id, 2.0)])
+        assert answer.certainty is told
