@@ -52,8 +52,8 @@ class RegionSettings:
     least_nodes: int = 2
     least_share: float = 0.5
     most_looked_at: float = 0.2
-    least_around: int = 4
-    nodes: int = 20
+    least_around: int = 2
+    nodes: int = 8
     reach: float = 3.0
     beside: float = 0.35
 
