@@ -6,7 +6,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -15,6 +15,7 @@ from hybridmap.errors import MapweaveError
 from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
+from mapserver.deciding import Deciding
 from mapserver.findingskeeper import FindingsKeeper
 from mapserver.merger import Merger, MergerSettings
 from mapserver.placeindex import PlaceIndex
@@ -75,6 +76,7 @@ class Upkeep:
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
+        self._deciding = Deciding(self._merger, lambda well: self._changes.put(_Decided(well)))
         self._changes: queue.SimpleQueue[News | threading.Event | _Read | _Decided | None] = (
             queue.SimpleQueue()
         )
@@ -189,7 +191,7 @@ class Upkeep:
                 spent = time.monotonic() - began
                 rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
                 self._save()
-                self._decide_again()
+                self._deciding.begin()
                 continue
             if change is None:
                 return
@@ -224,22 +226,6 @@ class Upkeep:
             self._dirty = True
             if time.monotonic() > rest_until + 2.0:
                 rest_until = time.monotonic()
-
-    def _decide_again(self) -> None:
-        """Where maps are large, a thread beside this one decides everything again now and then."""
-        if (decide := self._merger.again()) is not None:
-            threading.Thread(target=self._decided, args=(decide,), name="decide", daemon=True).start()
-
-    def _decided(self, decide: Callable[[], None]) -> None:
-        began = time.monotonic()
-        try:
-            decide()
-        except Exception:  # steps go on from what stands
-            log.exception("the merged map could not be decided again as a whole")
-            self._changes.put(_Decided(well=False))
-            return
-        log.info("the merged map is decided again as a whole, in %.0f s", time.monotonic() - began)
-        self._changes.put(_Decided(well=True))
 
     def _forget(self, node: Node) -> None:
         if self._fresh.get(node.id) is node:
