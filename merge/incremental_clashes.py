@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import networkx as nx
@@ -10,7 +11,7 @@ import numpy as np
 from hybridmap.node import MapId, NodeId
 from merge.fragments import Fragment
 from merge.incremental_graph import WideGraph
-from merge.incremental_sheets import Sheet
+from merge.incremental_sheets import Assembly, Bundle, MapPair, Sheet
 from merge.joining import Solver
 from merge.links import Link
 from merge.merging import MergeSettings
@@ -62,3 +63,33 @@ def clashing(
     except (nx.NetworkXNoPath, nx.NodeNotFound):
         # They are joined by way of maps that are not among these: the next merge made anew will tell.
         return {}, refutation
+
+
+def falling(
+    sheets: Mapping[MapId, Sheet],
+    bundles: Mapping[MapPair, Bundle],
+    whole: Assembly,
+    changed: set[MapId],
+    settings: MergeSettings,
+) -> list[tuple[list[Link], str]]:
+    """Links that must fall together, with reasons: under them robots would walk through each other.
+
+    Args:
+        sheets: of the island.
+        bundles: links that are believed.
+        whole: the graph that they make.
+        changed: maps whose nodes may have moved.
+        settings: of the merge.
+    """
+    some = neighbours(sheets, changed)
+    if len(some) < 2:
+        return []
+    inside = {pair: b for pair, b in bundles.items() if pair[0] in some and pair[1] in some}
+    kept = [link for bundle in inside.values() for link in bundle.links.values()]
+    labels = sorted({whole.label(node) for one in some for node in sheets[one].nodes})
+    graphs = [whole.graph(label, math.inf) for label in labels]
+    impossible, refutation = clashing(sheets, some, graphs, kept, settings)
+    return [
+        ([link for link in kept if refutation.key_of(link) == key], reason)
+        for key, reason in impossible.items()
+    ]

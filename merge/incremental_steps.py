@@ -20,7 +20,7 @@ from hybridmap.pose import Pose2
 from hybridmap.ruling import Rulings
 from merge.drives import refuse_drives
 from merge.groups import LinkGroup
-from merge.incremental_clashes import clashing, neighbours
+from merge.incremental_clashes import falling
 from merge.incremental_decided import Decided
 from merge.incremental_factors import RelaxSettings, Rows, relax
 from merge.incremental_graph import WideGraph
@@ -71,8 +71,11 @@ class Steps:
     @property
     def stale(self) -> bool:
         """Whether everything should be decided again, and no step does it."""
-        few = sum(len(sheet.nodes) for sheet in self._sheets.values()) <= self._steps.whole_up_to
-        return not few and self._changed_enough()
+        return not self._small and self._changed_enough()
+
+    @property
+    def _small(self) -> bool:
+        return sum(len(sheet.nodes) for sheet in self._sheets.values()) <= self._steps.whole_up_to
 
     def _changed_enough(self) -> bool:
         return self._since > self._steps.whole_share * max(len(self._all.factors), 1)
@@ -121,8 +124,7 @@ class Steps:
             lost = ledger.review(pair, verdicts, rulings)
             self._since += len(lost)
             self._touched |= ends_of(lost)
-        few = sum(len(one.nodes) for one in maps.values()) <= self._steps.whole_up_to or not ledger.bundles
-        whole = few and self._changed_enough()
+        whole = (self._small or not ledger.bundles) and self._changed_enough()
         if whole:
             changed = set(self._sheets)
             fresh = self._doubt_all(verdicts, rulings)
@@ -145,12 +147,12 @@ class Steps:
 
     def _settle(self, nodes: Iterable[NodeId], whole: bool, changed: set[MapId]) -> None:
         """Optimise until no link strains too much and no robots clash, then with all links at full pull."""
-        touched = set(nodes)
+        touched, everything = set(nodes), whole
         for _ in range(ATTEMPTS):
             # Limited pull lets the wrong ones stand out; in a step they were tested before.
-            for believed in (False, True) if whole else (True,):
-                if whole:
-                    self._relax_all(believed)
+            for self._plain in (False, True) if whole else (True,):
+                if everything:
+                    self._relax_all(self._plain)
                 else:
                     self._follow(touched)
                 lost = self._strained()
@@ -160,8 +162,14 @@ class Steps:
             if not lost:
                 break
             self._since += len(lost)
-            touched |= {node for link in lost for node in link.pair}
+            ends = {node for link in lost for node in link.pair}
+            if whole:
+                # Of a large map the rest is where it should be.
+                everything, touched = self._small, ends
+            touched |= ends
             self._assemble()
+        if whole and not everything:
+            self._relax_all(believed=True)
 
     def _leave(self, gone: Iterable[MapId]) -> None:
         """Forget maps that belong to another island now."""
@@ -189,8 +197,7 @@ class Steps:
         after = Sheet.of(one, pieces, known, undone.refused)
         told = after.said() ^ (set() if before is None else before.said())
         self._since += len(told)
-        ends = {node for a, b, _ in told for node in (a, b)}
-        self._touched |= {node for node in ends if node in after.rows}
+        self._touched |= {node for a, b, _ in told for node in (a, b) if node in after.rows}
         self._sheets[map_id] = after
         self._own[map_id] = [r for piece in pieces for r in piece.refused] + list(undone.refused)
         return True
@@ -248,36 +255,29 @@ class Steps:
         return self._all
 
     def _strained(self) -> list[Link]:
-        """Refuse the link that strains the most where something has moved, if it is too much."""
+        """Refuse what strains too much where it moved: the worst link; of large islands one by each map."""
         links, index = self._all.believed(self._moved)
-        if not links:
-            return []
         row_of = np.arange(len(self._all.means))
         strains = self._all.factors.take(index, row_of).strains(self._all.means)
-        worst = int(strains.argmax())
-        if strains[worst] <= self._settings.strain:
-            return []
-        off = float(strains[worst]) ** 0.5
-        reason = f"strains the joined map: {off:.1f} standard deviations from where it ended"
-        self._ledger.disbelieve([links[worst]], reason)
-        return [links[worst]]
+        lost: list[Link] = []
+        near: set[MapId] = set()
+        for k in np.argsort(-strains, kind="stable").tolist():
+            if strains[k] <= self._settings.strain or (lost and self._small):
+                break
+            if near.isdisjoint(node.map for node in links[k].pair):
+                near |= {node.map for node in links[k].pair}
+                off = float(strains[k]) ** 0.5
+                reason = f"strains the joined map: {off:.1f} standard deviations from where it ended"
+                self._ledger.disbelieve([links[k]], reason)
+                lost.append(links[k])
+        return lost
 
     def _fall(self, changed: set[MapId]) -> list[Link]:
         """Refuse groups of links under which robots would walk through each other."""
-        some = neighbours(self._sheets, changed)
-        if len(some) < 2:
-            return []
-        inside = {pair: b for pair, b in self._ledger.bundles.items() if pair[0] in some and pair[1] in some}
-        kept = [link for bundle in inside.values() for link in bundle.links.values()]
-        labels = sorted({self._all.label(node) for one in some for node in self._sheets[one].nodes})
-        graphs = [self._all.graph(label, math.inf) for label in labels]
-        impossible, refutation = clashing(self._sheets, some, graphs, kept, self._settings)
-        lost = []
-        for key, reason in impossible.items():
-            story = [link for link in kept if refutation.key_of(link) == key]
+        found = falling(self._sheets, self._ledger.bundles, self._all, changed, self._settings)
+        for story, reason in found:
             self._ledger.disbelieve(story, reason, for_good=True)
-            lost += story
-        return lost
+        return [link for story, _ in found for link in story]
 
     def _outcome(self, maps: Mapping[MapId, HybridMap], rulings: Rulings) -> MergedMap:
         """The island as a merged map."""
