@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
 from agent.pipeline import Status
-from agent.questions import decode_answer, encode_question
 from agent.report import AgentReport, encode_report
+from agent.sharing.questions import decode_answer, encode_question
 from hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2

@@ -14,20 +14,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from agent.exploration import ExplorerSettings
-from agent.explorer import Explorer
+from agent.exploring.exploration import ExplorerSettings
+from agent.exploring.explorer import Explorer
+from agent.exploring.passenger import Passenger, PassengerSettings
+from agent.exploring.wanderer import Wanderer
 from agent.floor import Floor, FloorSettings
-from agent.mapper import Mapper, MapperSettings
+from agent.mapping.mapper import Mapper, MapperSettings
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
-from agent.navigator import Navigator, NavigatorSettings
+from agent.navigating.navigator import Navigator, NavigatorSettings
 from agent.observation import Command, Observation, RobotDescription
-from agent.passenger import Passenger, PassengerSettings
-from agent.resumption import Resumption, ResumptionSettings
+from agent.resuming.resumption import Resumption, ResumptionSettings
 from agent.servo.proximity import guard
 from agent.tally import Tally
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
-from agent.wanderer import Wanderer
 from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId

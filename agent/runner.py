@@ -11,7 +11,7 @@ from agent.fleet import FleetLink
 from agent.mission import Answer, Question
 from agent.observation import Observation
 from agent.pipeline import Pipeline, Step
-from agent.replication import Replicator
+from agent.sharing.replication import Replicator
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from agent.observation import Command, Odometry
 from agent.servo.appearance import AppearanceServo
 from agent.servo.supervisor import Servo
 from benchmarks.servo_world import CAMERA, ROBOT, PoseFilter, Task, in_view
-from hybridmap.bearings import BearingFix, BearingSettings, relate, relate_all
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.recognising.bearings import BearingFix, BearingSettings, relate, relate_all
 
 _DEPTH_SHARE = 0.03
 _NOTHING = np.zeros((0, 2))

@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from agent.exploration import ExplorerSettings
+from agent.exploring.exploration import ExplorerSettings
 from agent.pipeline import PipelineSettings
 from benchmarks.explore_area import Look, MappedFloor, mapped_floor
 from benchmarks.explore_start import office

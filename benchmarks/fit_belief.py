@@ -1,4 +1,6 @@
-"""Fits how probable a recognised place is (mapserver.belief), and shows on other buildings whether it holds.
+"""Fits how probable a recognised place is, and shows on other buildings whether it holds.
+
+The fit goes into mapserver.relocalizing.belief.
 
     python -m benchmarks.fit_belief [--seeds N ...] [--check N ...] [--nodes N] [--queries N] [--json]
 
@@ -22,10 +24,10 @@ from benchmarks.relocalize_queries import KINDS, Query, known, nowhere, twins
 from benchmarks.relocalize_score import RIGHT_DEG, RIGHT_M, errors
 from hybridmap.node import NodeId
 from hybridmap.pose import Array
-from mapserver.belief import COEFFICIENTS, Support, probabilities
-from mapserver.placeindex import PlaceIndex
-from mapserver.relocalization import RelocalizationSettings, Relocalizer
-from mapserver.seenplaces import supported
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.belief import COEFFICIENTS, Support, probabilities
+from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
+from mapserver.relocalizing.seenplaces import supported
 
 PULL = 1.0
 """Of each weight to zero, as if by so many views."""

@@ -24,8 +24,8 @@ from hybridmap.grid import settle
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognition import Recognition, examine_view
-from hybridmap.selection import FIXED_BYTES, SelectionSettings, choose, worth
+from hybridmap.recognising.recognition import Recognition, examine_view
+from hybridmap.recognising.selection import FIXED_BYTES, SelectionSettings, choose, worth
 
 BUDGETS = (700, 850, 1000, 1200, 1500, 2000, 2500, 3000)
 QUERIES = 4

@@ -19,11 +19,11 @@ from hybridmap.camera import Camera
 from hybridmap.change import Change, NodePut
 from hybridmap.descriptor import decode, encode, root_sift, rounding_noise
 from hybridmap.grid import settle
-from hybridmap.matching import MatchSettings, match_vectors
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
-from hybridmap.selection import FIXED_BYTES
+from hybridmap.recognising.matching import MatchSettings, match_vectors
+from hybridmap.recognising.selection import FIXED_BYTES
 from wire.codec import decode_change, encode_change
 
 FRAMING = 80

@@ -35,11 +35,11 @@ from hybridmap.pose import Pose2
 from hybridmap.query import Certainty, View
 from hybridmap.superseded import Superseded
 from mapserver.living import LivingPlaces
-from mapserver.merger import Merger
-from mapserver.placeindex import PlaceIndex
-from mapserver.relocalization import Relocalizer
+from mapserver.merging.merger import Merger
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.routes import Router
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 
 CLOSE, CLOSE_TURN = 0.25, math.radians(8.0)
 ROUTES = 40

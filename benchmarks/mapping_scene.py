@@ -1,8 +1,9 @@
 """A simulated mapping run: a robot looks at a wall, drives back and forth, and follows what it sees.
 
 The camera's pictures are rendered, features are SIFT's, tracks Lucas-Kanade's and the estimates those of
-`agent.tracking`, all as a robot runs them; the drive closes its loop on the estimate. Truth is written down
-beside it and used for the start alone: a robot that shall look at something must stand before it.
+`agent.mapping.tracking`, all as a robot runs them; the drive closes its loop on the estimate. Truth is
+written down beside it, and used for the start alone: a robot that shall look at something must stand
+before it.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from numpy.typing import NDArray
 
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings
-from agent.exploration import ExplorerSettings
-from agent.mapper import MapperSettings
+from agent.exploring.exploration import ExplorerSettings
+from agent.mapping.mapper import MapperSettings
+from agent.mapping.placed import HERE
+from agent.mapping.tracking import Tracking
+from agent.mapping.view import View
 from agent.observation import Command, Observation, Odometry, RobotDescription
-from agent.placed import HERE
 from agent.servo.image_drive import ImageDrive, ImageDriveSettings
-from agent.tracking import Tracking
-from agent.view import View
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from benchmarks.ekf_run import speeds

@@ -19,8 +19,8 @@ from benchmarks.synthetic import Sensing, World, room, take_node
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from merge.candidates import Pair
-from merge.links import Link
+from merge.graph.candidates import Pair
+from merge.graph.links import Link
 
 WIDTH, DEPTH = 5.0, 4.0
 """Of a room, m."""

@@ -18,7 +18,7 @@ from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import CODE_BYTES, Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from merge.links import Link
+from merge.graph.links import Link
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25, mount_forward=0.08)
 BARE = Landmarks(

@@ -13,8 +13,8 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from mapweave.g2o import G2oEdge, G2oGraph
-from merge.links import Link
-from merge.merged import MergedMap
+from merge.graph.links import Link
+from merge.graph.merged import MergedMap
 
 WEIGHT = 20.0
 """Landmarks behind each link: files tell of none, so all have the same."""

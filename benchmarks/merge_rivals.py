@@ -13,13 +13,13 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Array, Pose2
 from mapweave.scoring import align
-from merge.cliques import best_clique
-from merge.consistency import ConsistencySettings, group_links, loop_distances2
-from merge.cutting import fragments_of
-from merge.fragments import fragment_by_node
-from merge.joining import Outliers
-from merge.links import Link
-from merge.merged import MergedMap
+from merge.belief.cliques import best_clique
+from merge.belief.consistency import ConsistencySettings, group_links, loop_distances2
+from merge.belief.cutting import fragments_of
+from merge.belief.joining import Outliers
+from merge.graph.fragments import fragment_by_node
+from merge.graph.links import Link
+from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings, merge_maps
 
 MAPWEAVE = "mapweave"

@@ -15,7 +15,7 @@ import numpy as np
 
 from hybridmap.errors import InvalidFile
 from hybridmap.pose import Array
-from merge.cliques import best_clique
+from merge.belief.cliques import best_clique
 
 GATE = 22.46
 """Chi-square with 6 degrees of freedom of a loop through two links: 99.9 %, as in the plane."""

@@ -22,8 +22,8 @@ from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidValue
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
-from mapserver.merger import Merger
-from merge.merged import MergedMap
+from mapserver.merging.merger import Merger
+from merge.graph.merged import MergedMap
 
 NODES_A_MAP = 100
 ACTIVE = 5

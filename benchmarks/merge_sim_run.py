@@ -29,8 +29,8 @@ from mapweave.trial.recording import Recording
 from mapweave.trial.run import TrialOptions, run_trial
 from mapweave.trial.scenario import Scenario, load_scenario, scenario_path
 from mapweave.trial.score import node_truth
-from merge.links import Link
-from merge.verification import verify
+from merge.graph.links import Link
+from merge.graph.verification import verify
 from sim.world import PanelSet
 
 VIEW = 0.5

@@ -19,10 +19,10 @@ from rich.progress import Progress
 
 from benchmarks.merge_building import LINK_SIGMAS, LOOKS, TURN_SIGMAS, WALK_SIGMAS, Building
 from hybridmap.pose import Array
-from hybridmap.pose_arrays import compose_poses, inverse_poses
-from merge.incremental_factors import Factors, RelaxSettings, relax
-from merge.incremental_settings import StepSettings
-from merge.posegraph import ANCHOR_SIGMA
+from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
+from merge.graph.posegraph import ANCHOR_SIGMA
+from merge.incremental.factors import Factors, RelaxSettings, relax
+from merge.incremental.settings import StepSettings
 
 NODES_A_MAP = 100
 ACTIVE = 4
@@ -102,7 +102,7 @@ class Solver(Protocol):
 
 
 class Mapweave:
-    """As `merge.incremental_steps` does: around what is new, and everything when a hundredth has come."""
+    """As `merge.incremental.steps` does: around what is new, and everything when a hundredth has come."""
 
     def __init__(self, nodes: int) -> None:
         """No measurements yet."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agent.follower import Progress
+from agent.navigating.follower import Progress
 from benchmarks.parking_run import LEAST_VISIBLE, Outcome, Record
 from benchmarks.parking_scene import Scene
 

@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from agent.follower import Progress
 from agent.mission import Answer
-from agent.navigator import Navigator
+from agent.navigating.follower import Progress
+from agent.navigating.navigator import Navigator
 from agent.servo.proximity import guard
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.exploration import Phase
+from agent.exploring.exploration import Phase
 from agent.mission import Answer, Explore, Question, WhereAmI, WhichWay
 from agent.pipeline import Pipeline
 from benchmarks.servo_planner import shortest_length
@@ -22,8 +22,8 @@ from hybridmap.errors import MapweaveError
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
-from mapserver.merger import Merger
-from mapserver.relocalization import Relocalizer
+from mapserver.merging.merger import Merger
+from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.routes import Router
 from sim.floorplan import FloorPlan
 from sim.places import is_clear

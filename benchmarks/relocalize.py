@@ -51,8 +51,8 @@ from benchmarks.relocalize_score import (
     wrong_by_kind,
 )
 from hybridmap.node import Node
-from mapserver.placeindex import PlaceIndex
-from mapserver.relocalization import RelocalizationSettings, Relocalizer
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
 
 REAL = 1000
 """Places that are real, at most."""

@@ -24,8 +24,8 @@ from benchmarks.relocalize_places import (
     placed,
 )
 from hybridmap.descriptor import decode, quantise
-from hybridmap.matching import match
 from hybridmap.node import Landmarks, Node, NodeId
+from hybridmap.recognising.matching import match
 
 AGENT = "d"
 """Of all distractors."""

@@ -13,11 +13,11 @@ from benchmarks.relocalize_places import Place
 from benchmarks.relocalize_queries import Query
 from benchmarks.relocalize_score import Reply
 from hybridmap.descriptor import root_sift
-from hybridmap.matching import match_vectors, squared_distances
 from hybridmap.query import RelocalizeAnswer
-from hybridmap.recognition import Recognition, RecognitionSettings, examine_matches
-from mapserver.relocalization import RelocalizationSettings, Relocalizer
-from mapserver.seenplaces import Sighting, is_lonely
+from hybridmap.recognising.matching import match_vectors, squared_distances
+from hybridmap.recognising.recognition import Recognition, RecognitionSettings, examine_matches
+from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
+from mapserver.relocalizing.seenplaces import Sighting, is_lonely
 
 AT_MOST = 10_000
 """Nodes; of a larger fleet so many are compared, all that are real among them."""

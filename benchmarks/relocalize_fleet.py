@@ -18,8 +18,8 @@ from benchmarks.relocalize_queries import KINDS, Query, known, nowhere, twins
 from benchmarks.relocalize_score import Reply, ask, judged, share, spent
 from hybridmap.descriptor import decode
 from hybridmap.node import Node, NodeId
-from mapserver.placeindex import PlaceIndex
-from mapserver.relocalization import Relocalizer
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.relocalization import Relocalizer
 
 DONORS = 800
 """Views behind the places that are not real."""

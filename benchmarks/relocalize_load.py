@@ -37,8 +37,8 @@ from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import View
-from mapserver.entry import Entry
-from mapserver.store import Store
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
 from mapweave.trial.children import Children, free_port
 from wire.bus_settings import BusSettings
 from wire.codec import encode_change

@@ -78,7 +78,7 @@ class Vocabulary:
 
 
 class WordIndex:
-    """Nodes by tf-idf; answers like mapserver.placeindex.PlaceIndex."""
+    """Nodes by tf-idf; answers like mapserver.places.placeindex.PlaceIndex."""
 
     def __init__(
         self, nodes: Iterable[Node], vocabulary: Vocabulary, progress: Callable[[], None] = lambda: None

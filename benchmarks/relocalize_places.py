@@ -14,8 +14,8 @@ from benchmarks.relocalize_pictures import Photographer, Picture, Wish, taken
 from hybridmap.grid import settle
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from merge.merged import MergedMap, Placement
-from merge.posegraph import Measurement, solve_graph
+from merge.graph.merged import MergedMap, Placement
+from merge.graph.posegraph import Measurement, solve_graph
 from sim.world import World
 from sim.worlds.catalog import make_world
 
@@ -28,7 +28,7 @@ SEEN_AGAIN = 0.85
 DEPTH_SHARE = 0.02
 """What the filter leaves of a depth's uncertainty, as a share of the depth; then a robot adds a floor."""
 DEPTH_FLOOR = (0.01, 0.015)
-"""m, and share of the depth, see agent.cartographer."""
+"""m, and share of the depth, see agent.mapping.cartographer."""
 COMMON_SCALE = 0.01
 """Depths of one node are wrong together by this share, as the wheels of its drive are."""
 SPARE = 1.4

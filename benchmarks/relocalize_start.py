@@ -34,7 +34,7 @@ from benchmarks.relocalize_queries import Query, known
 from benchmarks.relocalize_score import judged, share
 from benchmarks.relocalize_store import fill
 from hybridmap.query import RelocalizeAnswer
-from mapserver.placekeeper import SUFFIX
+from mapserver.places.placekeeper import SUFFIX
 from mapweave.trial.children import Children, free_port
 from wire.bus_settings import BusSettings
 from wire.keys import Keys

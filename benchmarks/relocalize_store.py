@@ -24,8 +24,8 @@ from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.grid import snap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from mapserver.entry import Entry
-from mapserver.store import Store
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
 from wire.codec import encode_change
 
 ROBOT_NODES = 500

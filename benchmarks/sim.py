@@ -29,7 +29,7 @@ from rich.table import Table
 from agent.ekf.mapping import MappingFilter
 from agent.fleet import FleetLink
 from agent.pipeline import PipelineSettings
-from agent.replication import Replicator
+from agent.sharing.replication import Replicator
 from agent.vision.sift import Sift
 from agent.vision.tracker import Tracker
 from benchmarks.bare_view import BareView

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from hybridmap.node import Node, NodeId
 from mapserver.known import Known
 from mapserver.living import LivingPlaces
-from mapserver.merger import Merger
-from mapserver.relocalization import Relocalizer
+from mapserver.merging.merger import Merger
+from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.routes import Router
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,10 @@ from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.answers import Answers
 from mapserver.desk import Desk
+from mapserver.log.store import Store
 from mapserver.services import guarded
-from mapserver.store import Store
-from merge.explanation import explain_nodes
-from merge.explanation_maps import explain_fleet, explain_maps
+from merge.explaining.explanation import explain_nodes
+from merge.explaining.maps import explain_fleet, explain_maps
 from merge.undoing import check_ruling, reason_of
 from wire.bus import Bus, Closing, Request
 from wire.explanation_messages import (

@@ -17,8 +17,8 @@ from itertools import islice
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from mapserver.services import guarded
-from merge.merged import MergedMap
-from merge.posegraph import PoseGraph
+from merge.graph.merged import MergedMap
+from merge.graph.posegraph import PoseGraph
 from wire.bus import Bus, Request
 from wire.keys import Keys
 from wire.posture_messages import MergedPosture, PostureNews

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from hybridmap.node import MapId, NodeId
 from hybridmap.query import KnownAnswer
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 from wire.messages import MAX_KNOWN
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from hybridmap.node import Node, NodeId
 from hybridmap.query import View
-from mapserver.placeindex import PlaceIndex
-from merge.merged import MergedMap
+from mapserver.places.placeindex import PlaceIndex
+from merge.graph.merged import MergedMap
 
 
 class LivingPlaces:

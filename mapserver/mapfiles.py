@@ -9,17 +9,17 @@ from hybridmap.change import EdgePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId
 from hybridmap.ruling import Rulings
-from merge.credence import credences
-from merge.cutting import fragments_of
-from merge.joining import Solver
-from merge.links import MERGE_AUTHOR, Link, RefusedLink, link_of
-from merge.merged import MergedMap, Placement
+from merge.belief.credence import credences
+from merge.belief.cutting import fragments_of
+from merge.belief.joining import Solver
+from merge.graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
+from merge.graph.merged import MergedMap, Placement
 from merge.undoing import undo
 from wire.codec import element_of
 from wire.mapfile import MapFile, RefusedPair
 
 PROBABILITY = "probability"
-"""Name among the evidence of a link in a file: see merge.credence."""
+"""Name among the evidence of a link in a file: see merge.belief.credence."""
 
 
 def map_file_of(merged: MergedMap) -> MapFile:

@@ -13,7 +13,7 @@ from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.reach import RECOGNISED
 from hybridmap.reach_book import ReachBook
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 
 NEAR, SUCCESSION = IMPLIED = ("near", "superseded")
 """Stand for the agents in the ids of edges that follow from where nodes are."""

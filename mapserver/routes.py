@@ -17,7 +17,7 @@ from hybridmap.reach_book import ReachBook
 from hybridmap.route import Route, RouteSettings, Ways
 from mapserver.living import without_faded
 from mapserver.roadmap import Roadmap
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 from merge.undoing import reason_of
 
 ENTRIES = 12

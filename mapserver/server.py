@@ -21,12 +21,12 @@ from mapserver.answers import Answers
 from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.desk import Desk, DeskSettings
 from mapserver.explainer import Explainer, RulingBook
-from mapserver.findingskeeper import FindingsKeeper
 from mapserver.herald import Herald
-from mapserver.ingest import Ingest
-from mapserver.placekeeper import PlaceKeeper
+from mapserver.log.ingest import Ingest
+from mapserver.log.store import Store
+from mapserver.merging.findingskeeper import FindingsKeeper
+from mapserver.places.placekeeper import PlaceKeeper
 from mapserver.services import Services
-from mapserver.store import Store
 from mapserver.upkeep import Upkeep
 from merge.merging import MergeSettings
 from wire.bus import Bus

@@ -15,13 +15,13 @@ from hybridmap.errors import MapweaveError
 from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
-from mapserver.deciding import Deciding
-from mapserver.findingskeeper import FindingsKeeper
-from mapserver.merger import Merger, MergerSettings
-from mapserver.placeindex import PlaceIndex
-from merge.merged import MergedMap
+from mapserver.merging.deciding import Deciding
+from mapserver.merging.findingskeeper import FindingsKeeper
+from mapserver.merging.merger import Merger, MergerSettings
+from mapserver.places.placeindex import PlaceIndex
+from merge.explaining.parting import joinings, partings
+from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings
-from merge.parting import joinings, partings
 
 log = logging.getLogger(__name__)
 

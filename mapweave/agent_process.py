@@ -14,14 +14,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from agent.drivers.robot import Robot
 from agent.fleet import FleetLink
-from agent.journal import Journal
-from agent.kept import Kept
-from agent.merged_postures import MergedPostures
 from agent.mission import Idle, Mission
 from agent.observation import Observation, RobotDescription
 from agent.pipeline import Pipeline, PipelineSettings, Step
-from agent.replication import Replicator
 from agent.runner import LOCKSTEP_PATIENCE, Runner
+from agent.sharing.journal import Journal
+from agent.sharing.kept import Kept
+from agent.sharing.merged_postures import MergedPostures
+from agent.sharing.replication import Replicator
 from hybridmap.node import MapId
 from wire.bus import Bus
 from wire.keys import Keys

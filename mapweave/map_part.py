@@ -9,10 +9,10 @@ from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeId, Node, NodeId
 from hybridmap.pose import Pose2
-from merge.credence import credences
-from merge.cutting import fragments_of
-from merge.merged import MergedMap
-from merge.posegraph import Measurement
+from merge.belief.credence import credences
+from merge.belief.cutting import fragments_of
+from merge.graph.merged import MergedMap
+from merge.graph.posegraph import Measurement
 from merge.undoing import undo
 
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from agent.vision.lens import Lens
 from hybridmap.errors import DeviceError
-from hybridmap.matching import match
 from hybridmap.node import Node
 from hybridmap.pose import Pose2
 from hybridmap.query import View
+from hybridmap.recognising.matching import match
 
 AGREES_PX = 5.0
 """A match agrees if its landmark lies so near to the feature by the posture that was answered."""

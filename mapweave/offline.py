@@ -10,8 +10,8 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.ruling import Rulings
 from mapserver.mapfiles import maps_of
-from mapserver.merger import Merger, MergerSettings
-from merge.merged import MergedMap
+from mapserver.merging.merger import Merger, MergerSettings
+from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings
 from wire.mapfile import MapFile
 

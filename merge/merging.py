@@ -19,18 +19,18 @@ from dataclasses import dataclass, field
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
-from merge.agglomeration import agglomerate
-from merge.consistency import ConsistencySettings, group_links
-from merge.distinctness import weigh
-from merge.drives import refuse_drives
-from merge.exclusion import ExclusionSettings
-from merge.incremental_memory import Memory
-from merge.joining import Outliers, Solver, optimise
-from merge.links import Link, RefusedLink
-from merge.merged import MergedMap, Postures
-from merge.posegraph import HUBER
-from merge.readmission import readmitted
-from merge.refutation import Refutation
+from merge.belief.agglomeration import agglomerate
+from merge.belief.consistency import ConsistencySettings, group_links
+from merge.belief.distinctness import weigh
+from merge.belief.drives import refuse_drives
+from merge.belief.joining import Outliers, Solver, optimise
+from merge.belief.memory import Memory
+from merge.belief.readmission import readmitted
+from merge.bodies.exclusion import ExclusionSettings
+from merge.bodies.refutation import Refutation
+from merge.graph.links import Link, RefusedLink
+from merge.graph.merged import MergedMap, Postures
+from merge.graph.posegraph import HUBER
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Ruling, Rulings
-from merge.claims import CLAIMS
-from merge.links import Link, RefusedLink, refuse, refuse_edge
-from merge.merged import MergedMap
+from merge.belief.claims import CLAIMS
+from merge.graph.links import Link, RefusedLink, refuse, refuse_edge
+from merge.graph.merged import MergedMap
 
 NANOSECONDS = 1_000_000_000
 

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from agent.ekf import algebra
-from hybridmap.kernels import kernels
+from hybridmap.recognising.kernels import kernels
 
 PRODUCTS = (
     "drive", "advance",

@@ -19,8 +19,8 @@ from agent.ekf.settings import LocalizationSettings
 from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
-from hybridmap.planar_pose import PlanarPoseSettings, solve_planar_pose
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.recognising.planar_pose import PlanarPoseSettings, solve_planar_pose
 
 __all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from agent.homing.trail import Trail, TrailSettings
 from agent.observation import Odometry, RobotDescription
-from hybridmap.bearings import BearingFix
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2, PoseGaussian, wrap_angle
+from hybridmap.recognising.bearings import BearingFix
 
 DIRECTIONS = (math.pi, 0.75 * math.pi, -0.75 * math.pi, 0.5 * math.pi, -0.5 * math.pi, 0.0)
 """rad, from the place: where else the search for the first posture begins."""
@@ -57,7 +57,7 @@ class Guesses:
             description: of the robot that drives.
             place: camera of the place's view.
             pixels_at_place: (N, 2) px, where the landmarks are there.
-            fixes: of the first image, at least one; see hybridmap.bearings.relate_all.
+            fixes: of the first image, at least one; see hybridmap.recognising.bearings.relate_all.
             prior: place_from_robot by anything but these bearings, however uncertain.
             settings: of each trail.
         """

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from agent.homing.guesses import Guesses
 from agent.homing.trail import TrailSettings
-from agent.node_tracks import NodeTracks
 from agent.observation import Observation, RobotDescription
 from agent.vision.lens import Lens
+from agent.vision.node_tracks import NodeTracks
 from agent.vision.sift import Features
 from agent.vision.tracker import TrackerSettings
-from hybridmap.bearing_recognition import BearingRecognition
 from hybridmap.node import Landmarks, Node
 from hybridmap.pose import Array, PoseGaussian
+from hybridmap.recognising.bearing_recognition import BearingRecognition
 
 
 @dataclass(frozen=True)

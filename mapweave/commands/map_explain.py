@@ -65,7 +65,7 @@ def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> Pair
     """Two nodes of a map file, or of what a server has."""
     from mapserver.mapfiles import merged_of
     from mapweave.commands.map_ends import ask
-    from merge.explanation import explain_nodes
+    from merge.explaining.explanation import explain_nodes
     from wire.explanation_messages import ExplainRequest, decode_pair, encode_explain_request
     from wire.keys import Keys
     from wire.mapfile import read_map_file
@@ -82,7 +82,7 @@ def explained_maps(
     """Two maps of a map file, or of what a server has; each two of them without ends."""
     from mapserver.mapfiles import merged_of
     from mapweave.commands.map_ends import ask
-    from merge.explanation_maps import explain_fleet, explain_maps
+    from merge.explaining.maps import explain_fleet, explain_maps
     from wire.explanation_messages import MAX_MAPS_TOLD, ExplainRequest, decode_maps, encode_explain_request
     from wire.keys import Keys
     from wire.mapfile import read_map_file

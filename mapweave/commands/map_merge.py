@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from hybridmap.hybrid_map import HybridMap
     from hybridmap.node import MapId
     from hybridmap.ruling import Rulings
-    from merge.merged import MergedMap
+    from merge.graph.merged import MergedMap
     from merge.merging import MergeSettings
 
 
@@ -38,9 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.commands.network import settings_of
     from mapweave.offline import parts_of
     from mapweave.settings import merge_settings
-    from merge.explanation_maps import explain_fleet
-    from merge.merged import MergedMap
-    from merge.parting import joinings
+    from merge.explaining.maps import explain_fleet
+    from merge.explaining.parting import joinings
+    from merge.graph.merged import MergedMap
     from wire.mapfile import read_map_file, write_map_file
 
     settings = merge_settings(settings_of(arguments), arguments.settings)

@@ -39,8 +39,8 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
     from hybridmap.node import check_name
+    from mapserver.people.web import Web, parse_address
     from mapserver.server import MapServer, ServerSettings
-    from mapserver.web import Web, parse_address
     from mapweave.settings import merge_settings
     from wire.bus_settings import BusSettings
     from wire.keys import Keys

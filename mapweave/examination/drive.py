@@ -22,8 +22,8 @@ from hybridmap.errors import DeviceError, InvalidValue
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import Certainty
-from mapserver.merger import Merger
-from mapserver.relocalization import Relocalizer
+from mapserver.merging.merger import Merger
+from mapserver.relocalizing.relocalization import Relocalizer
 from mapweave.examination.verdict import LEVELS, Verdict
 
 REACH = 1.5

@@ -21,13 +21,13 @@ from hybridmap.errors import DeviceError, InvalidFile
 from hybridmap.node import Edge, MapId, NodeId
 from hybridmap.pose import Pose2
 from mapserver.mapfiles import map_file_of
-from mapserver.merger import Merger, MergerSettings
+from mapserver.merging.merger import Merger, MergerSettings
 from mapweave.examination.drive import Truth
 from mapweave.examination.pieces import pieces
 from mapweave.picture import MapPicture, draw_map
 from mapweave.scoring import FALSE_LINK, FALSE_LINK_TURN, link_recall, posture_error, score_map
-from merge.links import Link
-from merge.merged import MergedMap
+from merge.graph.links import Link
+from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings
 from wire.mapfile import write_map_file
 

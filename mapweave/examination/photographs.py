@@ -23,14 +23,14 @@ from agent.drivers.replay import images_of
 from agent.observation import RobotDescription
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
-from hybridmap.bearing_recognition import recognise_bearings
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
-from mapserver.appearance import agreeing, rivals
-from mapserver.placeindex import PlaceIndex
+from hybridmap.recognising.bearing_recognition import recognise_bearings
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.appearance import agreeing, rivals
 from mapweave.examination.verdict import Verdict
 
 
@@ -90,13 +90,13 @@ Geometry = Callable[[Node, View], int]
 
 
 def planar(node: Node, view: View) -> int:
-    """By the geometry of a level camera at one height (hybridmap.bearing_recognition)."""
+    """By the geometry of a level camera at one height (hybridmap.recognising.bearing_recognition)."""
     found = recognise_bearings(node, view, np.random.default_rng(node.id.number))
     return 0 if found is None else found.inliers
 
 
 def general(node: Node, view: View) -> int:
-    """By the fundamental matrix, as a map server does (mapserver.appearance)."""
+    """By the fundamental matrix, as a map server does (mapserver.relocalizing.appearance)."""
     found = agreeing(node, view)
     return 0 if found is None else len(found)
 

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from agent.journal import Journal
+from agent.sharing.journal import Journal
 from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
-from mapserver.store import Store
+from mapserver.log.store import Store
 from wire.codec import encode_body
 
 

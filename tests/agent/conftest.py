@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import skimage.data
 
-from agent.mapper import Mapper
+from agent.mapping.mapper import Mapper
 from agent.observation import Observation, Odometry, RobotDescription
 from benchmarks.synthetic import World
 from hybridmap.camera import Camera

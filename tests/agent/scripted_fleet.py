@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from agent.mission import Answer, Question
-from agent.navigator import Navigator, NavigatorSettings
+from agent.navigating.navigator import Navigator, NavigatorSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.vision.lens import Lens
 from agent.vision.sift import Features

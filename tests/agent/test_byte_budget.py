@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.mapper import Mapper, MapperSettings
+from agent.mapping.mapper import Mapper, MapperSettings
 from hybridmap.change import Change, NodePut
 from hybridmap.errors import InvalidValue, SettingsError
 from hybridmap.node import MapId, Node

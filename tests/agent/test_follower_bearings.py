@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agent.detour import Detour
-from agent.fix import Fix
-from agent.follower import Follower, FollowerSettings, Progress
 from agent.homing.localizer import BearingLocalizer
-from agent.lookout import Expected, Lookout, LookoutSettings
+from agent.localizing.fix import Fix
+from agent.localizing.lookout import Expected, Lookout, LookoutSettings
+from agent.navigating.detour import Detour
+from agent.navigating.follower import Follower, FollowerSettings, Progress
 from agent.observation import Observation, Odometry, RobotDescription
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agent.helm import NO_ANSWER, Helm
 from agent.mission import Answer, Question, WhereAmI, WhichWay
+from agent.navigating.helm import NO_ANSWER, Helm
+from agent.navigating.search import Search, SearchSettings
 from agent.observation import Observation, Odometry
-from agent.search import Search, SearchSettings
 from agent.tally import Tally
 from agent.vision.lens import Lens
 from benchmarks.synthetic import take_map

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agent import cartographer
-from agent.cartographer import Cartographer, CartographerSettings
-from agent.mapper import Mapper
+from agent.mapping import cartographer
+from agent.mapping.cartographer import Cartographer, CartographerSettings
+from agent.mapping.mapper import Mapper
 from agent.observation import Command, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.change import NodePut

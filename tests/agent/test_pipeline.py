@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from agent.agreement import AgreementSettings
 from agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
 from agent.observation import Command, Observation, Odometry
 from agent.pipeline import Pipeline, PipelineSettings, Step
-from agent.resumption import ResumptionSettings
+from agent.resuming.agreement import AgreementSettings
+from agent.resuming.resumption import ResumptionSettings
 from hybridmap.change import NodePut
 from hybridmap.node import Edge, EdgeKind, NodeId
 from hybridmap.pose import Pose2

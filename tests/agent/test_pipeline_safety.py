@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from agent.explorer import Explorer
+from agent.exploring.explorer import Explorer
 from agent.mission import Explore
 from agent.observation import Command
 from agent.pipeline import Pipeline

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.journal import Journal
-from agent.kept import Kept
 from agent.mission import Explore, GoTo
 from agent.observation import Command
 from agent.pipeline import Pipeline
+from agent.sharing.journal import Journal
+from agent.sharing.kept import Kept
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, wrap_angle

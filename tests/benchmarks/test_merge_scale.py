@@ -8,8 +8,8 @@ from benchmarks.merge_building import Building
 from benchmarks.merge_scale import at_size, scale
 from hybridmap.change import NodePut
 from hybridmap.errors import InvalidValue
-from merge.links import Link
-from merge.verification import verify
+from merge.graph.links import Link
+from merge.graph.verification import verify
 
 
 def test_links_that_are_drawn_are_those_that_would_be_found() -> None:

@@ -19,14 +19,14 @@ from benchmarks.relocalize_queries import Query, beside
 from benchmarks.relocalize_score import Reply, ask, figures, judged, spent
 from benchmarks.synthetic import CAMERA, room, take_map, take_view
 from hybridmap.descriptor import decode, root_sift
-from hybridmap.matching import MatchSettings, match_vectors
 from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
-from mapserver.belief import Support
-from mapserver.placeindex import PlaceIndex
-from mapserver.relocalization import Relocalizer
-from merge.merged import MergedMap
+from hybridmap.recognising.matching import MatchSettings, match_vectors
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.belief import Support
+from mapserver.relocalizing.relocalization import Relocalizer
+from merge.graph.merged import MergedMap
 from sim.worlds.catalog import make_world
 
 

@@ -13,7 +13,7 @@ from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
-from mapserver.store import Store
+from mapserver.log.store import Store
 
 
 def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
-from mapserver.entry import Entry
-from mapserver.store import Store
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
 from tests.mapserver.played import HandAgent, Server
 from wire.codec import encode_change
 from wire.memory import MemoryHub

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from hybridmap.change import Change, NodeRetired
 from hybridmap.node import MapId, NodeId
-from mapserver.agent_log import PullSettings
-from mapserver.ingest import Ingest, IngestSettings
-from mapserver.store import Store
+from mapserver.log.agent_log import PullSettings
+from mapserver.log.ingest import Ingest, IngestSettings
+from mapserver.log.store import Store
 from wire.bus import Request
 from wire.codec import encode_change
 from wire.keys import Keys

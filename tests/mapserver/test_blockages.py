@@ -13,7 +13,7 @@ from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from mapserver.blockages import Blockages, BlockageSettings
-from mapserver.merger import Merger
+from mapserver.merging.merger import Merger
 from mapserver.routes import Router
 
 A, B, C = (NodeId("a", 1, number) for number in (1, 3, 5))

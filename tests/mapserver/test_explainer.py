@@ -17,13 +17,13 @@ from hybridmap.explanation import MapsExplanation, Standing
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ends, Ruling
-from mapserver.entry import Entry
 from mapserver.explainer import RulingBook
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
 from mapserver.mapfiles import map_file_of, maps_of, merged_of
-from mapserver.merger import Merger
+from mapserver.merging.merger import Merger
 from mapserver.server import MapServer, ServerSettings
-from mapserver.store import Store
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 from wire.bus import Reply
 from wire.codec import encode_change
 from wire.explanation_messages import (

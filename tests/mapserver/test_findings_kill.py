@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mapserver.findingskeeper import SUFFIX
+from mapserver.merging.findingskeeper import SUFFIX
 from tests.waiting import eventually
 
 SERVER = """
@@ -19,9 +19,9 @@ from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
-from mapserver.entry import Entry
+from mapserver.log.entry import Entry
 from mapserver.server import MapServer
-from mapserver.store import Store
+from mapserver.log.store import Store
 from wire.codec import encode_change
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.merged_postures import MergedPostures
+from agent.sharing.merged_postures import MergedPostures
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
 from mapserver.herald import Herald, HeraldSettings
 from mapserver.server import MapServer
-from merge.merged import MergedMap, Postures
-from merge.posegraph import PoseGraph
+from merge.graph.merged import MergedMap, Postures
+from merge.graph.posegraph import PoseGraph
 from tests.mapserver.conftest import MappedRoom
 from tests.waiting import eventually
 from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet

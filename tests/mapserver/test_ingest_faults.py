@@ -11,13 +11,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agent.journal import Journal
-from agent.replication import ReplicationSettings, Replicator
+from agent.sharing.journal import Journal
+from agent.sharing.replication import ReplicationSettings, Replicator
 from hybridmap.change import Change, NodeRetired
 from hybridmap.node import NodeId
-from mapserver.agent_log import PullSettings
-from mapserver.ingest import Ingest, IngestSettings
-from mapserver.store import Store
+from mapserver.log.agent_log import PullSettings
+from mapserver.log.ingest import Ingest, IngestSettings
+from mapserver.log.store import Store
 from wire.codec import encode_change
 from wire.keys import Keys
 from wire.memory import Faults, MemoryBus, MemoryHub

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.journal import Journal
+from agent.sharing.journal import Journal
 from hybridmap.node import MapId
-from mapserver.store import Store
+from mapserver.log.store import Store
 from wire.codec import encode_change
 
 CHANGES = 400
@@ -21,8 +21,8 @@ CHANGES = 400
 SERVER = """
 import sys, time
 from pathlib import Path
-from mapserver.ingest import Ingest
-from mapserver.store import Store
+from mapserver.log.ingest import Ingest
+from mapserver.log.store import Store
 from wire.bus_settings import BusSettings
 from wire.keys import Keys
 from wire.zenoh_bus import ZenohBus
@@ -41,8 +41,8 @@ store.close()
 AGENT = """
 import sys, time
 from pathlib import Path
-from agent.journal import Journal
-from agent.replication import Replicator
+from agent.sharing.journal import Journal
+from agent.sharing.replication import Replicator
 from hybridmap.change import NodeRetired
 from hybridmap.node import NodeId
 from wire.bus_settings import BusSettings

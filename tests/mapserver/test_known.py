@@ -15,9 +15,9 @@ from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from hybridmap.query import KnownAnswer
 from mapserver.known import Known
-from mapserver.merger import Merger
+from mapserver.merging.merger import Merger
 from mapserver.server import MapServer, ServerSettings
-from merge.merged import MergedMap, Placement
+from merge.graph.merged import MergedMap, Placement
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
 from wire.messages import (

@@ -15,7 +15,7 @@ from hybridmap.query import Certainty, View
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.answers import Answers
 from mapserver.living import LivingPlaces, without_faded
-from mapserver.merger import Merger
+from mapserver.merging.merger import Merger
 
 HERE, THERE = MapId("a", 1), MapId("b", 1)
 RETIRED = Ruling((THERE, THERE), True, "anna", 1, "rebuilt")

@@ -11,10 +11,10 @@ from benchmarks.synthetic import Sensing, room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
-from mapserver.merger import Merger
+from mapserver.merging.merger import Merger
 from mapserver.routes import Router
-from merge.explanation import explain_nodes
-from merge.explanation_maps import explain_maps
+from merge.explaining.explanation import explain_nodes
+from merge.explaining.maps import explain_maps
 
 ME = MapId("a", 1)
 STEP = 0.8

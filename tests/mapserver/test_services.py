@@ -16,11 +16,11 @@ from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapserver.desk import DeskSettings
-from mapserver.merger import Merger
-from mapserver.placeindex import PlaceIndex
-from mapserver.relocalization import Relocalizer
+from mapserver.merging.merger import Merger
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.server import MapServer, ServerSettings
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 from wire.bus import Reply
 from wire.keys import Keys
 from wire.log_messages import decode_record

@@ -14,11 +14,11 @@ from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
 from hybridmap.ruling import Ruling, Rulings
-from mapserver.judgement import NOWHERE
-from mapserver.merger import Merger
-from mapserver.placeindex import PlaceIndex
+from mapserver.merging.merger import Merger
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.judgement import NOWHERE
 from mapserver.upkeep import Upkeep
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 
 
 def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> None:

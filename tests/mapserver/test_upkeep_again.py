@@ -13,8 +13,8 @@ from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 from mapserver.upkeep import Upkeep
-from merge.incremental_again import Again
-from merge.incremental_settings import StepSettings
+from merge.incremental.again import Again
+from merge.incremental.settings import StepSettings
 from tests.waiting import eventually
 
 
@@ -22,9 +22,8 @@ from tests.waiting import eventually
 def test_answers_go_on_while_all_is_decided_again(
     broken: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(
-        "merge.incremental.StepSettings", lambda: StepSettings(anew_up_to=0, whole_up_to=0, whole_share=0.0)
-    )
+    always = StepSettings(anew_up_to=0, whole_up_to=0, whole_share=0.0)
+    monkeypatch.setattr("merge.incremental.islands.StepSettings", lambda: always)
     entered, go = threading.Event(), threading.Event()
     real = Again.run
 

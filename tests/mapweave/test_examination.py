@@ -16,7 +16,7 @@ import skimage.data
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
-from mapserver.appearance import evidence
+from mapserver.relocalizing.appearance import evidence
 from mapweave.cli import main
 from mapweave.examination.verdict import Verdict, figures
 

@@ -20,13 +20,13 @@ from hybridmap.errors import InvalidFile, InvalidValue
 from hybridmap.node import EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
 from mapserver.mapfiles import map_file_of
-from mapserver.merger import Merger
+from mapserver.merging.merger import Merger
 from mapweave.cli import main
 from mapweave.exporting import FORMATS
 from mapweave.g2o import G2oEdge, G2oGraph, read_g2o, write_g2o
 from mapweave.g2o_optimum import optimum_of
 from mapweave.map_part import MapPart
-from merge.merged import MergedMap
+from merge.graph.merged import MergedMap
 from wire.mapfile import write_map_file
 
 

@@ -17,9 +17,9 @@ from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
-from mapserver.entry import Entry
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
 from mapserver.mapfiles import merged_of
-from mapserver.store import Store
 from mapweave.cli import main
 from mapweave.trial.children import Children, free_port
 from wire.bus_settings import BusSettings

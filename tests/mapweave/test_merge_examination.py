@@ -15,7 +15,7 @@ import pytest
 
 from agent.drivers.replay import Replay
 from agent.pipeline import PipelineSettings
-from agent.resumption import ResumptionSettings
+from agent.resuming.resumption import ResumptionSettings
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2

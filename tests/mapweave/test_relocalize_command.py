@@ -22,10 +22,10 @@ from hybridmap.errors import Busy
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import View
-from mapserver.entry import Entry
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
 from mapserver.server import MapServer
 from mapserver.services import Services
-from mapserver.store import Store
 from mapweave.cli import main
 from mapweave.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
 from wire.bus_settings import BusSettings

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from hybridmap.errors import SettingsError
 from mapweave.settings import Settings, load_settings, merge_settings
-from merge.joining import Outliers
+from merge.belief.joining import Outliers
 from merge.merging import MergeSettings
 from wire.tables import build
 

@@ -10,12 +10,12 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ruling import Ruling, Rulings
-from merge.candidates import Pair
-from merge.incremental_factors import RelaxSettings, relax
-from merge.incremental_graph import WideGraph
-from merge.incremental_verdicts import Verdict, Verdicts
-from merge.links import Link, RefusedLink
-from merge.merged import MergedMap
+from merge.graph.candidates import Pair
+from merge.graph.links import Link, RefusedLink
+from merge.graph.merged import MergedMap
+from merge.incremental.factors import RelaxSettings, relax
+from merge.incremental.graph import WideGraph
+from merge.incremental.verdicts import Verdict, Verdicts
 from merge.merging import merge_maps
 from merge.undoing import undo
 

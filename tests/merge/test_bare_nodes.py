@@ -8,8 +8,8 @@ import pytest
 from benchmarks.synthetic import room, take_node
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from merge.links import Link, RefusedLink
-from merge.verification import verify
+from merge.graph.links import Link, RefusedLink
+from merge.graph.verification import verify
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 

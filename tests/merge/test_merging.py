@@ -11,11 +11,11 @@ from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from merge.candidates import choose_pairs, overlaps
-from merge.links import Link, RefusedLink
-from merge.merged import MergedMap
+from merge.graph.candidates import choose_pairs, overlaps
+from merge.graph.links import Link, RefusedLink
+from merge.graph.merged import MergedMap
+from merge.graph.verification import verify
 from merge.merging import merge_maps
-from merge.verification import verify
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 

@@ -12,9 +12,9 @@ from benchmarks.merge_grid import draw_grid
 from benchmarks.merge_rivals import RIVALS, error, oracle, precision_recall
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from merge.graduated import wrong_measurements
+from merge.belief.graduated import wrong_measurements
+from merge.graph.posegraph import Measurement, solve_graph
 from merge.merging import merge_maps
-from merge.posegraph import Measurement, solve_graph
 
 GATE = 16.27
 SMALL = FleetSettings(nodes=40, side=8.0)

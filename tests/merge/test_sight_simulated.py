@@ -16,10 +16,10 @@ from hybridmap.change import NodePut
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
-from merge.exclusion import Clash, ExclusionSettings, clash_of
-from merge.posegraph import PoseGraph
-from merge.sight import SightSettings
-from merge.trails import trails_of
+from merge.bodies.exclusion import Clash, ExclusionSettings, clash_of
+from merge.bodies.sight import SightSettings
+from merge.bodies.trails import trails_of
+from merge.graph.posegraph import PoseGraph
 from sim.simulation import Simulation
 from sim.worlds.catalog import make_world
 

@@ -10,9 +10,9 @@ from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ruling, Rulings
-from mapserver.merger import Merger
-from merge.explanation_maps import explain_maps
-from merge.merged import MergedMap
+from mapserver.merging.merger import Merger
+from merge.explaining.maps import explain_maps
+from merge.graph.merged import MergedMap
 
 A, B = MapId("a", 1), MapId("b", 1)
 NOON = 1_772_366_400_000_000_000

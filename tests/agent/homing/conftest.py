@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from agent.homing.guesses import Guesses
 from agent.homing.trail import TrailSettings
 from agent.observation import Odometry, RobotDescription
-from hybridmap.bearings import BearingSettings, relate_all
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.recognising.bearings import BearingSettings, relate_all
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25, mount_forward=0.06)
 PLACE = Camera(400, 300, 350.0, 345.0, 199.5, 149.5, mount_height=0.28, mount_forward=0.1)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.journal import Journal
+from agent.sharing.journal import Journal
 from hybridmap.camera import Camera
 from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from mapserver.entry import Entry
-from mapserver.store import Store
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
 from mapweave.trial.disks import map_hash, read_disks
 from wire.codec import encode_change
 

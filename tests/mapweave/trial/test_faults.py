@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from agent.journal import Journal
-from mapserver.store import Store
+from agent.sharing.journal import Journal
+from mapserver.log.store import Store
 from mapweave.trial.run import TrialOptions, run_trial
 from mapweave.trial.scenario import load_scenario
 

@@ -1,0 +1,236 @@
+"""Mapping: observations in, nodes and edges out. Who drives, explorer or person, is not its business."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from agent.ekf.report import Health
+from agent.mapping.cartographer import Cartographer, CartographerSettings
+from agent.mapping.placed import HERE
+from agent.mapping.track_settings import TrackingSettings
+from agent.mapping.tracking import Tracking
+from agent.mapping.view import View
+from agent.observation import Observation, RobotDescription
+from agent.surveying.surveyor import Traverse
+from agent.vision.lens import Lens
+from agent.vision.report import TrackReport
+from agent.vision.sift import Features, Sift, SiftSettings
+from hybridmap.change import ChangeBody, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, Node
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.recognising.recognition import Recognition
+
+
+@dataclass(frozen=True)
+class MapperSettings:
+    """How a map is made.
+
+    Attributes:
+        sift: features of a view.
+        tracking: of landmarks between views.
+        cartographer: nodes and edges.
+        depths_per_height: assumed depth of an unknown feature before there is any node, as a multiple of
+            the camera's height (the paper's "assumed common height").
+    """
+
+    sift: SiftSettings = field(default_factory=SiftSettings)
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    cartographer: CartographerSettings = field(default_factory=CartographerSettings)
+    depths_per_height: float = 8.0
+
+
+class Mapper:
+    """Cuts a drive into episodes. Each begins at a view, the *anchor*, and ends at the next.
+
+    The filter's posture is relative to the anchor, with zero covariance there (the paper's P_0^r = 0). So
+    its covariance at the next anchor is that of the edge between the two nodes.
+
+    Attributes:
+        typical_depth: median depth of the last node's landmarks, m; before there is one, an assumed depth.
+    """
+
+    def __init__(
+        self,
+        map_id: MapId,
+        description: RobotDescription,
+        settings: MapperSettings | None = None,
+        contents: Sequence[ChangeBody] = (),
+        next_number: int = 1,
+    ) -> None:
+        """Start an empty map where the robot stands, or take up one that was begun; see Cartographer."""
+        settings = settings or MapperSettings()
+        self.typical_depth = settings.depths_per_height * max(description.camera.mount_height, 0.05)
+        self._description = description
+        self._settings = settings
+        self._lens = Lens(description)
+        self._sift = Sift(self._lens, settings.sift)
+        self._tracking = Tracking(description, self._lens, settings.tracking)
+        self._cartographer = Cartographer(map_id, description, settings.cartographer, contents, next_number)
+        self._anchor: View | None = None
+        self._leaves: list[View] = []
+
+    # What an explorer or a passenger needs to know
+
+    @property
+    def map(self) -> HybridMap:
+        """What was mapped so far."""
+        return self._cartographer.map
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an anchor view to map from."""
+        return self._anchor is not None
+
+    @property
+    def astray(self) -> bool:
+        """Whether there is a map and the robot does not know where on it it is: it must recognise a place."""
+        return self._anchor is None and bool(self.map.nodes)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the last image shows nothing of what it should, or none comes: no time to map."""
+        return self._tracking.doubtful
+
+    @property
+    def doubt(self) -> str:
+        """Why, in words."""
+        if self._tracking.strange:
+            return "the image shows something else than a moment ago"
+        if self._tracking.blank:
+            return "the image shows nothing: is it dark, or the lens covered?"
+        return "the camera gives no new image" if self.doubtful else ""
+
+    @property
+    def health(self) -> str:
+        """What is wrong with the estimate of the posture, in words; empty if nothing is.
+
+        That depths are unknown before the robot has moved goes without saying.
+        """
+        health, reason = self._tracking.health
+        return reason if self.started and health is not Health.NO_PARALLAX else ""
+
+    @property
+    def anchor_from_robot(self) -> Pose2:
+        """Posture since the anchor view."""
+        return self._tracking.pose.mean
+
+    @property
+    def map_from_robot(self) -> PoseGaussian:
+        """Posture in the agent's map."""
+        return self._cartographer.map_from_anchor @ self._tracking.pose
+
+    @property
+    def tracked(self) -> int:
+        """Tracks alive."""
+        return len(self._tracking.ids)
+
+    @property
+    def track_report(self) -> TrackReport:
+        """Age of the tracks, how well they agree with the filter, and how much of the image they cover."""
+        return self._tracking.report
+
+    @property
+    def anchored(self) -> int:
+        """Features of the anchor view that are still tracked."""
+        return 0 if self._anchor is None else int(np.isin(self._tracking.ids, self._anchor.tracks).sum())
+
+    @property
+    def anchor_features(self) -> int:
+        """Features that the anchor view had."""
+        return 0 if self._anchor is None else len(self._anchor.features)
+
+    @property
+    def bearings(self) -> Array:
+        """(N,) rad, bearings of the tracks, positive to the left."""
+        return self._description.camera.bearings(self._tracking.pixels)
+
+    @property
+    def converged_share(self) -> float:
+        """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
+        return self._tracking.converged_share
+
+    def drove(self, traverse: Traverse | None, refined: Node | None) -> list[ChangeBody]:
+        """Take in what was measured on a drive while nothing was mapped; see Cartographer."""
+        return self._cartographer.drove(traverse, refined)
+
+    # One tick, and what ends an episode
+
+    def step(self, observation: Observation) -> None:
+        """Take in what the robot senses. Call once a tick, before anything below."""
+        self._tracking.step(observation)
+        if self._tracking.carried_off or self._tracking.disputed:
+            self.lose()
+            self._tracking.step(observation)
+
+    def begin(self, observation: Observation) -> None:
+        """Take the first view: the anchor of the first episode."""
+        anchor = self._take(observation, HERE)
+        if anchor is not None:
+            self._begin_at(anchor)
+
+    def lose(self) -> None:
+        """Nobody knows any more where the robot is. What was seen since the anchor view is dropped.
+
+        With nodes it is astray and must `resume`; without any it may `begin` anew.
+        """
+        self._cartographer.lose(self._tracking.pose)
+        self._tracking = Tracking(self._description, self._lens, self._settings.tracking)
+        self._anchor, self._leaves = None, []
+
+    def resume(
+        self, observation: Observation, features: Features, node: Node, recognition: Recognition
+    ) -> None:
+        """Go on from an image in which a node of the own map was recognised: it is the next anchor.
+
+        Args:
+            observation: with the image.
+            features: of that image.
+            node: of `map`.
+            recognition: of the node in the features.
+        """
+        self.lose()
+        self._tracking.step(observation)
+        anchor = self._tracking.take(observation, features, HERE)
+        self.typical_depth = float(np.median(node.landmarks.depths[node.landmarks.has_depth]))
+        self._begin_at(anchor)
+        self._cartographer.recognise(node, anchor, recognition)
+
+    def _begin_at(self, anchor: View) -> None:
+        self._tracking.reanchor()
+        self._anchor = anchor
+        self._tracking.follow(anchor, self.typical_depth)
+
+    def leaf(self, observation: Observation) -> None:
+        """Keep the current image as a node beside the anchor, for example at the far end of a drive."""
+        view = self._take(observation, self._tracking.pose)
+        if view is not None:
+            self._tracking.remember(force=True)
+            self._leaves.append(view)
+
+    def finish(self, observation: Observation) -> list[ChangeBody]:
+        """End the episode: its views become nodes, and the current image becomes the next anchor.
+
+        Returns:
+            The changes to the map, already applied to `map`. Empty without an image.
+        """
+        next_anchor = self._take(observation, HERE)
+        if next_anchor is None or self._anchor is None:
+            return []
+        self._tracking.remember(force=True)
+        changes = self._cartographer.place(self._anchor, self._leaves, self._tracking)
+        for change in changes[:1]:
+            if isinstance(change, NodePut):
+                self.typical_depth = float(np.median(change.node.landmarks.depths))
+        self._cartographer.move_anchor(self._tracking.reanchor())
+        self._anchor, self._leaves = next_anchor, []
+        self._tracking.follow(next_anchor, self.typical_depth)
+        return changes
+
+    def _take(self, observation: Observation, anchor_from_view: PoseGaussian) -> View | None:
+        if observation.image is None:
+            return None
+        return self._tracking.take(observation, self._sift.extract(observation.image), anchor_from_view)

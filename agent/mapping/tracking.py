@@ -1,0 +1,292 @@
+"""Tracks and the mapping filter together: what ties the robot's motion to what it sees."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.ekf.landmarks import LandmarkEstimates
+from agent.ekf.mapping import MappingFilter
+from agent.ekf.report import Health
+from agent.ekf.triangulation import triangulate
+from agent.mapping.continuity import Continuity, Sight, relit, turned
+from agent.mapping.dispute import Dispute
+from agent.mapping.track_history import TrackHistory
+from agent.mapping.track_settings import TrackingSettings
+from agent.mapping.view import View, associate, even_choice
+from agent.observation import Observation, RobotDescription
+from agent.vision.hidden import Hidden
+from agent.vision.lens import Lens
+from agent.vision.report import TrackReport
+from agent.vision.sift import Features
+from agent.vision.strikes import Strikes
+from agent.vision.template import Templates
+from agent.vision.tracker import Tracker
+from hybridmap.pose import Array, Pose2, PoseGaussian
+
+
+class Tracking:
+    """Follows image points and filters an even choice of them.
+
+    An image that shows nothing of what the image before leads to expect is not believed: the tracks wait
+    where they were last seen, for the light to come back or somebody to step aside. If that does not happen
+    while the wheels stand, the robot was carried off.
+
+    Attributes:
+        history: where each track was seen from.
+        strange: how many images in a row were not believed because they show other things.
+        blank: likewise because they show nothing.
+        missing: how many images in a row did not come, or came a second time.
+    """
+
+    def __init__(self, description: RobotDescription, lens: Lens, settings: TrackingSettings) -> None:
+        """Start with nothing in view."""
+        self.history = TrackHistory()
+        self._camera, self._lens = description.camera, lens
+        self._settings = settings
+        self._tracker = Tracker(lens, settings.tracker)
+        self._hidden = Hidden(settings.hidden)
+        own = replace(settings.filter, side_slip=description.side_slip)
+        self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
+        # Two images are compared by points that live for one step: nothing to hold them to.
+        once = replace(settings.tracker, anchored=False)
+        self._continuity = Continuity(lens, description.camera, once, settings.continuity)
+        self.strange = self.blank = self.missing = 0
+        self._dispute = Dispute(settings.dispute)
+        self._believed: NDArray[np.uint8] | None = None
+        self._since_believed = Pose2()
+        self._misses_px: Array = np.zeros((0, 2))
+        self._strikes = Strikes(settings.strikes)
+        self._unused: int | None = None
+        self._expected_depth = 1.0
+        self._next_track = 1
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """(N,) tracks alive."""
+        return self._tracker.ids
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) px in the ideal image, where they are."""
+        return self._tracker.pixels
+
+    @property
+    def report(self) -> TrackReport:
+        """What the tracks are worth after the last image that was believed."""
+        tracker = self._tracker
+        return TrackReport.of(self._camera, tracker.pixels, tracker.ages, tracker.held, self._misses_px)
+
+    @property
+    def pose(self) -> PoseGaussian:
+        """`anchor_from_robot`."""
+        return self._filter.pose
+
+    @property
+    def health(self) -> tuple[Health, str]:
+        """What holds the posture up, and in words what is wrong; empty if nothing is."""
+        if self._unused is None or self.missing or self.strange or self.blank:
+            return self._filter.health
+        if not self._unused:
+            return Health.BLIND, "no landmark in view"
+        return Health.FEW, f"{self._unused} landmarks in view are too few or too near to each other to go by"
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the last image was not believed, or the last images were missing."""
+        return bool(self.strange or self.blank) or self.missing > self._settings.dropped
+
+    @property
+    def disputed(self) -> bool:
+        """Whether wheels and images tell stories since the anchor that cannot both be true."""
+        return self._dispute.with_filter(self._filter.pose.mean)
+
+    @property
+    def carried_off(self) -> bool:
+        """Whether images have shown something else for so long that the robot must be elsewhere."""
+        return self.strange >= self._settings.patience or self.blank >= self._settings.blank_patience
+
+    @property
+    def converged_share(self) -> float:
+        """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
+        converged = self._filter.converged()
+        return float(converged.mean()) if len(converged) else 0.0
+
+    def landmarks(self) -> LandmarkEstimates:
+        """The filter's landmarks, in robot."""
+        return self._filter.landmarks()
+
+    def step(self, observation: Observation) -> None:
+        """Predict by the wheels, follow the tracks, correct by what they show."""
+        self._filter.predict(observation.odometry)
+        self._dispute.step(observation.odometry)
+        self._since_believed = self._since_believed @ observation.odometry.motion()
+        if observation.image is None or self._frozen(observation.image):
+            self.missing += self._believed is not None
+            return
+        self.missing = 0
+        ids, templates = self._tracker.ids, self._tracker.templates
+        if not self._follow(observation.image):
+            return
+        self._seek_hidden(observation.image, ids, templates)
+        # A landmark that is gone stays out: what it taught is in the posture already.
+        alive = np.concatenate([self._tracker.ids, self._hidden.ids])
+        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive)])
+        filtered = np.isin(self._tracker.ids, self._filter.ids)
+        pixels = self._tracker.pixels[filtered]
+        self._misses_px = np.zeros((0, 2))
+        self._unused = None if self._trusted(pixels) else len(pixels)
+        if self._unused is None:
+            ids = self._tracker.ids[filtered]
+            update = self._filter.update(ids, pixels)
+            self._misses_px = update.innovations_px[update.accepted]
+            refused = self._strikes.judge(ids, update.accepted)
+            self._filter.remove(refused)
+            self._tracker.keep(~np.isin(self._tracker.ids, refused))
+        if len(self._filter.ids) - len(self._hidden.ids) < self._settings.refill:
+            self._fill()
+        self.remember()
+
+    def remember(self, force: bool = False) -> None:
+        """Note from where the tracks are seen now, if the robot has moved or it is forced."""
+        self.history.record(self._filter.pose.mean, self._tracker.ids, self._tracker.pixels, force)
+
+    def take(self, observation: Observation, features: Features, anchor_from_view: PoseGaussian) -> View:
+        """Make a view of an image that was just tracked, and tell which of its features are tracks."""
+        tracks = associate(features, self._tracker.ids, self._tracker.raw, self._settings.associate_px)
+        return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity)
+
+    def follow(self, view: View, expected_depth: float) -> None:
+        """Make tracks of a view's features that have none, and give the filter an even choice of them."""
+        new = view.tracks < 0
+        ids = np.arange(self._next_track, self._next_track + int(new.sum()), dtype=np.int64)
+        self._next_track += len(ids)
+        view.tracks[new] = ids
+        self._tracker.add(ids, view.features.raw[new])
+        self._strikes.forget()
+        self._expected_depth = expected_depth
+        self._unused = None if len(ids) else 0
+        self._fill(first=int(ids[0]) if len(ids) else self._next_track)
+        self.remember(force=True)
+
+    def reanchor(self) -> PoseGaussian:
+        """Begin anew from here; returns `old_anchor_from_new`."""
+        moved = self._filter.reanchor()
+        self._dispute.settle()
+        self.history.reanchor(moved.mean, self._tracker.ids)
+        return moved
+
+    def _fill(self, first: int = 0) -> None:
+        """Give the filter an even choice of the tracks that it does not hold, from a first one on."""
+        s, held = self._settings, len(self._filter.ids)
+        room = min(s.filtered - held + len(self._hidden.ids), s.most_filtered - held)
+        inside = np.isin(self._tracker.ids, self._filter.ids)
+        candidates = ~inside & (self._tracker.ids >= first)
+        if room <= 0 or not candidates.any():
+            return
+        ids, pixels = self._tracker.ids[candidates], self._tracker.pixels[candidates]
+        chosen = even_choice(pixels, self._tracker.pixels[inside], room)
+        inverse_depths, sigmas = self._first_depths(ids[chosen])
+        self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
+
+    def _first_depths(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
+        """(N,) inverse depths 1/m with which tracks come into the filter, and their sigmas.
+
+        Tracks that were followed outside of it are triangulated against its trajectory. Its errors enter all
+        of them alike, which their covariances do not know.
+        """
+        s = self._settings
+        inverse_depths = np.full(len(ids), 1.0 / self._expected_depth)
+        nearest = s.prior_near / max(self._camera.mount_height, 0.05)
+        sigmas = np.maximum(s.prior_spread * inverse_depths, nearest)
+        poses, pixels = self.history.sightings(ids)
+        if len(poses) >= 2:
+            solved = triangulate(poses, pixels, self._camera, s.filter.pixel_sigma, self.pose.mean.vector)
+            better = s.doubt * np.sqrt(solved.ray_covariances[:, 2, 2])
+            fits = (solved.chi2 < s.most_chi2) & (better < sigmas)
+            inverse_depths[fits], sigmas[fits] = solved.rays[fits, 2], better[fits]
+        return inverse_depths, sigmas
+
+    def _seek_hidden(self, image: NDArray[np.uint8], ids: NDArray[np.int64], templates: Templates) -> None:
+        """Of the tracks that were followed until now, ids (N,), hide those just lost; find others again."""
+        lost = ~np.isin(ids, self._tracker.ids) & np.isin(ids, self._filter.ids)
+        if self._settings.tracker.anchored:
+            self._hidden.take(ids[lost], templates.chosen(lost))
+        self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
+        if not len(self._hidden.ids):
+            return
+        expected = self._filter.predict_pixels(self._hidden.ids)
+        # What has left the view, or is leaving it, is not hidden.
+        margin = self._settings.tracker.border_px + self._settings.hidden.template.half_px
+        far_in = np.array([self._camera.width, self._camera.height]) - margin
+        inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < far_in)).all(axis=1))
+        self._hidden.keep(inside)
+        expected = expected[inside]
+        found, raw, patches = self._hidden.seek(image, self._lens.distort(expected))
+        if len(found):
+            self._tracker.add(found, raw, patches)
+
+    def _frozen(self, image: NDArray[np.uint8]) -> bool:
+        """Whether an image is the last one again, to the last grey level, although the wheels have moved.
+
+        Only an image with nothing in it is the same from everywhere.
+        """
+        moved = self._since_believed
+        stands = max(abs(moved.x), abs(moved.y), abs(moved.heading)) < 1e-3
+        if stands or self._believed is None or not np.array_equal(image, self._believed):
+            return False
+        return int(image.min()) < int(image.max())
+
+    def _follow(self, image: NDArray[np.uint8]) -> bool:
+        """Follow the tracks into an image; returns whether it is believed."""
+        believed, moved, (way, turn) = self._believed, self._since_believed, self._settings.stale
+        if believed is None or np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn:
+            self._tracker.track(image, self._expected())
+        else:
+            sight = self._see(image, believed)
+            if sight is not Sight.SAME and self._see(relit(image, believed), believed) is Sight.SAME:
+                # The next image will be in the same light as this one really is.
+                self._tracker.relight(image)
+            elif sight is not Sight.SAME:
+                self.strange += sight is Sight.STRANGE
+                self.blank += sight is Sight.BLANK
+                return False
+        self.strange = self.blank = 0
+        self._believed, self._since_believed = image, Pose2()
+        return True
+
+    def _see(self, image: NDArray[np.uint8], believed: NDArray[np.uint8]) -> Sight:
+        """Follow the tracks into an image; if it does not continue the one before, they stay behind."""
+        tracker, expected = copy.copy(self._tracker), self._expected()
+        tracker.track(image, expected)
+        found = np.full(expected.shape, np.nan)
+        found[np.isin(self._tracker.ids, tracker.ids)] = tracker.pixels
+        turn = self._since_believed.heading
+        sight = self._continuity.compare(believed, image, turn, expected, found)
+        if sight is Sight.SAME:
+            self._tracker = tracker
+        return sight
+
+    def _expected(self) -> Array:
+        """(N, 2) px where the tracks should be now: by the filter, else by the turn alone."""
+        expected = turned(self._camera, self._tracker.pixels, self._since_believed.heading)
+        ids = self._filter.ids
+        if len(ids):
+            order = np.argsort(ids)
+            place = np.clip(np.searchsorted(ids[order], self._tracker.ids), 0, len(ids) - 1)
+            rows = self._filter.predict_pixels()[order[place]]
+            hit = (ids[order][place] == self._tracker.ids) & self._camera.contains(rows)
+            expected[hit] = rows[hit]
+        return expected
+
+    def _trusted(self, pixels: Array) -> bool:
+        """Whether landmarks are enough, and far enough apart, to correct the wheels.
+
+        A few points in one corner may all lie on the same edge, slide along it together and agree.
+        """
+        s = self._settings
+        spread = float(np.ptp(pixels[:, 0])) if len(pixels) else 0.0
+        return len(pixels) >= s.least_filtered and spread >= s.least_spread * self._camera.width

@@ -1,0 +1,277 @@
+"""Following one route: servo to the nodes in sight, drive to those that are not, park at the last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+
+from agent.homing.localizer import BearingLocalizer
+from agent.localizing.fix import Fix
+from agent.localizing.localizer import Localizer
+from agent.localizing.lookout import Expected, Lookout
+from agent.navigating.detour import Detour
+from agent.navigating.follower_settings import FollowerSettings
+from agent.navigating.headway import Headway
+from agent.navigating.node_servo import NodeServo
+from agent.observation import Command, Observation, RobotDescription
+from agent.servo.blind import BlindDrive
+from agent.servo.proximity import ranger_points
+from agent.servo.step import State
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
+from hybridmap.query import RouteLeg
+
+
+class Progress(StrEnum):
+    """How far a follower is."""
+
+    DRIVING = "driving along the route"
+    PARKING = "parking at the goal"
+    ARRIVED = "parked at the goal"
+    UNSURE = "no landmark in sight for a while"
+    BLOCKED = "not getting on"
+
+
+class Follower:
+    """Drives one route.
+
+    All postures are relative to the *reference*, the leg whose node the robot's fix is on; the route's
+    relative postures lead from there to the target.
+
+    Attributes:
+        progress: how far it is.
+        detail: in words.
+        fix: where the robot is.
+        leg: index of the leg that is driven to.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        sift: Sift,
+        route: tuple[RouteLeg, ...],
+        fix: Fix,
+        detour: Detour,
+        settings: FollowerSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Start on a route.
+
+        Args:
+            description: of the robot.
+            lens: of its camera.
+            sift: finds features.
+            route: legs; the posture of the first is relative to the node of the fix.
+            fix: where the robot is.
+            detour: drives between nodes.
+            settings: how.
+            rng: for verification.
+        """
+        self.progress = Progress.DRIVING
+        self.detail = ""
+        self.fix = fix
+        self._description = description
+        self._lookout = Lookout(description, lens, sift, settings.lookout, rng)
+        self._route = route
+        self._detour = detour
+        self._settings = settings
+        # A landmark without a depth has one for the rest of the drive once the way has told it.
+        self._nodes = [leg.node for leg in route]
+        self._servo = NodeServo(description)
+        self._blind_drive = BlindDrive(description)
+        self._start = fix.node
+        self._last = len(route) - 1
+        self._reference = 0
+        if fix.node != route[0].node.id:
+            posture = route[0].previous_from_node.inverse() @ fix.node_from_robot
+            self.fix = Fix(route[0].node.id, posture, None, fix.blind)
+        # The route may begin at a node that the robot does not stand at: then that is the first to reach.
+        self.leg = min(1 if self._off_reference() < settings.passed else 0, self._last)
+        self._tick = 0
+        self._progressed = Headway()
+        self._headway = Headway()
+        self._servo_barred = 0.0
+        self._approaching = False
+        self._hidden = 0.0
+        self._confirmed = False
+        self._looks: list[PoseGaussian] = []
+
+    @property
+    def blocked(self) -> tuple[NodeId, NodeId]:
+        """The pair of nodes between which the robot is, or is stuck."""
+        before = self._route[self.leg - 1].node.id if self.leg else self._start
+        return before, self._route[self.leg].node.id
+
+    def step(self, observation: Observation) -> Command:
+        """One tick; `progress` says whether it is the last one."""
+        s = self._settings
+        self._tick += 1
+        self.fix.follow(observation, self._description)
+        if self.fix.localizer is not None:
+            self._nodes[self._reference] = self.fix.localizer.node
+        if self._tick % s.look_every == 0:
+            self._look_for(self._ahead(), observation)
+        self._pass_nodes()
+        target = self._target()
+        distance = math.hypot(target.x, target.y)
+        node = self._route[self.leg].node.id
+        self.detail = f"{distance:.2f} m to node {node}, {self._last - self.leg} further"
+        parking = self.leg == self._last
+        self.progress = Progress.DRIVING
+        if self.fix.blind > s.blind and not (parking and distance < s.near):
+            self.progress = Progress.UNSURE
+            return Command()
+        self._progressed.take(distance, self._description.tick)
+        if self._progressed.stood > (s.parking_patience if parking else s.patience):
+            self.progress = Progress.BLOCKED
+            return Command()
+        return self._drive(target, distance, parking, observation)
+
+    # Driving
+
+    def _drive(self, target: Pose2, distance: float, parking: bool, observation: Observation) -> Command:
+        """Servo if the target's landmarks are in sight, else drive to its position, at the goal blindly."""
+        obstacles = ranger_points(observation.proximity, self._description)
+        localizer = self.fix.localizer
+        if localizer is not None and self._may_servo(target, distance, parking):
+            if self._servo.leg != self.leg:
+                self._headway = Headway()
+            step = self._servo.command(self.leg, localizer, target, obstacles)
+            if parking:
+                self.progress = Progress.PARKING
+                self.detail = f"{step.reason}, {distance * 1000:.0f} mm off"
+                self._confirm(step.state, observation)
+            if step.state != "stuck":
+                self._approaching = False
+                return step.command
+        self._servo.over()
+        if not parking or distance > self._settings.near:
+            self._approaching = False
+            command = self._detour.toward(target.inverse())
+            if self._detour.around:
+                self.detail += ", around an obstacle"
+            return command
+        if not self._approaching:
+            self._blind_drive.start(target)
+            self._approaching = True
+        step = self._blind_drive.command(target, obstacles)
+        self._hidden = self._hidden + self._description.tick if step.state == "arrived" else 0.0
+        if self._hidden > self._settings.hidden:
+            self.progress = Progress.UNSURE
+        return step.command
+
+    def _look_at_goal(self, observation: Observation) -> Localizer | BearingLocalizer | None:
+        if observation.image is None:
+            return None
+        found = self._lookout.find(observation.image, [self._expected(self._last)])
+        return None if found is None else found[1]
+
+    def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
+        """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
+        s, tick = self._settings, self._description.tick
+        self._servo_barred = max(self._servo_barred - tick, 0.0)
+        if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
+            return False
+        if self._servo.leg == self.leg and not (parking and distance <= s.near):
+            self._headway.take(distance, tick)
+            if self._headway.stood > (s.stalled_parking if parking else s.stalled):
+                self._servo_barred = s.barred
+        return self._servo_barred == 0.0
+
+    def _confirm(self, state: State, observation: Observation) -> None:
+        """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
+
+        A view from where the node's was taken shows its features at their own scale, so nothing tells better
+        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there.
+        """
+        if state != "arrived":
+            self._confirmed, self._hidden, self._looks = False, 0.0, []
+        elif self._confirmed:
+            self.progress = Progress.ARRIVED
+        elif (localizer := self._look_at_goal(observation)) is not None:
+            self._looks.append(localizer.pose)
+            # By bearings alone one look is as good as several: it goes on with all that was seen on the way.
+            if isinstance(localizer, BearingLocalizer) or len(self._looks) == self._settings.goal_looks:
+                if isinstance(localizer, Localizer):
+                    localizer.restart(averaged(self._looks))
+                self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
+        else:
+            self._hidden += self._description.tick
+            if self._hidden > self._settings.hidden:
+                self.progress = Progress.UNSURE
+
+    # Nodes ahead
+
+    def _pass_nodes(self) -> None:
+        """Go on to the next node where one is passed, or a later one is in sight already."""
+        before = self.leg
+        if self._reference > self.leg:
+            self.leg = self._reference
+        if self._reference == self.leg < self._last and self._off_reference() < 2 * self._settings.passed:
+            self.leg += 1
+        while self.leg < self._last:
+            target = self._target()
+            if math.hypot(target.x, target.y) >= self._settings.passed:
+                break
+            self.leg += 1
+        if self.leg != before:
+            self._progressed = Headway()
+
+    def _look_for(self, wanted: Sequence[Expected], observation: Observation) -> bool:
+        """Look for landmarks, furthest first; returns whether some were found: then the fix is on them."""
+        if observation.image is None or not wanted:
+            return False
+        found = self._lookout.find(observation.image, wanted)
+        if found is not None:
+            self._reference, localizer = found
+            self.fix = Fix.of(localizer)
+        return found is not None
+
+    def _ahead(self) -> list[Expected]:
+        """Nodes whose landmarks may be in view, furthest first."""
+        s = self._settings
+        first = self._reference + 1 if self.fix.in_sight else 0
+        wanted = []
+        for index in range(min(self.leg + s.skip, self._last), first - 1, -1):
+            expected = self._expected(index)
+            there = expected.node_from_robot
+            if math.hypot(there.x, there.y) < s.sight_reach and abs(wrap_angle(there.heading)) < s.sight_turn:
+                wanted.append(expected)
+        # At the goal more of its landmarks come into view: a fresh look makes the last millimetres better.
+        if self._reference == self._last and self.fix.in_sight and self._tick % (3 * s.look_every) == 0:
+            tracked = len(self.fix.localizer.visible) if self.fix.localizer is not None else 0
+            wanted.append(self._expected(self._last)._replace(tracked=tracked))
+        return wanted
+
+    def _expected(self, index: int) -> Expected:
+        """A leg's node, with where the robot should be from it."""
+        there = self._from_reference(index) @ self.fix.node_from_robot.mean
+        localizer = self.fix.localizer
+        held = localizer if index == self._reference and isinstance(localizer, BearingLocalizer) else None
+        return Expected(index, self._nodes[index], there, 1.0 + self.fix.blind, held=held)
+
+    def _target(self) -> Pose2:
+        """`target_from_robot`."""
+        return self._from_reference(self.leg) @ self.fix.node_from_robot.mean
+
+    def _from_reference(self, target: int) -> Pose2:
+        """`target_from_reference` along the route's relative postures."""
+        pose = Pose2()
+        for leg in self._route[min(self._reference, target) + 1 : max(self._reference, target) + 1]:
+            pose = pose @ leg.previous_from_node.mean
+        return pose.inverse() if target >= self._reference else pose
+
+    def _off_reference(self) -> float:
+        return math.hypot(self.fix.node_from_robot.mean.x, self.fix.node_from_robot.mean.y)
+
+
+def _lies_ahead(target_from_robot: Pose2) -> bool:
+    """Whether a posture can be servoed to without a manoeuvre: ahead, and facing alike."""
+    there = target_from_robot.inverse()
+    return abs(target_from_robot.heading) < 0.5 and there.x > 0.1 and abs(there.y) < 0.6 * there.x

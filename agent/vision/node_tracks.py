@@ -1,0 +1,66 @@
+"""One node's landmarks in the images: tracked from where a recognition has found them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.vision.lens import Lens
+from agent.vision.sift import Features
+from agent.vision.strikes import Strikes
+from agent.vision.tracker import Tracker, TrackerSettings
+from hybridmap.pose import Array
+
+
+class NodeTracks:
+    """Follows landmarks until they are lost or refused too often. Ids are their indices in the node."""
+
+    def __init__(
+        self,
+        lens: Lens,
+        image: NDArray[np.uint8],
+        features: Features,
+        pairs: NDArray[np.integer],
+        settings: TrackerSettings,
+        strikes: int,
+    ) -> None:
+        """Begin where a recognition has found the landmarks.
+
+        Args:
+            lens: of the camera.
+            image: (H, W) grey.
+            features: of the image.
+            pairs: (N, 2) indices of landmarks, and of the features that show them.
+            settings: of the tracker.
+            strikes: a track that is refused this often in a row is given up.
+        """
+        self._tracker = Tracker(lens, settings)
+        self._tracker.track(image)
+        self._strikes = Strikes(strikes)
+        self.renew(features, pairs)
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """(N,) landmarks that are tracked now."""
+        return self._tracker.ids
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) px in the ideal image, where they are seen."""
+        return self._tracker.pixels
+
+    def renew(self, features: Features, pairs: NDArray[np.integer]) -> None:
+        """Go on from where a fresh look finds the landmarks in the last image; the strikes begin anew."""
+        self._tracker.clear()
+        self._tracker.add(pairs[:, 0].astype(np.int64), features.raw[pairs[:, 1]])
+        self._strikes.forget()
+
+    def follow(self, image: NDArray[np.uint8], expected: Array) -> None:
+        """Into the next image, (H, W) grey; expected: (N, 2) px in the ideal image, NaN where unknown."""
+        self._tracker.track(image, expected)
+
+    def judge(self, accepted: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Tell which of the tracks were believed, (N,); returns the landmarks given up, tracked no more."""
+        given_up = self._strikes.judge(self.ids, accepted)
+        self._tracker.keep(~np.isin(self.ids, given_up))
+        return given_up

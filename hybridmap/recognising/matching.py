@@ -1,0 +1,115 @@
+"""Which features of two images look alike.
+
+A one-way ratio test lets many features of one image choose the same feature of the other, which on frames
+with little texture makes dozens of wrong matches that agree with some geometry. So a match has to be the best
+in both directions, and distinctly better than the second best in both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.descriptor import rounding_noise
+from hybridmap.errors import InvalidValue
+from hybridmap.landmark_tables import landmark_tables
+from hybridmap.node import CODE_BYTES
+from hybridmap.recognising.kernels import kernels
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """When two descriptors are taken for the same.
+
+    Attributes:
+        ratio: largest ratio of the best distance to the second best, in each direction.
+        most_distance: largest distance of two decoded descriptors; RootSIFT has unit length, so unrelated
+            descriptors are about 0.9 apart.
+    """
+
+    ratio: float = 0.85
+    most_distance: float = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Pairs of features, best first.
+
+    Attributes:
+        pairs: (K, 2) int64, indices in a and in b; no index occurs twice in a column.
+        distances: (K,) float32, between the descriptors; 0 where rounding could explain all of it.
+    """
+
+    pairs: NDArray[np.int64]
+    distances: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.pairs)
+
+
+def squared_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, D) and (M, D) -> (N, M) squared Euclidean distances, by one matrix product."""
+    out: NDArray[np.float32] = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1)[None] - 2 * (a @ b.T)
+    np.maximum(out, 0, out=out)
+    return out
+
+
+def match_vectors(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    settings: MatchSettings | None = None,
+    noise: float = 0.0,
+) -> Matches:
+    """Match descriptors that are already decoded.
+
+    Args:
+        a: (N, D).
+        b: (M, D).
+        settings: when two descriptors are taken for the same.
+        noise: what rounding has added to every squared distance on average; taken off again, so that the
+            ratio is that of the distances before rounding.
+    """
+    return _mutual(squared_distances(a, b) - np.float32(noise), settings or MatchSettings())
+
+
+def _mutual(squared: NDArray[np.float32], s: MatchSettings) -> Matches:
+    """Pairs that are each other's nearest and distinctly so, of (N, M) squared distances."""
+    if squared.size == 0:
+        return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+    rows, columns = kernels().two_nearest(np.ascontiguousarray(squared))
+    (best_in_b, best, second), (best_in_a, _, second_in_a) = rows, columns
+    mutual = best_in_a[best_in_b] == np.arange(len(best))
+    distinct = best < s.ratio**2 * np.minimum(second, second_in_a[best_in_b])
+    kept = np.flatnonzero(mutual & distinct & (best <= s.most_distance**2))
+    kept = kept[np.argsort(best[kept], kind="stable")]
+    return Matches(
+        np.stack([kept, best_in_b[kept]], axis=1).astype(np.int64),
+        np.sqrt(np.maximum(best[kept], 0)).astype(np.float32),
+    )
+
+
+def match(
+    codes_a: NDArray[np.uint8], codes_b: NDArray[np.uint8], settings: MatchSettings | None = None
+) -> NDArray[np.int64]:
+    """Match compact descriptors: mutual nearest neighbours that pass the ratio test both ways.
+
+    Args:
+        codes_a: (N, 32) uint8.
+        codes_b: (M, 32) uint8.
+        settings: when two descriptors are taken for the same.
+
+    Returns:
+        (K, 2) int64, indices in a and in b, best first; `match_vectors` gives the distances as well.
+
+    Raises:
+        InvalidValue: the input is not (N, 32) bytes.
+    """
+    for codes in (codes_a, codes_b):
+        if codes.ndim != 2 or codes.shape[1] != CODE_BYTES or codes.dtype != np.uint8:
+            raise InvalidValue(f"codes must be (N, {CODE_BYTES}) uint8, not {codes.shape} {codes.dtype}")
+    steps = kernels().squared_steps(np.ascontiguousarray(codes_a), np.ascontiguousarray(codes_b))
+    squared = steps.astype(np.float32) * np.float32(landmark_tables().step ** 2)
+    return _mutual(squared - np.float32(rounding_noise()), settings or MatchSettings()).pairs

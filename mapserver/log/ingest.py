@@ -1,0 +1,305 @@
+"""Takes in what agents send: every change of every log exactly once and in order, whatever gets lost.
+
+    change -------> in order? -> store (commit) -> acknowledge -> on_change
+    beacon -------> gap? ------> ask the agent's log for it, in chunks -> store ...
+
+A change that does not decode when it is published is treated as lost and pulled: it may have been damaged
+on the way. If it does not decode when it is pulled either, the agent's log holds it like that, and it is
+refused: kept aside with the reason, which goes back with the acknowledgement, and the log goes on behind it.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+from hybridmap.change import Change
+from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from hybridmap.node import MapId, check_name
+from mapserver.log.agent_log import NEVER, AgentLog, PullSettings
+from mapserver.log.entry import Entry
+from mapserver.log.ingest_counters import IngestCounters
+from mapserver.log.store import Store
+from wire.bus import Bus, Closing, Reply, Sample
+from wire.codec import MAX_CHANGE_BYTES
+from wire.keys import Keys
+from wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, Refusal
+
+log = logging.getLogger(__name__)
+
+LONGEST_WAIT = 3600.0
+"""Of the thread, s, when nothing is due: an infinite one cannot be given."""
+
+
+@dataclass(frozen=True, slots=True)
+class IngestSettings:
+    """How changes are taken in.
+
+    Attributes:
+        pull: when missing changes are pulled.
+        ask_timeout: for a piece of a log, s.
+        pulls_at_once: of different logs.
+        retry_interval: after a failed commit (disk full), s.
+    """
+
+    pull: PullSettings = field(default_factory=PullSettings)
+    ask_timeout: float = 2.0
+    pulls_at_once: int = 4
+    retry_interval: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Pulled:
+    """What came back for a range of a log."""
+
+    map: MapId
+    asked: LogRequest
+    replies: list[Reply]
+
+
+class Ingest:
+    """Keeps a store complete. One thread applies; a few more wait for agents' answers."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        store: Store,
+        server_name: str,
+        on_change: Callable[[Change], None],
+        settings: IngestSettings | None = None,
+        replay: Callable[[Iterable[Change]], None] | None = None,
+    ) -> None:
+        """Replay the store, then listen.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            store: stays the caller's.
+            server_name: under which acknowledgements go out.
+            on_change: called with every change after it is committed, in order of each log: at the start with
+                all that is in the store, in the caller's thread, later in the ingest's own. It should only
+                take note, because the next change waits for it.
+            settings: how.
+            replay: called instead with all that is in the store at once, map by map.
+
+        Raises:
+            InvalidFile: the store is damaged.
+        """
+        self._bus = bus
+        self._keys = keys
+        self._store = store
+        self._name = check_name(server_name)
+        self._on_change = on_change
+        self._settings = settings or IngestSettings()
+        self._counters = IngestCounters()
+        self._logs: dict[MapId, AgentLog] = {}
+        self._work: queue.SimpleQueue[Sample | _Pulled | None] = queue.SimpleQueue()
+        self._declared: list[Closing] = []
+        self._pullers = ThreadPoolExecutor(self._settings.pulls_at_once, thread_name_prefix="pull")
+        self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
+        self._stopping = False
+        self._failure = ""
+        maps = self._store.maps()
+        stored = (change for map_id in maps for change in self._store.replay(map_id))
+        if replay is not None:
+            replay(stored)
+        for change in stored:
+            self._on_change(change)
+        for map_id in maps:
+            watermark, log_id = self._store.watermark(map_id), self._store.log_id(map_id) or 0
+            refusals = tuple(self._store.refusals(map_id))
+            self._logs[map_id] = AgentLog(
+                map_id, log_id, self._settings.pull, watermark, watermark, refusals=refusals
+            )
+        self._thread.start()
+        self._declared = [
+            self._bus.subscribe(self._keys.changes(), self._work.put),
+            self._bus.subscribe(self._keys.heads(), self._work.put),
+        ]
+
+    def counters(self) -> IngestCounters:
+        """What has happened since the start."""
+        return self._counters
+
+    @property
+    def failure(self) -> str:
+        """Why the disk does not take changes at present; empty if it does."""
+        return self._failure
+
+    def close(self) -> None:
+        """Stop listening; what has come is applied, what is missing will be pulled next time."""
+        for declared in self._declared:
+            declared.close()
+        self._declared = []
+        self._stopping = True
+        self._work.put(None)
+        if self._thread.is_alive():
+            self._thread.join()
+        self._pullers.shutdown(cancel_futures=True)
+
+    def _run(self) -> None:
+        while not self._stopping:
+            due = min((one.pull_at for one in self._logs.values() if not one.pulling), default=NEVER)
+            touched: dict[MapId, AgentLog] = {}
+            for item in self._drain(due):
+                one = self._take(item)
+                if one is not None:
+                    touched[one.map] = one
+            now = time.monotonic()
+            for one in self._logs.values():
+                if one.map in touched:
+                    self._apply(one, one.next_run(), None)
+                if one.map in touched or one.pull_at <= now:
+                    asked = one.missing(now)
+                    if asked is not None:
+                        self._count(pulls=1)
+                        self._pullers.submit(self._pull, one.map, asked)
+
+    def _drain(self, due: float) -> list[Sample | _Pulled]:
+        """Wait for something to come until a pull is due; take what waits, for one transaction a log."""
+        items: list[Sample | _Pulled] = []
+        try:
+            item = self._work.get(timeout=min(max(0.0, due - time.monotonic()), LONGEST_WAIT))
+            while item is not None:
+                items.append(item)
+                if len(items) == MAX_ROWS:
+                    break
+                item = self._work.get_nowait()
+        except queue.Empty:
+            pass
+        return items
+
+    def _take(self, item: Sample | _Pulled) -> AgentLog | None:
+        """Look at one thing that came. Returns the log that may go on now."""
+        try:
+            if isinstance(item, _Pulled):
+                return self._take_pulled(item)
+            if item.attachment:
+                return self._take_change(item)
+            return self._take_head(item)
+        except InvalidMessage as error:
+            self._count(damaged=1)
+            log.warning("%s", error)
+            return None
+
+    def _take_change(self, sample: Sample) -> AgentLog | None:
+        self._count(messages=1, message_bytes=len(sample.payload))
+        map_id = self._keys.parse_change(sample.key)
+        mark = Mark.decode(sample.attachment)
+        one = self._log(map_id, mark.log_id)
+        if one is None:
+            return None
+        one.newest = max(one.newest, mark.sequence)
+        if mark.sequence <= one.watermark or mark.sequence in one.ahead:
+            self._count(doubled=1)
+            return one
+        fits = len(sample.payload) <= MAX_CHANGE_BYTES
+        entry = Entry.read(map_id, mark.sequence, sample.payload if fits else b"")
+        if isinstance(entry.change, str):
+            self._count(damaged=1)
+            log.info("%s %d came damaged (%s), pulling it", map_id, mark.sequence, entry.change)
+        else:
+            one.offer(entry)
+        return one
+
+    def _take_head(self, sample: Sample) -> AgentLog | None:
+        map_id = self._keys.parse_head(sample.key)
+        head = Head.decode(sample.payload)
+        one = self._log(map_id, head.log_id)
+        if one is None:
+            return None
+        one.newest = max(one.newest, head.newest)
+        one.heard(time.monotonic())
+        if head.acknowledged.get(self._name, 0) < one.watermark:
+            self._acknowledge(one)
+        return one
+
+    def _take_pulled(self, pulled: _Pulled) -> AgentLog | None:
+        one = self._logs[pulled.map]
+        entries, covered = self._read_answer(one, pulled)
+        self._count(pulled=len(entries))
+        gained = covered > one.watermark
+        one.pulled(time.monotonic(), gained=gained)
+        if gained:
+            self._apply(one, entries, covered)
+        return one
+
+    def _read_answer(self, one: AgentLog, pulled: _Pulled) -> tuple[list[Entry], int]:
+        """The changes that were pulled and how far they reach; (nothing, 0) if no answer is of use."""
+        asked = pulled.asked
+        for reply in pulled.replies:
+            if reply.error:
+                log.info("%s does not give %s from %d: %s", one.map.agent, one.map, asked.first, reply.error)
+                continue
+            try:
+                answer = LogAnswer.decode(reply.payload)
+            except InvalidMessage as error:
+                self._count(damaged=1)
+                log.warning("%s from %d: %s", one.map, asked.first, error)
+                if asked.first == asked.last:
+                    # It was asked for alone and cannot even be carried.
+                    return [Entry(asked.first, b"", str(error))], asked.first
+                one.chunk = max(1, (asked.last - asked.first + 1) // 4)
+                continue
+            if answer.log_id == one.log_id and answer.first == asked.first:
+                entries = [Entry.read(one.map, *change) for change in answer.changes]
+                entries = [entry for entry in entries if entry.sequence <= asked.last]
+                return entries, min(answer.covered, asked.last)
+        return [], 0
+
+    def _log(self, map_id: MapId, log_id: int) -> AgentLog | None:
+        """The log of this name, or None after telling the agent that it is another's."""
+        one = self._logs.get(map_id)
+        if one is None or (one.log_id != log_id and one.watermark == 0):
+            one = self._logs[map_id] = AgentLog(map_id, log_id, self._settings.pull)
+        if one.log_id == log_id:
+            return one
+        reason = f"another log goes by the name {map_id} here: begin a fresh map"
+        ack = Ack(map_id, log_id, 0, (Refusal(0, reason),))
+        self._bus.publish(self._keys.ack(self._name, map_id.agent), ack.encode())
+        return None
+
+    def _apply(self, one: AgentLog, entries: list[Entry], covered: int | None) -> None:
+        """Commit, acknowledge, pass on: in this order."""
+        if not entries and covered is None:
+            return
+        try:
+            applied = self._store.apply(one.map, one.log_id, entries, covered)
+        except (InvalidFile, InvalidValue) as error:
+            # Nothing is lost: it is not acknowledged, so the agent keeps it and it is pulled later.
+            one.commit_failed(time.monotonic(), self._settings.retry_interval)
+            self._count(failures=1)
+            if str(error) != self._failure:
+                log.error("%s", error)
+            self._failure = str(error)
+            return
+        self._failure = ""
+        one.settled(applied)
+        for refusal in applied.refusals:
+            log.warning("refused %s %d: %s", one.map, refusal.sequence, refusal.reason)
+        self._count(applied=len(applied.changes), refused=len(applied.refusals))
+        self._acknowledge(one)
+        for change in applied.changes:
+            try:
+                self._on_change(change)
+            except Exception:
+                # The change is safe on the disk; whoever choked on it must not stop the other robots' logs.
+                log.exception("passing on %s %d failed", change.map, change.sequence)
+
+    def _acknowledge(self, one: AgentLog) -> None:
+        ack = Ack(one.map, one.log_id, one.watermark, one.refusals)
+        self._bus.publish(self._keys.ack(self._name, one.map.agent), ack.encode())
+
+    def _pull(self, map_id: MapId, asked: LogRequest) -> None:
+        """Ask for a piece of a log; in a thread of its own, because an agent may be slow."""
+        replies = self._bus.ask(self._keys.log(map_id), asked.encode(), self._settings.ask_timeout)
+        self._work.put(_Pulled(map_id, asked, replies))
+
+    def _count(self, **more: int) -> None:
+        self._counters = self._counters.plus(**more)

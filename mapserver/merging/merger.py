@@ -1,0 +1,281 @@
+"""Keeps the merged map up to date as changes come in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import islice
+
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import EdgeKind, MapId, Node, NodeId
+from hybridmap.reach_book import ReachBook
+from hybridmap.recognising.recognition import RecognitionSettings
+from hybridmap.ruling import Rulings
+from mapserver.merging.findings import Findings, Recollection, print_of
+from mapserver.merging.merger_counters import MergerCounters
+from mapserver.merging.succession import Succession
+from mapserver.places.placeindex import PlaceIndex
+from mapserver.relocalizing.lookalikes import LookAlikes
+from merge.graph.candidates import CandidateSettings, Pair
+from merge.graph.links import Link
+from merge.graph.merged import MergedMap
+from merge.graph.verification import VerificationSettings, verify
+from merge.incremental.islands import Islands
+from merge.incremental.pairs import PairTable
+from merge.incremental.verdicts import Verdict, Verdicts
+from merge.life.fading import Fader, FadingSettings
+from merge.life.renewal import RenewalSettings, Renewer
+from merge.merging import MergeSettings
+
+
+@dataclass(frozen=True)
+class MergerSettings:
+    """How maps are merged as they come.
+
+    Attributes:
+        candidates: which pairs are looked at; the place index must have the same.
+        verification: when two nodes are linked.
+        merging: which links are believed.
+        renewal: when newer nodes stand for older ones.
+        fading: when landmarks are thought to be gone.
+    """
+
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+    merging: MergeSettings = field(default_factory=MergeSettings)
+    renewal: RenewalSettings = field(default_factory=RenewalSettings)
+    fading: FadingSettings = field(default_factory=FadingSettings)
+
+
+class Merger:
+    """Holds every robot's map, the overlaps of their nodes and the verdicts on pairs of them.
+
+    Work is done where it is cheapest: a new node is compared with its best candidates when it comes; the
+    merged map is made when it is asked for and something has changed, and then only where it has. New
+    nodes are not compared with such as were superseded on another day. But for that the outcome depends on
+    what the maps hold, not on the order in which it came.
+    """
+
+    def __init__(self, index: PlaceIndex | None = None, settings: MergerSettings | None = None) -> None:
+        """Start with no maps.
+
+        Args:
+            index: is filled with the nodes that come; give it to a Relocalizer too.
+            settings: how.
+        """
+        # An index in which there is nothing yet is one.
+        self.index = PlaceIndex() if index is None else index
+        self.alike = LookAlikes(RecognitionSettings())
+        self.maps: dict[MapId, HybridMap] = {}
+        self.counters = MergerCounters()
+        self.reaches = ReachBook()
+        self.settings = settings or MergerSettings()
+        self._before: Recollection | None = None
+        self._prints: dict[NodeId, tuple[Node, bytes]] = {}
+        self._pairs = PairTable(self.settings.candidates)
+        self._succession = Succession(self.index, self._pairs, self.node)
+        self._uncompared: dict[NodeId, None] = {}
+        self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
+        self._verdicts = Verdicts()
+        self._islands = Islands(self.settings.merging)
+        self._kept: dict[MapId, HybridMap] = {}
+        self._touched: set[MapId] = set()
+        self._renewer = Renewer(self.settings.renewal, self.settings.verification, self.reaches)
+        self._fader = Fader(self.settings.fading)
+        self._rulings = Rulings()
+        self._merged = MergedMap.empty()
+        self._dirty = False
+
+    @property
+    def uncompared(self) -> int:
+        """Nodes that were read and for which nobody has yet looked which others are like them."""
+        return len(self._uncompared)
+
+    @property
+    def compared(self) -> tuple[int, int]:
+        """Nodes that were compared with all others, and pairs of them on which there is a verdict."""
+        nodes = sum(len(one.nodes) for one in self.maps.values())
+        return nodes - len(self._uncompared), sum(map(len, self._known.values())) // 2
+
+    @property
+    def recollecting(self) -> bool:
+        """Whether there are findings of before that no merge has taken over yet."""
+        return self._before is not None
+
+    def recollect(self, findings: Findings) -> None:
+        """Believe what was found before of nodes that are just as they were; what is not read by then."""
+        self._before = Recollection(findings)
+
+    def findings(self) -> Findings:
+        """What was found of all nodes that are compared."""
+        before, self._prints = self._prints, {}
+        for node_id, node in ((n.id, n) for one in self.maps.values() for n in one.nodes.values()):
+            known = before.get(node_id)
+            same = known is not None and known[0] is node
+            self._prints[node_id] = known if known and same else (node, print_of(node))
+        prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
+        verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
+        return Findings(prints, self._pairs.overlaps(), verdicts, self._islands.decisions())
+
+    def node(self, node_id: NodeId) -> Node | None:
+        """A node of any map, if it is there."""
+        one = self.maps.get(node_id.map)
+        return None if one is None else one.nodes.get(node_id)
+
+    def on_change(self, change: Change) -> None:
+        """Take in one change, in the order of its log."""
+        self.counters.changes += 1
+        self.apply(change.map, change.body)
+        if isinstance(change.body, NodePut):
+            # Which nodes of its own map are no neighbours its edges tell, and they come after it.
+            self._verify(pair for pair in self._pairs.of(change.body.node.id) if pair[0].map != pair[1].map)
+
+    def apply(self, map_id: MapId, body: ChangeBody) -> None:
+        """Take in a change without comparing nodes yet."""
+        before = self._pairs.of(body.node.id) if isinstance(body, NodePut) else []
+        self._replay(map_id, body)
+        if isinstance(body, NodePut):
+            self.index.add(body.node)
+            self._pairs.put(body.node.id, self._succession.overlaps(body.node, before))
+
+    def read(
+        self,
+        log: Iterable[tuple[MapId, ChangeBody]],
+        overlaps: Mapping[Pair, float] | None = None,
+        links: Mapping[Pair, Link] | None = None,
+    ) -> None:
+        """Take in many changes at once: a store at the start. Places can be found as soon as this returns.
+
+        Which are alike is looked for by `look_around`, or when they are merged; then they are compared.
+
+        Args:
+            log: what each map tells, in its order.
+            overlaps: if they are known already, of all pairs of these nodes; else they are looked for.
+            links: what is known already of pairs of these nodes.
+        """
+        put: dict[NodeId, None] = {}
+        for map_id, body in log:
+            self._replay(map_id, body)
+            if isinstance(body, NodePut):
+                put[body.node.id] = None
+        # What the index has already, just so, it leaves as it is.
+        fresh = [node for node_id in put if (node := self.node(node_id)) is not None]
+        self.index.extend(fresh)
+        if overlaps is None:
+            self._uncompared.update((node.id, None) for node in fresh)
+        for (a, b), value in (overlaps or {}).items():
+            self._pairs.put(a, {b: value})
+        for pair, link in (links or {}).items():
+            self._judge(pair, link)
+
+    def rule(self, rulings: Rulings) -> None:
+        """Heed these rulings of people from now on, and no others."""
+        self._rulings = rulings
+        self._dirty = True
+
+    def merged(self) -> MergedMap:
+        """The merged map of all that has come; made anew only if something has changed, and where it has."""
+        if self._dirty or self._islands.decided:
+            self.look_around()
+            self._take_over()
+            changed = self._pairs.changed()
+            self._verify(pair for pair in changed if pair in self._pairs)
+            for pair in changed:
+                self._touched |= {pair[0].map, pair[1].map}
+                if pair in self._pairs and pair[1] in self._known.get(pair[0], {}):
+                    self._verdicts.put(pair, self._known[pair[0]][pair[1]])
+                else:
+                    self._verdicts.drop(pair)
+            for map_id in self._touched & self.maps.keys():
+                # Copies: a merged map stays as it was when later changes come.
+                self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+            merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
+            renewed = self._renewer.renewed(merged)
+            self._succession.follow(renewed.superseded)
+            self._merged = self._fader.fade(renewed)
+            self.counters.merges += 1
+            self._touched = set()
+            self._dirty = False
+        return self._merged
+
+    def again(self) -> Callable[[], None] | None:
+        """What should be decided again as a whole, by any thread; the next merge takes it up."""
+        task = self._islands.again(self._kept, self._verdicts)
+        return None if task is None else task.run
+
+    def give_up(self) -> None:
+        """What was to be decided again could not be."""
+        self._islands.give_up()
+
+    def look_around(self, most: int | None = None) -> None:
+        """Look for what is like the nodes that were read, or like so many of them."""
+        for node_id in list(islice(self._uncompared, most)):
+            if (node := self.node(node_id)) is not None:
+                before = self._before
+                source = before if before is not None and before.knows(node) else self.index
+                self._pairs.put(node_id, source.overlaps(node, self.node))
+            del self._uncompared[node_id]
+
+    def _take_over(self) -> None:
+        """Take over all verdicts of before; whatever comes now is found anew."""
+        if self._before is not None:
+            for pair, verdict in self._before.verdicts(self.node):
+                if pair[1] not in self._known.get(pair[0], {}):
+                    self._judge(pair, verdict)
+            self._islands.resume(self._before.decided)
+            self._before = None
+
+    def apart(self) -> MergedMap:
+        """The merged map if nobody had compared any two maps: a component for each part of each map."""
+        kept = {map_id: HybridMap(one.contents()) for map_id, one in self.maps.items()}
+        return Islands(self.settings.merging).merge(kept, Verdicts(), set(kept), self._rulings)
+
+    def status(self) -> str:
+        """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
+        return self.merged().summary()
+
+    def _replay(self, map_id: MapId, body: ChangeBody) -> None:
+        """Take a change into its map, and forget what no longer holds."""
+        one = self.maps.setdefault(map_id, HybridMap())
+        self._touched.add(map_id)
+        self._dirty = True
+        gone = one.nodes.get(body.id) if isinstance(body, NodeRetired) else None
+        for edge in one.dropped_by(body):
+            if edge.kind is not EdgeKind.DRIVEN:
+                self._pairs.disconnect(edge.a, edge.b)
+        one.apply(body)
+        match body:
+            case NodePut(node):
+                self._forget(node.id)
+                self._succession.put(node)
+            case NodeRetired(node_id):
+                self._forget(node_id)
+                self.index.remove(node_id, None if gone is None else gone.landmarks.codes)
+            case EdgePut(edge):
+                # Nodes so near to each other on a robot's way are not compared: it tells nothing new. A
+                # later drive says nothing of that; it may lead from map to map.
+                if edge.kind is not EdgeKind.DRIVEN:
+                    self._pairs.connect(edge.a, edge.b)
+
+    def _verify(self, pairs: Iterable[Pair]) -> None:
+        for pair in pairs:
+            a, b = self.node(pair[0]), self.node(pair[1])
+            if pair[1] in self._known.get(pair[0], {}) or a is None or b is None:
+                continue
+            verdict = verify(a, b, self.settings.verification)
+            self._judge(pair, verdict)
+            self.counters.verified += 1
+            self.counters.recognised += isinstance(verdict, Link)
+
+    def _judge(self, pair: Pair, verdict: Verdict) -> None:
+        for one, other in (pair, pair[::-1]):
+            self._known.setdefault(one, {})[other] = verdict
+
+    def _forget(self, node_id: NodeId) -> None:
+        """Drop what was found out about a node: it is gone, or is known better."""
+        self._pairs.forget(node_id)
+        self._uncompared.pop(node_id, None)
+        self._succession.drop(node_id)
+        for other in self._known.pop(node_id, {}):
+            del self._known[other][node_id]

@@ -1,0 +1,241 @@
+"""Maps are joined step by step, best supported first, and each step is evidence for the next.
+
+Two maps that few links join may be joined by many once one of them is part of something larger; of two
+stories that are supported alike one may then prevail; and a link that was too little alone may be borne out
+by what others have joined. So in each round only pieces are joined of which each is the other's best
+supported one. Then the links between the larger pieces are sorted anew, all together, and those within one
+piece are tested against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from typing import TypeVar
+
+import networkx as nx
+
+from hybridmap.node import MapId, NodeId
+from merge.belief.consistency import ConsistencySettings, Sorted, group_links, sort_links
+from merge.belief.credence import standpoints
+from merge.belief.groups import LinkGroup
+from merge.belief.joining import Solver, misfits
+from merge.belief.witnesses import FalseWitnesses
+from merge.graph.fragments import Fragment, fragment_by_node
+from merge.graph.links import Link, RefusedLink, refuse
+from merge.graph.posegraph import PoseGraph
+
+Key = tuple[NodeId, NodeId]
+"""Names of two pieces of map, smaller first."""
+
+P = TypeVar("P", NodeId, int)
+"""A piece of map, by whatever it is called."""
+CONTRADICTION = "contradicts better supported links by way of other maps"
+
+
+def agglomerate(
+    solver: Solver, groups: Mapping[Key, LinkGroup], s: ConsistencySettings
+) -> tuple[list[Link], list[RefusedLink]]:
+    """Join fragments by their groups of links.
+
+    Args:
+        solver: of the fragments.
+        groups: by the names of the fragments.
+        s: when links are believed.
+
+    Returns:
+        The links that join, and those that do not; what a group has refuted is in neither.
+    """
+    kept = [link for group in groups.values() for link in group.sorted.kept if group.first is group.second]
+    if not s.cliques:
+        return [link for group in groups.values() for link in group.sorted.kept], []
+    refused = {r.pair: r for group in groups.values() for r in group.sorted.refused}
+    waiting = [link for group in groups.values() for link in group.links if group.first is not group.second]
+    between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
+    heard = _heard(groups)
+    agreed = {
+        link.canonical().pair
+        for key, found in between.items()
+        for link in _beyond_chance(found, [found], heard[key[0].map], s).kept
+    }
+    while True:
+        by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
+        inside = [link for link in waiting if by_node[link.a] is by_node[link.b]]
+        waiting = [link for link in waiting if by_node[link.a] is not by_node[link.b]]
+        borne_out = _borne_out(inside, by_node, agreed, heard, s)
+        kept += borne_out
+        fits = {link.pair for link in borne_out}
+        for link in inside:
+            if link.pair not in fits:
+                refused.setdefault(link.canonical().pair, refuse(link, CONTRADICTION))
+        own: dict[Key, list[Sorted]] = {}
+        for (a, b), found in between.items():
+            first, second = sorted((by_node[a].name, by_node[b].name))
+            own.setdefault((first, second), []).append(found)
+        pooled = {
+            key: _beyond_chance(_sorted(links, key, groups, by_node, s), own[key], heard[key[0].map], s)
+            for key, links in group_links(waiting, by_node).items()
+        }
+        chosen = joined({key: found.weight for key, found in pooled.items() if found.kept}, pooled)
+        if not chosen:
+            break
+        kept += [link for key in chosen for link in pooled[key].kept]
+        through = {link.canonical().pair for key in chosen for link in pooled[key].kept}
+        waiting = [link for link in waiting if link.canonical().pair not in through]
+    for found in pooled.values():
+        refused |= {r.pair: r for r in found.refused if r.pair not in refused}
+    told = {link.canonical().pair for link in kept}
+    every = [link for group in groups.values() for link in group.links]
+    kept = _heard_again(solver, kept, [k for k in every if k.canonical().pair not in told], agreed, heard, s)
+    told = {link.canonical().pair for link in kept}
+    return kept, [r for pair, r in refused.items() if pair not in told]
+
+
+def _heard_again(
+    solver: Solver,
+    kept: Sequence[Link],
+    refused: Sequence[Link],
+    agreed: set[tuple[NodeId, NodeId]],
+    heard: Mapping[MapId, FalseWitnesses],
+    s: ConsistencySettings,
+) -> list[Link]:
+    """Refused links that the joined map bears out after all, until there is none.
+
+    Of hundreds of links that are right some two will miss each other's gate by chance, and a clique keeps but
+    one of them. What all others make of the map is a better judge than any one of them.
+    """
+    kept, refused = list(kept), list(refused)
+    while True:
+        by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
+        inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
+        back = _borne_out(inside, by_node, agreed, heard, s)
+        if not back:
+            return kept
+        kept += back
+        pairs = {link.pair for link in back}
+        refused = [link for link in refused if link.pair not in pairs]
+
+
+def _sorted(
+    links: Sequence[Link],
+    key: Key,
+    groups: Mapping[Key, LinkGroup],
+    by_node: Mapping[NodeId, Fragment],
+    s: ConsistencySettings,
+) -> Sorted:
+    """Sort the links between two pieces; what a group is by itself has been found out already."""
+    group = groups.get(key)
+    first, second = by_node[key[0]], by_node[key[1]]
+    if group is not None and len(group.first) == len(first) and len(group.second) == len(second):
+        return group.sorted
+    return sort_links(links, first, second, s)
+
+
+def _heard(groups: Mapping[Key, LinkGroup]) -> dict[MapId, FalseWitnesses]:
+    """What false witnesses are like, by map: read off all maps that links tie to it, directly or not."""
+    ties: nx.Graph = nx.Graph()
+    ties.add_edges_from((group.first.name.map, group.second.name.map) for group in groups.values())
+    out: dict[MapId, FalseWitnesses] = {}
+    for island in nx.connected_components(ties):
+        supports = [
+            group.sorted.supports[0]
+            for group in groups.values()
+            if group.first is not group.second and group.first.name.map in island
+        ]
+        out |= dict.fromkeys(island, FalseWitnesses.of(supports))
+    return out
+
+
+def _beyond_chance(
+    found: Sorted, own: Sequence[Sorted], heard: FalseWitnesses, s: ConsistencySettings
+) -> Sorted:
+    """What chance does is read off all pieces but the two that are judged."""
+    return found.beyond_chance(heard.without(FalseWitnesses.of(one.supports[0] for one in own)), s)
+
+
+def best_supported(weights: Mapping[tuple[P, P], float]) -> dict[P, tuple[P, P]]:
+    """Of each piece the two that are joined by the greatest weight: it and another one."""
+    best: dict[P, tuple[P, P]] = {}
+    for key in _ranked(weights):
+        for piece in key:
+            best.setdefault(piece, key)
+    return best
+
+
+def joined(weights: Mapping[tuple[P, P], float], tied: Container[tuple[P, P]]) -> list[tuple[P, P]]:
+    """Which pieces are joined in this round: those of which each is the other's best supported one.
+
+    A piece of which the other one has a better supported one is joined to it too, if no links at all tie it
+    to any of those: then they have nothing to say to each other, and whichever comes first is the same.
+
+    Args:
+        weights: behind the links that would join two pieces, the smaller first.
+        tied: pieces between which there are links at all.
+
+    Returns:
+        Best supported first.
+    """
+    best = best_supported(weights)
+    better: dict[P, list[P]] = {}
+    out = []
+    for key in _ranked(weights):
+        for one, other in (key, key[::-1]):
+            if best[one] == key and not any(
+                (min(one, rival), max(one, rival)) in tied for rival in better.get(other, ())
+            ):
+                out.append(key)
+                break
+        for one, other in (key, key[::-1]):
+            better.setdefault(one, []).append(other)
+    return out
+
+
+def _ranked(weights: Mapping[tuple[P, P], float]) -> list[tuple[P, P]]:
+    return sorted(weights, key=lambda key: (-weights[key], key))
+
+
+def _borne_out(
+    links: Sequence[Link],
+    by_node: Mapping[NodeId, Fragment],
+    agreed: set[tuple[NodeId, NodeId]],
+    heard: Mapping[MapId, FalseWitnesses],
+    s: ConsistencySettings,
+) -> list[Link]:
+    """The links within pieces that these bear out: others of their group agree with them and they fit, or how
+    well they fit makes it likely enough that they are true.
+    """
+    inside: dict[NodeId, tuple[PoseGraph, list[Link]]] = {}
+    for link in links:
+        piece = by_node[link.a]
+        inside.setdefault(piece.name, (piece.graph, []))[1].append(link)
+    out: list[Link] = []
+    for graph, here in inside.values():
+        least = max(0.0, s.least_evidence - heard[here[0].a.map].log_odds)
+        good = borne_out(here, graph, agreed, least, s)
+        out += [link for link, yes in zip(here, good, strict=True) if yes]
+    return out
+
+
+def borne_out(
+    links: Sequence[Link],
+    graph: PoseGraph,
+    agreed: Container[tuple[NodeId, NodeId]],
+    least: float,
+    s: ConsistencySettings,
+) -> list[bool]:
+    """Of links within one piece, which it bears out.
+
+    Args:
+        links: with both ends in the piece.
+        graph: the piece.
+        agreed: links that others of their group agree with.
+        least: natural logarithm of Bayes' factor from which any other one is likely enough.
+        s: when links are believed.
+    """
+    if not s.cliques or not links:
+        return [True for _ in links]
+    fits = misfits(links, graph, s) < s.gate
+    out = [bool(good) and link.canonical().pair in agreed for link, good in zip(links, fits, strict=True)]
+    asked = [k for k, good in enumerate(out) if not good]
+    for k, found in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
+        out[k] = bool(found.log_factor > least)
+    return out

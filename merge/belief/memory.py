@@ -1,0 +1,103 @@
+"""What a merge has found out that the next one need not find out again.
+
+Everything kept here depends on nothing but what it is kept with, compared by identity: maps, fragments and
+links are never changed, only replaced. So a merge with a memory is the merge without one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
+from merge.belief.consistency import ConsistencySettings
+from merge.belief.cutting import fragments_of
+from merge.belief.groups import LinkGroup, Verdict
+from merge.graph.fragments import Fragment
+from merge.graph.links import Link
+
+T = TypeVar("T")
+Key = tuple[NodeId, NodeId]
+"""Names of two fragments, or two nodes, smaller first."""
+
+
+class Memory:
+    """Fragments by map, and sorted groups of links by fragments. For merges with the same settings."""
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self._maps: dict[MapId, tuple[HybridMap, list[Fragment]]] = {}
+        self._groups: dict[Key, tuple[Fragment, Fragment, tuple[Link, ...], LinkGroup]] = {}
+        self._weighed: dict[Key, tuple[Link, Link]] = {}
+
+    def fragments(
+        self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings, strain: float
+    ) -> list[Fragment]:
+        """See `merge.belief.cutting.fragments_of`; only maps that have changed are cut."""
+        found: list[Fragment] = []
+        for map_id, one in maps.items():
+            known = self._maps.get(map_id)
+            if known is None or known[0] is not one:
+                known = self._maps[map_id] = one, fragments_of({map_id: one}, s, strain)
+            found += known[1]
+        return sorted(found, key=lambda fragment: fragment.name)
+
+    def weighed(self, links: Sequence[Link], weighed: Sequence[Link]) -> list[Link]:
+        """Links as they were weighed now; one that has the weight it had before is the same object as before.
+
+        Args:
+            links: as they were verified.
+            weighed: the same by `merge.belief.distinctness.weigh`, in the same order.
+        """
+        found = []
+        for link, now in zip(links, weighed, strict=True):
+            if now is not link:
+                before = self._weighed.get(link.pair)
+                if before is None or before[0] is not link or before[1].doubles != now.doubles:
+                    before = self._weighed[link.pair] = link, now
+                now = before[1]
+            found.append(now)
+        return found
+
+    def group(
+        self,
+        links: Sequence[Link],
+        given: Sequence[Link],
+        first: Fragment,
+        second: Fragment,
+        s: ConsistencySettings,
+        verdict: Verdict,
+    ) -> LinkGroup:
+        """See `LinkGroup.of`; links between two fragments are sorted anew only if any of them is new.
+
+        Args:
+            links: from `first` to `second`.
+            given: the same as they were given, in the same order.
+            first: piece of map.
+            second: piece of map; may be the same.
+            s: when links are believed.
+            verdict: on sets that are supported alike; it depends on the two fragments alone.
+        """
+        key = first.name, second.name
+        known = self._groups.get(key)
+        if known is not None and known[0] is first and known[1] is second and _same(known[2], given):
+            return known[3]
+        group = LinkGroup.of(links, first, second, s, verdict)
+        self._groups[key] = first, second, tuple(given), group
+        return group
+
+    def forget(self, maps: set[MapId]) -> None:
+        """Drop what is known of maps that are gone."""
+        self._maps = {k: v for k, v in self._maps.items() if k not in maps}
+        self._groups = _among(self._groups, maps)
+        self._weighed = _among(self._weighed, maps)
+
+
+def _among(known: dict[Key, T], gone: set[MapId]) -> dict[Key, T]:
+    """What is known between two nodes of maps that are not gone."""
+    return {k: v for k, v in known.items() if k[0].map not in gone and k[1].map not in gone}
+
+
+def _same(one: Sequence[Link], other: Sequence[Link]) -> bool:
+    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))

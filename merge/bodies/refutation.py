@@ -1,0 +1,118 @@
+"""Refutation: which groups of links cannot be true, because robots are bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+
+import networkx as nx
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
+from merge.belief.consistency import ConsistencySettings
+from merge.belief.groups import LinkGroup
+from merge.belief.joining import Solver
+from merge.bodies.exclusion import Clash, ExclusionSettings, clash_of
+from merge.bodies.trails import Trail, trails_of
+from merge.graph.links import Link
+from merge.graph.posegraph import PoseGraph
+
+Key = tuple[NodeId, NodeId]
+"""Names of two fragments, smaller first."""
+
+
+class Refutation:
+    """Knows where every robot was when, as far as its clock is known."""
+
+    def __init__(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        solver: Solver,
+        consistency: ConsistencySettings,
+        exclusion: ExclusionSettings,
+    ) -> None:
+        """Read the trails.
+
+        Args:
+            maps: with the nodes of all fragments.
+            solver: of the fragments.
+            consistency: when links are believed.
+            exclusion: when two robots clash.
+        """
+        self._solver = solver
+        self._consistency = consistency
+        self._exclusion = exclusion
+        self._trails: dict[NodeId, tuple[Trail, ...]] = {}
+        for fragment in solver.fragments:
+            nodes = maps[fragment.name.map].nodes
+            trails = trails_of([nodes[node] for node in fragment.nodes])
+            if trails:
+                self._trails[fragment.name] = trails
+
+    def verdict(self, story: Sequence[Link]) -> str:
+        """Why links that agree with each other cannot be true; empty if they can, as far as anybody knows."""
+        ends = {self._solver.by_node[node].name for link in story for node in link.pair}
+        if len(ends & self._trails.keys()) < 2:
+            return ""
+        graph = next(g for g in self._solver.solve(story) if story[0].a in g.rows)
+        return next((clash.reason for _, clash in self._clashes([graph])), "")
+
+    def key_of(self, link: Link) -> Key:
+        """Between which fragments a link is."""
+        first, second = sorted(self._solver.by_node[node].name for node in link.pair)
+        return first, second
+
+    def impossible(
+        self, groups: Mapping[Key, LinkGroup], solved: Sequence[PoseGraph], kept: Sequence[Link]
+    ) -> dict[Key, str]:
+        """Groups that must fall, with reasons.
+
+        Where two pieces that clash are joined by links of their own, those are wrong: all other links between
+        them agree with these. Where they are joined by way of other pieces, one group on the way is wrong,
+        and the weakest is the likeliest.
+
+        Args:
+            groups: all links.
+            solved: the components.
+            kept: the links that made them.
+        """
+        clashes = dict(self._clashes(solved))
+        if not clashes:
+            return {}
+        weights: dict[Key, int] = {}
+        for link in kept:
+            key = self.key_of(link)
+            weights[key] = weights.get(key, 0) + link.weight
+        direct = {key: clash.reason for key, clash in clashes.items() if key in weights}
+        if direct:
+            return direct
+        (start, end), clash = min(clashes.items(), key=lambda item: (-item[1].evidence, item[0]))
+        weakest = _weakest_on_the_way(weights, start, end)
+        return {weakest: f"{clash.reason}, and these are the weakest links that join the two"}
+
+    def _clashes(self, solved: Sequence[PoseGraph]) -> Iterator[tuple[Key, Clash]]:
+        """Pairs of fragments in one component that clash, by whichever clock says so most clearly."""
+        for graph in solved:
+            names = [name for name in self._trails if name in graph.rows]
+            for k, first in enumerate(names):
+                for second in names[k + 1 :]:
+                    found = [
+                        clash_of(graph, one, two, self._exclusion)
+                        for one in self._trails[first]
+                        for two in self._trails[second]
+                    ]
+                    clashes = [clash for clash in found if clash is not None]
+                    if clashes:
+                        yield (first, second), max(clashes, key=lambda clash: clash.evidence)
+
+
+def _weakest_on_the_way(weights: Mapping[Key, int], start: NodeId, end: NodeId) -> Key:
+    """The weakest pair on the best supported way from one fragment to another."""
+    graph: nx.Graph = nx.Graph()
+    for (first, second), weight in sorted(weights.items()):
+        if first != second:
+            graph.add_edge(first, second, weight=weight)
+    tree = nx.maximum_spanning_tree(graph)
+    way = nx.shortest_path(tree, start, end)
+    steps = [(min(a, b), max(a, b)) for a, b in pairwise(way)]
+    return min(steps, key=lambda key: (weights[key], key))

@@ -1,0 +1,247 @@
+"""Explanations of two nodes: why they are linked, or are not, with every number behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import InvalidValue
+from hybridmap.explanation import Misfit, PairExplanation, Standing, Witness
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.pose import Array, Pose2
+from hybridmap.reach import RECOGNISED, reach_of
+from hybridmap.recognising.matching import match
+from hybridmap.recognising.recognition import Recognition
+from merge.belief.claims import CLAIMS
+from merge.belief.consistency import ConsistencySettings, group_links, loop_distances2
+from merge.belief.credence import prior_odds, probability, standpoints
+from merge.belief.cutting import fragments_of
+from merge.graph.fragments import fragment_by_node
+from merge.graph.links import Link, RefusedLink
+from merge.graph.merged import MergedMap
+from merge.graph.verification import VerificationSettings, examine, verify
+from merge.undoing import reason_of, undo
+
+SAID = {
+    EdgeKind.MAPPED: "drove from the one to the other while it mapped",
+    EdgeKind.TURNED: "turned on the spot from the one to the other",
+    EdgeKind.DRIVEN: "has driven from the one to the other",
+    EdgeKind.LOOP: "has recognised the one at the other",
+    EdgeKind.MERGED: "has recognised the one at the other",
+}
+
+
+def explain_nodes(
+    merged: MergedMap,
+    a: NodeId,
+    b: NodeId,
+    verification: VerificationSettings | None = None,
+    consistency: ConsistencySettings | None = None,
+) -> PairExplanation:
+    """Explain two nodes.
+
+    Args:
+        merged: the merged map.
+        a: a node.
+        b: another one.
+        verification: as in the merge.
+        consistency: as in the merge.
+
+    Raises:
+        InvalidValue: the same node twice, or one that is not there.
+    """
+    if a == b:
+        raise InvalidValue(f"{a} twice: give two nodes")
+    one, two = (node_of(merged, node) for node in sorted((a, b)))
+    link, refusal = _link(merged, one.id, two.id), _refusal(merged, one.id, two.id)
+    found = _looked_at(one, two, link or (refusal.link if refusal else None), verification)
+    ruling = merged.rulings.against(one.id, two.id)
+    retired = next((r for m, r in merged.rulings.retired.items() if m in (one.id.map, two.id.map)), None)
+    if retired is not None:
+        about = merged.rulings.about(one.id, two.id)
+        return replace(found, standing=Standing.UNDONE, reason=reason_of(retired), rulings=about)
+    witnesses: tuple[Witness, ...] = ()
+    if link is not None:
+        witnesses = _witnesses(merged, link, consistency)
+        count = sum(w.agrees and w.kept for w in witnesses)
+        standing, reason = Standing.LINKED, f"{link.weight} landmarks agree on one posture, {_others(count)}"
+    elif ruling is not None and refusal is not None and refusal.link is not None:
+        standing, reason = Standing.UNDONE, reason_of(ruling)
+    elif refusal is not None:
+        standing, reason = Standing.REFUSED, refusal.reason
+    else:
+        fresh = verify(one, two, verification)
+        words = (
+            fresh.reason
+            if isinstance(fresh, RefusedLink)
+            else f"{fresh.weight} landmarks agree on one posture"
+        )
+        standing = Standing.UNCOMPARED
+        reason = f"they share too little, are neighbours, or others share more; compared now: {words}"
+        link = None if isinstance(fresh, RefusedLink) else fresh
+    geometry = link or (refusal.link if refusal else None)
+    found = replace(
+        found,
+        standing=standing,
+        reason=reason,
+        claims=(*_claims(merged, one.id, two.id), *_consequences(merged, one.id, two.id)),
+        rulings=merged.rulings.about(one.id, two.id),
+    )
+    if geometry is None:
+        return found
+    misfit, credence = _judged(merged, geometry, kept=standing is Standing.LINKED)
+    return replace(
+        found,
+        misfit=misfit,
+        probability=credence,
+        witnesses=witnesses or _witnesses(merged, geometry, consistency),
+    )
+
+
+def node_of(merged: MergedMap, node: NodeId) -> Node:
+    """A node of a merged map.
+
+    Raises:
+        InvalidValue: it is not there; the words say what is.
+    """
+    one = merged.maps.get(node.map)
+    if one is None:
+        known = ", ".join(map(str, merged.maps)) or "none"
+        raise InvalidValue(f"there is no map {node.map}; known are: {known}")
+    if node not in one.nodes:
+        numbers = sorted(n.number for n in one.nodes)
+        span = f"its {len(numbers)} nodes are {numbers[0]} to {numbers[-1]}" if numbers else "it has no nodes"
+        raise InvalidValue(f"map {node.map} has no node {node.number}; {span}")
+    return one.nodes[node]
+
+
+def residuals_px(a: Node, b: Node, a_from_b: Pose2, shared: NDArray[np.int64]) -> Array:
+    """(K,) px, how far shared landmarks are from where a posture predicts them.
+
+    A landmark of a that has a depth is projected into b's image, one that only b knows the depth of into a's.
+
+    Args:
+        a: one node.
+        b: another one.
+        a_from_b: posture of b in a.
+        shared: (K, 2) indices of landmarks in a and in b.
+    """
+    in_a, in_b = a.landmarks.take(shared[:, 0]), b.landmarks.take(shared[:, 1])
+    to_b = b.camera.project(a_from_b.inverse().apply(in_a.points_in_robot(a.camera)))
+    to_a = a.camera.project(a_from_b.apply(in_b.points_in_robot(b.camera)))
+    off = np.where(in_a.has_depth[:, None], to_b - in_b.pixels, to_a - in_a.pixels)
+    out: Array = np.linalg.norm(off.reshape(-1, 2), axis=1)
+    return out
+
+
+def _looked_at(
+    a: Node, b: Node, link: Link | None, verification: VerificationSettings | None
+) -> PairExplanation:
+    """What the landmarks say. A link brings its posture; else the nodes are compared again."""
+    s = verification or VerificationSettings()
+    matches = match(a.landmarks.codes, b.landmarks.codes, s.recognition.matching)
+    nothing = np.zeros((0, 2), np.int64)
+    out = PairExplanation(a, b, Standing.UNCOMPARED, "", matches, nothing, np.zeros(0))
+    if link is not None:
+        link = link.canonical()
+        posture, shared, evidence = link.a_from_b, link.shared, link.evidence
+    else:
+        verdict = examine(a, b, s)
+        if not isinstance(verdict, Recognition):
+            return out
+        posture, shared, evidence = verdict.node_from_robot, verdict.pairs, verdict.evidence
+    off = residuals_px(a, b, posture.mean, shared)
+    return replace(out, a_from_b=posture, shared=shared, evidence=dict(evidence), residuals_px=off)
+
+
+def _link(merged: MergedMap, a: NodeId, b: NodeId) -> Link | None:
+    return next((link for link in merged.links if link.pair == (a, b)), None)
+
+
+def _refusal(merged: MergedMap, a: NodeId, b: NodeId) -> RefusedLink | None:
+    """What became of a comparison of the two; the robots' own words are told apart from it."""
+    found = [refusal for refusal in merged.refused if refusal.pair == (a, b) and refusal.edge is None]
+    return max(found, key=lambda refusal: refusal.link is not None, default=None)
+
+
+def _others(count: int) -> str:
+    more = "1 more link" if count == 1 else f"{count} more links"
+    return f"and {more} between the same pieces of map agree{'s' if count == 1 else ''}"
+
+
+def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, float | None]:
+    component = merged.component_of(link.a)
+    if component is None or component != merged.component_of(link.b):
+        # How many links of all stand tells nothing of these: maps that show alike things bring many.
+        return None, None
+    (found,) = standpoints([link], merged.graphs[component], kept=kept)
+    misfit = Misfit(found.merged_a_from_b, found.off, found.strain2, found.alone)
+    return misfit, probability(found.log_factor, prior_odds(merged))
+
+
+def _witnesses(merged: MergedMap, link: Link, consistency: ConsistencySettings | None) -> tuple[Witness, ...]:
+    """All other links that were found between the two pieces of map, as the merge compares them."""
+    s = consistency or ConsistencySettings()
+    maps = {one: merged.maps[one] for one in {link.a.map, link.b.map}}
+    pieces = fragment_by_node(fragments_of(_without_undone(merged, maps), s))
+    ends = {pieces[link.a].name, pieces[link.b].name}
+    kept = {other.pair for other in merged.links}
+    found = [*merged.links, *(r.link for r in merged.refused if r.link is not None and r.edge is None)]
+    near = [
+        other
+        for other in found
+        if other.pair != link.pair
+        and other.a in pieces
+        and other.b in pieces
+        and {pieces[other.a].name, pieces[other.b].name} == ends
+    ]
+    ((names, group),) = group_links([link, *near], pieces).items()
+    distances2 = loop_distances2(group, pieces[names[0]], pieces[names[1]], s)
+    own = next(k for k, other in enumerate(group) if other.canonical().pair == link.canonical().pair)
+    return tuple(
+        Witness(
+            *other.pair,
+            float(distances2[own, k]),
+            bool(distances2[own, k] < s.gate),
+            other.canonical().pair in kept,
+        )
+        for k, other in enumerate(group)
+        if k != own
+    )
+
+
+def _without_undone(merged: MergedMap, maps: dict[MapId, HybridMap]) -> dict[MapId, HybridMap]:
+    return dict(undo(maps, (), merged.rulings).maps)
+
+
+def _claims(merged: MergedMap, a: NodeId, b: NodeId) -> Iterator[str]:
+    refused = {r.edge: r.reason for r in merged.refused if r.edge is not None}
+    for one in merged.maps.values():
+        for edge in one.edges.values():
+            if {edge.a, edge.b} == {a, b}:
+                words = f"{edge.id.agent} {SAID[edge.kind]} (edge {edge.id})"
+                if edge.id in refused:
+                    words += f"; refused: {refused[edge.id]}"
+                elif edge.kind in CLAIMS:
+                    words += "; believed"
+                    if edge.kind in RECOGNISED:
+                        words += f"; {_reach(merged, edge)}"
+                yield words
+
+
+def _consequences(merged: MergedMap, a: NodeId, b: NodeId) -> Iterator[str]:
+    """What follows for routes and for the two nodes' lives."""
+    link = _link(merged, a, b)
+    if link is not None:
+        yield f"the link {_reach(merged, link.edge())}"
+    for node in (a, b):
+        if node in merged.superseded:
+            yield f"{node} is superseded: {merged.superseded[node]}"
+
+
+def _reach(merged: MergedMap, edge: Edge) -> str:
+    return reach_of(edge, node_of(merged, edge.a), node_of(merged, edge.b)).reason

@@ -1,0 +1,102 @@
+"""Partings: what has become one map, or is no longer one, from one merge to the next."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+import networkx as nx
+
+from hybridmap.node import MapId
+from merge.graph.links import Link
+from merge.graph.merged import MergedMap
+
+
+def joined_maps(merged: MergedMap) -> list[frozenset[MapId]]:
+    """Sets of maps that are one, of single ones too, by their smallest; maps without nodes are in none."""
+    graph: nx.Graph = nx.Graph()
+    for component in merged.components:
+        inside = sorted({node.map for node in component})
+        graph.add_nodes_from(inside)
+        graph.add_edges_from((inside[0], other) for other in inside[1:])
+    return sorted((frozenset(part) for part in nx.connected_components(graph)), key=min)
+
+
+def partings(before: MergedMap, after: MergedMap) -> tuple[str, ...]:
+    """What is no longer one map, with the reason.
+
+    Args:
+        before: an earlier merge.
+        after: a later one.
+
+    Returns:
+        For example `r1.1 and r3.1 are no longer one map: 8 links refused (r1 would have seen ...)`.
+    """
+    part_of = {one: part for part in joined_maps(after) for one in part}
+    out: list[str] = []
+    for whole in joined_maps(before):
+        parts = sorted(
+            {part_of[one] & whole for one in whole if one in part_of}, key=lambda p: (-len(p), min(p))
+        )
+        out += [
+            f"{_named(parts[0])} and {_named(part)} are no longer one map: {_lost(part, before, after)}"
+            for part in parts[1:]
+        ]
+    return tuple(out)
+
+
+def joinings(before: MergedMap, after: MergedMap) -> tuple[str, ...]:
+    """What has become one map.
+
+    Args:
+        before: an earlier merge.
+        after: a later one.
+
+    Returns:
+        For example `r1.1 and r3.1 are one map now, by 8 links`.
+    """
+    part_of = {one: part for part in joined_maps(before) for one in part}
+    out = []
+    for whole in joined_maps(after):
+        known = sorted(
+            {part_of[one] & whole for one in whole if one in part_of}, key=lambda p: (-len(p), min(p))
+        )
+        news = [frozenset([one]) for one in sorted(whole) if one not in part_of]
+        parts = [*known, *news]
+        for part in parts[1:]:
+            count = len(_across(after.links, part, whole - part))
+            by = f"by {count} link{'' if count == 1 else 's'}" if count else "by way of others"
+            out.append(f"{_named(parts[0])} and {_named(part)} are one map now, {by}")
+    return tuple(out)
+
+
+def _named(maps: Iterable[MapId]) -> str:
+    names = [str(one) for one in sorted(maps)]
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} with {names[-1]}"
+
+
+def _across(links: Iterable[Link], part: frozenset[MapId], rest: frozenset[MapId]) -> list[Link]:
+    return [
+        link
+        for link in links
+        if (link.a.map in part and link.b.map in rest) or (link.b.map in part and link.a.map in rest)
+    ]
+
+
+def _lost(part: frozenset[MapId], before: MergedMap, after: MergedMap) -> str:
+    """What has become of the links that held a part."""
+    held = _across(before.links, part, frozenset(before.maps) - part)
+    pairs = {link.pair for link in held}
+    reasons = Counter(r.reason for r in after.refused if r.pair in pairs and r.edge is None)
+    gone = [pair for pair in pairs if pair[0] not in after.postures or pair[1] not in after.postures]
+    told = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    if gone:
+        told.append(f"{_links(len(gone))} gone with a node")
+    left = len(pairs) - sum(reasons.values()) - len(gone)
+    if left > 0:
+        told.append(f"{_links(left)} no longer among the pairs that look most alike")
+    return "; ".join(told) or "a map has fallen into pieces"
+
+
+def _links(count: int) -> str:
+    return "1 link" if count == 1 else f"{count} links"

@@ -1,0 +1,41 @@
+"""Fragments: pieces of map that hold together by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from hybridmap.node import NodeId
+from merge.graph.links import RefusedLink
+from merge.graph.posegraph import Measurement, PoseGraph
+
+
+@dataclass(frozen=True, eq=False)
+class Fragment:
+    """Nodes of one map that its own edges connect, with the postures that these edges give.
+
+    Attributes:
+        name: the smallest id in it.
+        graph: solved postures; the smallest id is held at its own posture.
+        measurements: the edges that are believed.
+        refused: loops of the robot's own that are not.
+    """
+
+    name: NodeId
+    graph: PoseGraph
+    measurements: tuple[Measurement, ...]
+    refused: tuple[RefusedLink, ...] = ()
+
+    @property
+    def nodes(self) -> tuple[NodeId, ...]:
+        """In the order of ids."""
+        return self.graph.nodes
+
+    def __len__(self) -> int:
+        """How many nodes."""
+        return len(self.graph.nodes)
+
+
+def fragment_by_node(fragments: Collection[Fragment]) -> dict[NodeId, Fragment]:
+    """Which fragment each node belongs to."""
+    return {node: fragment for fragment in fragments for node in fragment.nodes}

@@ -1,0 +1,98 @@
+"""The mapper on photographs hung on walls of known depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from agent.mapping.mapper import Mapper
+from agent.observation import Odometry
+from hybridmap.node import MapId
+from hybridmap.pose import Pose2
+
+
+def drive(mapper, walls, positions, start=1):
+    """Observe from each x position in turn; returns the last observation."""
+    before = Pose2(positions[0])
+    for tick, x in enumerate(positions, start):
+        observation = walls.observe(before, Pose2(x), tick)
+        mapper.step(observation)
+        if not mapper.started:
+            mapper.begin(observation)
+        before = Pose2(x)
+    return observation
+
+
+def test_depths_of_a_node_are_those_of_the_walls(walls, description):
+    mapper = Mapper(MapId("r0", 1), description)
+    there = np.arange(0.0, 0.6, 0.025)
+    last = drive(mapper, walls, [*there, *there[::-1]])
+    changes = mapper.finish(last)
+    (node,) = mapper.map.nodes.values()
+    assert len(changes) == 1
+    assert len(node.landmarks) > 30
+    true = walls.depth_at(Pose2(), node.landmarks.pixels)
+    error = np.abs(node.landmarks.depths - true) / true
+    assert np.median(error) < 0.02
+    # Landmarks at the edge between the walls may be attributed to either.
+    assert np.mean(error < 0.08) > 0.9
+
+
+def test_an_edge_is_the_drive_between_two_views(walls, description):
+    mapper = Mapper(MapId("r0", 1), description)
+    first = drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025)))
+    mapper.finish(first)
+    second = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
+    mapper.finish(second)
+    (edge,) = mapper.map.edges.values()
+    a, b = mapper.map.nodes[edge.a], mapper.map.nodes[edge.b]
+    assert abs(edge.a_from_b.mean.x - 0.5) < 0.01
+    assert abs(edge.a_from_b.mean.y) < 0.01
+    assert edge.a_from_b.mahalanobis2(Pose2(0.5)) < 16.3  # 99.9 % of chi-square with 3 degrees of freedom
+    assert len(edge.shared) > 15
+    # A shared landmark is the same physical point in both nodes.
+    in_a = a.points_in_robot[edge.shared[:, 0]]
+    in_b = Pose2(0.5).apply(b.points_in_robot[edge.shared[:, 1]])
+    assert np.median(np.linalg.norm(in_a - in_b, axis=1)) < 0.08
+
+
+def test_a_view_without_features_gives_no_node(walls, description):
+    mapper = Mapper(MapId("r0", 1), description)
+    away = [Pose2(0, 0, np.pi)] * 3
+    for tick, pose in enumerate(away, 1):
+        observation = walls.observe(pose, pose, tick)
+        mapper.step(observation)
+        if not mapper.started:
+            mapper.begin(observation)
+    assert mapper.anchor_features == 0
+    assert mapper.finish(observation) == []
+    assert not mapper.map.nodes
+
+
+def test_standing_still_gives_no_depth(walls, description):
+    mapper = Mapper(MapId("r0", 1), description)
+    last = drive(mapper, walls, [0.0] * 30)
+    mapper.finish(last)
+    assert not mapper.map.nodes
+
+
+def test_a_covered_lens_and_lost_encoders_are_named(walls, description):
+    mapper = Mapper(MapId("r", 1), description)
+    pose = Pose2()
+    mapper.step(walls.observe(pose, pose, 0))
+    mapper.begin(walls.observe(pose, pose, 0))
+    assert mapper.health == ""
+    told = []
+    for tick in range(1, 40):
+        before, pose = pose, Pose2(0.02 * tick, 0.0, 0.05 * np.sin(0.4 * tick))
+        seen = walls.observe(before, pose, tick)
+        if 20 <= tick < 26:
+            seen = replace(seen, odometry=Odometry(0.0, 0.0))
+        elif tick >= 30:
+            seen = replace(seen, image=None)
+        mapper.step(seen)
+        told.append(mapper.health)
+    assert not any(told[:18])
+    assert sum("refute" in health for health in told[19:26]) >= 4
+    assert told[-1] == "no image for 10 steps"

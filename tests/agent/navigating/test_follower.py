@@ -1,0 +1,138 @@
+"""The end of a route: the robot is at the goal only if a fresh look says so."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agent.localizing.fix import Fix
+from agent.localizing.lookout import Expected, Lookout, LookoutSettings
+from agent.navigating.detour import Detour
+from agent.navigating.follower import Follower, Progress
+from agent.navigating.follower_settings import FollowerSettings
+from agent.navigating.headway import Headway
+from agent.navigating.node_servo import NodeServo
+from agent.observation import Command, Observation, Odometry, RobotDescription
+from agent.servo.step import ServoStep
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.camera import Camera
+from hybridmap.node import Node
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import RouteLeg
+from hybridmap.recognising.recognition import recognise
+
+HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
+
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
+ROBOT = RobotDescription(camera=CAMERA)
+
+
+class Deluded:
+    """A localizer whose tracks have slid: it is sure to stand at the goal, wherever it stands."""
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self.pose = PoseGaussian.from_sigmas(Pose2(), 0.002, 0.001)
+        self.visible = np.arange(len(node.landmarks))
+        self.in_sight = True
+
+    def step(self, observation: Observation) -> None:
+        """It learns nothing."""
+
+
+def follower_at_the_goal(node: Node) -> Follower:
+    lens = Lens(ROBOT)
+    fix = Fix(node.id, HERE, Deluded(node))  # type: ignore[arg-type]
+    route = (RouteLeg(node, HERE, None),)
+    rng = np.random.default_rng(0)
+    return Follower(ROBOT, lens, Sift(lens), route, fix, Detour(ROBOT), FollowerSettings(), rng)
+
+
+@pytest.mark.parametrize(
+    "begin", [Pose2(-0.03, 0.0, 0.0), Pose2(-0.01, 0.02, -0.015), Pose2(0.02, -0.02, 0.02)]
+)
+def test_slid_tracks_do_not_park_the_robot_beside_the_goal(walls, node, begin):
+    """The robot believes to be parked, 2 to 3 cm off. It looks afresh, and drives the rest."""
+    follower, pose = follower_at_the_goal(node), begin
+    odometry = Odometry(0.0, 0.0)
+    for tick in range(400):
+        command = follower.step(Observation(tick * 100_000_000, odometry, walls.render(pose)))
+        if follower.progress is Progress.ARRIVED:
+            break
+        odometry = Odometry(command.forward * ROBOT.tick, command.turn * ROBOT.tick)
+        pose = pose @ odometry.motion()
+    assert follower.progress is Progress.ARRIVED
+    assert pose.distance(Pose2()) < 0.01
+    assert abs(pose.heading) < np.radians(1.0)
+
+
+def test_who_sees_nothing_of_the_goal_is_not_there(walls, node):
+    follower = follower_at_the_goal(node)
+    dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
+    seen = []
+    for tick in range(40):
+        follower.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), dark))
+        seen.append(follower.progress)
+        if follower.progress is Progress.UNSURE:
+            break
+    assert Progress.ARRIVED not in seen
+    assert seen[-1] is Progress.UNSURE
+
+
+def test_a_fresh_look_takes_over_only_for_many_more_landmarks(walls, node):
+    """Tracks have been filtered for a while; a look that knows hardly more has not."""
+    lens, pose = Lens(ROBOT), Pose2(-0.3, 0.1, -0.1)
+    image = walls.render(pose)
+    lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
+    view = Sift(lens).extract(image).view(CAMERA)
+    found = recognise(node, view, None, np.random.default_rng(0))
+    assert found is not None
+    assert found.inliers > 20
+    assert lookout.find(image, [Expected(0, node, pose, tracked=found.inliers - 2)]) is None
+    taken = lookout.find(image, [Expected(0, node, pose, tracked=found.inliers // 2)])
+    assert taken is not None
+    assert taken[1].pose.mean.distance(pose) < 0.05
+
+
+def test_nodes_are_found_where_they_are_expected_only(walls, node):
+    lens, pose = Lens(ROBOT), Pose2(-0.3, 0.1, -0.1)
+    lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
+    image, elsewhere = walls.render(pose), pose @ Pose2(-0.5)
+    assert lookout.find(image, [Expected(3, node, elsewhere)]) is None
+    found = lookout.find(image, [Expected(7, node, elsewhere), Expected(3, node, elsewhere, doubt=2.0)])
+    assert found is not None
+    assert found[0] == 3
+
+
+def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypatch):
+    """It once stood before an obstacle for as long as anybody had patience, and the drive around had none."""
+    standing = ServoStep(Command(), "driving", None, "standing still to think the way over", 9)
+
+    def stand(servo: NodeServo, leg: int, *_: object) -> ServoStep:
+        servo.leg = leg
+        return standing
+
+    monkeypatch.setattr(NodeServo, "command", stand)
+    follower = follower_at_the_goal(node)
+    follower.fix.localizer.pose = PoseGaussian.from_sigmas(Pose2(-1.0, 0.0, 0.0), 0.002, 0.001)
+    dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
+    commands = [follower.step(Observation(k * 10**8, Odometry(0.0, 0.0), dark)) for k in range(140)]
+    moved = [command.forward > 0.0 for command in commands]
+    stood = round(FollowerSettings().stalled_parking / ROBOT.tick)
+    assert not any(moved[: stood - 1])
+    assert all(moved[stood + 2 : stood + 30])
+    assert follower.progress is Progress.DRIVING
+
+
+@given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=60))
+def test_headway_counts_since_the_robot_came_nearer(distances):
+    headway, best, since = Headway(), np.inf, 0
+    for distance in distances:
+        headway.take(distance, 0.1)
+        since += 1
+        if distance < best - headway.step:
+            best, since = distance, 0
+        assert headway.stood == pytest.approx(0.1 * since)
+        assert headway.best == best

@@ -1,0 +1,98 @@
+"""Asking: a busy server is asked again when it said, and a robot's patience has an end. And moving."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from agent.mission import Answer, Question, WhichWay
+from agent.navigating.helm import NO_ANSWER, Helm
+from agent.observation import Observation, Odometry, RobotDescription
+from hybridmap.camera import Camera
+from hybridmap.node import NodeId
+from hybridmap.query import RouteAnswer
+
+BODY = RobotDescription(Camera(64, 48, 60, 60, 32, 24, 0.3), tick=0.1)
+HERE, THERE = NodeId("r0", 1, 1), NodeId("r1", 1, 1)
+
+
+def ask(fleet: Callable[[int, Question], Answer | None], patience: int = 100) -> tuple[Answer, list[float]]:
+    """Ask a way of a fleet that answers the n-th question (from 0) within a tick; when it was asked, s."""
+    helm = Helm(BODY, patience)
+    behaviour = helm.ask(WhichWay(helm.number(), HERE, THERE))
+    asked: list[float] = []
+    answers: tuple[Answer, ...] = ()
+    while True:
+        helm.take_in(Observation(0, Odometry(0.0, 0.0), None), answers)
+        try:
+            next(behaviour)
+        except StopIteration as end:
+            return end.value, asked
+        answers = ()
+        for question in helm.questions():
+            asked.append(helm.now)
+            answer = fleet(len(asked) - 1, question)
+            answers = answers if answer is None else (answer,)
+
+
+def test_a_busy_server_is_asked_again_when_it_said() -> None:
+    def fleet(n: int, question: Question) -> Answer:
+        pauses = (0.8, 2.0)
+        if n < len(pauses):
+            return Answer(question.number, None, "busy", pauses[n])
+        return Answer(question.number, RouteAnswer((), "here you go"))
+
+    answer, asked = ask(fleet)
+    assert isinstance(answer.content, RouteAnswer)
+    assert len(asked) == 3
+    # An answer is heard a tick after the question; a tick is the finest that time is told apart.
+    assert asked[1] - asked[0] == pytest.approx(0.9, abs=0.11)
+    assert asked[2] - asked[1] == pytest.approx(2.1, abs=0.11)
+
+
+def test_a_server_that_stays_busy_is_left_with_the_time_it_said() -> None:
+    answer, asked = ask(lambda _, question: Answer(question.number, None, "busy", 1.5), patience=50)
+    assert (answer.content, answer.error, answer.retry_after) == (None, "busy", 1.5)
+    assert len(asked) == 4
+
+
+def test_another_refusal_is_final_and_silence_is_waited_for() -> None:
+    answer, asked = ask(lambda _, question: Answer(question.number, None, "no such node"))
+    assert (answer.error, len(asked)) == ("no such node", 1)
+    answer, asked = ask(lambda *_: None, patience=7)
+    assert (answer.error, len(asked)) == (NO_ANSWER, 1)
+
+
+BEARINGS = tuple(np.linspace(-math.pi, math.pi, 8, endpoint=False).tolist())
+
+
+@pytest.mark.parametrize(
+    ("readings", "most", "freest"),
+    [
+        ([1, 1, 1, 1, 1, 2, 3, 2], math.inf, 6),
+        ([1, 1, 1, 1, 1, 2, 3, 2], 0.5, 0),
+        ([0.3, 0.3, 2, 2, 2, 2.5, 3, 2], 0.5, 2),
+    ],
+)
+def test_it_goes_where_there_is_most_room_or_enough(readings, most, freest) -> None:
+    helm = Helm(RobotDescription(BODY.camera, ranger_bearings=BEARINGS, ranger_reach=3.0))
+    helm.take_in(Observation(0, Odometry(0.0, 0.0), None, np.array(readings, dtype=float)), ())
+    way, direction = helm.freest(most)
+    assert direction == BEARINGS[freest]
+    assert way == min(helm.room(direction), most)
+    assert all(min(helm.room(bearing), most) <= way for bearing in BEARINGS)
+
+
+def test_without_rangers_there_is_no_room() -> None:
+    helm = Helm(BODY)
+    helm.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
+    assert helm.freest() == (0.0, 0.0)
+
+
+def test_a_robot_that_cannot_turn_gives_up() -> None:
+    helm = Helm(BODY)
+    helm.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
+    assert len(list(helm.turn(0.6, 0.6))) <= 32

@@ -1,0 +1,163 @@
+"""The ingest against agents that are played by hand, so that each mishap can be made to happen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hybridmap.node import MapId
+from mapserver.log.agent_log import AgentLog, PullSettings
+from mapserver.log.entry import Applied, Entry
+from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server
+from tests.waiting import eventually
+from wire.bus import Sample
+from wire.log_messages import Ack, LogRequest
+from wire.memory import MemoryHub
+
+
+def test_changes_are_applied_and_acknowledged(server: Server, agent: HandAgent) -> None:
+    for sequence in (1, 2, 3):
+        agent.publish(sequence)
+    eventually(lambda: agent.acks and agent.acks[-1] == Ack(MAP, LOG_ID, 3))
+    eventually(lambda: server.sequences == [1, 2, 3])
+    assert server.store.watermark(MAP) == 3
+
+
+def test_a_change_is_on_the_disk_before_anybody_hears_of_it(server: Server, agent: HandAgent) -> None:
+    stored: list[int] = []
+    server.on_change = lambda change: stored.append(server.store.watermark(MAP) - change.sequence)
+    agent.publish(1)
+    eventually(lambda: stored)
+    assert stored == [0]
+
+
+def test_a_reordered_change_waits_for_its_turn_without_being_pulled(server: Server, agent: HandAgent) -> None:
+    for sequence in (1, 3, 2, 4):
+        agent.publish(sequence)
+    eventually(lambda: server.sequences == [1, 2, 3, 4])
+    assert server.ingest.counters().pulls == 0
+
+
+def test_doubles_are_counted_and_dropped(server: Server, agent: HandAgent) -> None:
+    for sequence in (1, 1, 2, 1, 2, 2):
+        agent.publish(sequence)
+    eventually(lambda: server.ingest.counters().messages == 6)
+    eventually(lambda: server.sequences == [1, 2])
+    assert server.ingest.counters().doubled == 4
+
+
+def test_a_gap_is_pulled_and_only_the_gap(server: Server, agent: HandAgent) -> None:
+    agent.serve(9)
+    agent.publish(1)
+    for sequence in (5, 6):
+        agent.publish(sequence)
+    eventually(lambda: server.sequences == [1, 2, 3, 4, 5, 6])
+    assert agent.asked == [LogRequest(2, 4)]
+
+
+def test_a_beacon_alone_brings_everything_in_chunks(server: Server, agent: HandAgent) -> None:
+    agent.serve(600)
+    agent.beacon(600)
+    eventually(lambda: server.sequences == list(range(1, 601)))
+    assert agent.asked == [LogRequest(1, 256), LogRequest(257, 512), LogRequest(513, 600)]
+    eventually(lambda: agent.acks[-1].watermark == 600)
+
+
+def test_a_shorter_answer_than_asked_for_goes_on_where_it_ends(server: Server, agent: HandAgent) -> None:
+    agent.serve(10, lambda asked: agent.answer(LogRequest(asked.first, min(asked.last, asked.first + 2))))
+    agent.beacon(10)
+    eventually(lambda: server.sequences == list(range(1, 11)))
+    assert [asked.first for asked in agent.asked] == [1, 4, 7, 10]
+
+
+def test_changes_that_the_agent_has_pruned_leave_holes(server: Server, agent: HandAgent) -> None:
+    agent.serve(8)
+    for pruned in (1, 4, 5):
+        del agent.log[pruned]
+    agent.beacon(8)
+    eventually(lambda: server.sequences == [2, 3, 6, 7, 8])
+    assert server.store.watermark(MAP) == 8
+
+
+def test_a_beacon_that_knows_less_is_told_again(server: Server, agent: HandAgent) -> None:
+    agent.publish(1)
+    eventually(lambda: len(agent.acks) == 1)
+    agent.beacon(1, s0=1)
+    agent.beacon(1, s0=0)
+    eventually(lambda: len(agent.acks) == 2)
+    agent.beacon(1)
+    eventually(lambda: len(agent.acks) == 3)
+    assert {ack.watermark for ack in agent.acks} == {1}
+
+
+def test_a_restarted_server_replays_and_goes_on(server: Server, agent: HandAgent) -> None:
+    agent.serve(5)
+    agent.publish(1)
+    agent.publish(2)
+    eventually(lambda: server.sequences == [1, 2])
+    server.end()
+    agent.publish(3)
+    server.seen.clear()
+    server.begin()
+    assert server.sequences == [1, 2], "before anything else"
+    agent.beacon(5)
+    eventually(lambda: server.sequences == [1, 2, 3, 4, 5])
+
+
+def test_two_servers_are_each_complete(
+    hub: MemoryHub, tmp_path: Path, server: Server, agent: HandAgent
+) -> None:
+    other = Server(hub, tmp_path / "s1.sqlite", "s1")
+    agent.serve(5)
+    for sequence in (1, 2, 3, 5):
+        agent.publish(sequence)
+    eventually(lambda: server.sequences == other.sequences == [1, 2, 3, 4, 5])
+    other.end()
+
+
+def test_a_fresh_epoch_is_another_map(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+    agent.publish(1)
+    eventually(lambda: server.sequences == [1])
+    fresh = HandAgent(hub, MapId("r0", 4), 78)
+    fresh.publish(1)
+    fresh.publish(2)
+    eventually(lambda: server.store.watermark(fresh.map) == 2)
+    assert server.store.watermark(MAP) == 1
+    fresh.bus.close()
+
+
+def test_the_pause_doubles_and_a_sign_of_life_ends_it() -> None:
+    one = AgentLog(MAP, 1, PullSettings(grace=0.5, first_pause=1.0, longest_pause=5.0), newest=9)
+    assert one.missing(0.0) is None
+    assert one.missing(0.4) is None
+    assert one.missing(0.5) == LogRequest(1, 9)
+    assert one.missing(0.5) is None, "one at a time"
+    waits = []
+    now = 0.5
+    for _ in range(4):
+        one.pulled(now, gained=False)
+        waits.append(one.pull_at - now)
+        now = one.pull_at
+        assert one.missing(now) is not None
+    assert waits == [1.0, 2.0, 4.0, 5.0]
+    one.pulled(now, gained=False)
+    one.heard(now)
+    assert one.pull_at - now == 1.0
+
+
+def test_memory_for_what_is_ahead_is_bounded() -> None:
+    one = AgentLog(MAP, 1, PullSettings(ahead=10))
+    for sequence in range(2, 100):
+        one.offer(Entry(sequence, b"", "x"))
+    assert len(one.ahead) == 10
+    one.offer(Entry(1, b"", "x"))
+    assert [entry.sequence for entry in one.next_run()] == list(range(1, 12))
+    one.settled(Applied((), (), 5))
+    assert min(one.ahead) == 6
+
+
+def test_what_comes_while_closing_is_no_error(server: Server, agent: HandAgent) -> None:
+    for sequence in range(1, 50):
+        agent.publish(sequence)
+    server.ingest.close()
+    server.ingest.close()
+    server.ingest._work.put(Sample(KEYS.head(MAP), b""))

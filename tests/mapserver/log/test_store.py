@@ -1,0 +1,250 @@
+"""The store: exactly once, in order, and nothing that is half done."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap.camera import Camera
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from hybridmap.errors import InvalidFile, InvalidValue
+from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
+from wire.codec import encode_body, encode_change
+from wire.log_messages import Refusal
+
+MAP, OTHER = MapId("r0", 1), MapId("r1", 1)
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
+HERE = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
+
+
+def node_put(number: int, landmarks: int = 0, map_id: MapId = MAP) -> NodePut:
+    seen = Landmarks(
+        np.zeros((landmarks, 2), np.float32), np.zeros((landmarks, 32), np.uint8),
+        np.full(landmarks, np.nan, np.float32), np.full(landmarks, np.nan, np.float32),
+    )  # fmt: skip
+    return NodePut(Node(NodeId(*map_id, number), 0, HERE, CAMERA, seen))
+
+
+def edge_put(number: int, a: int, b: int, shared: list[tuple[int, int]] | None = None) -> EdgePut:
+    pairs = np.array(shared or [], np.int64).reshape(-1, 2)
+    ends = (NodeId(*MAP, a), NodeId(*MAP, b))
+    return EdgePut(Edge(NodeId(*MAP, number), *ends, HERE, EdgeKind.LOOP, pairs))
+
+
+def entry(sequence: int, body: ChangeBody | None = None) -> Entry:
+    change = Change(MAP, sequence, 7, body or NodeRetired(NodeId(*MAP, sequence)))
+    return Entry.read(MAP, sequence, encode_change(change))
+
+
+def broken(sequence: int) -> Entry:
+    return Entry.read(MAP, sequence, b"\xc1garbage")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "s0.sqlite"
+
+
+@pytest.fixture
+def store(path: Path) -> Iterator[Store]:
+    store = Store(path)
+    yield store
+    store.close()
+
+
+def sequences(store: Store, map_id: MapId = MAP) -> list[int]:
+    return [change.sequence for change in store.replay(map_id)]
+
+
+def test_an_unknown_map_is_empty(store: Store) -> None:
+    assert (store.maps(), store.watermark(MAP), store.log_id(MAP), sequences(store)) == ([], 0, None, [])
+
+
+def test_doubles_are_left_out_and_gaps_stop(store: Store) -> None:
+    assert store.apply(MAP, 5, [entry(1), entry(1), entry(2)]).watermark == 2
+    applied = store.apply(MAP, 5, [entry(1), entry(2), entry(3), entry(5)])
+    assert ([c.sequence for c in applied.changes], applied.watermark) == ([3], 3)
+    assert store.apply(MAP, 5, [entry(5)]).changes == ()
+    assert sequences(store) == [1, 2, 3]
+
+
+def test_an_answer_for_a_range_may_have_holes(store: Store) -> None:
+    applied = store.apply(MAP, 5, [entry(2), entry(5)], covered=7)
+    assert ([c.sequence for c in applied.changes], applied.watermark) == ([2, 5], 7)
+    assert store.apply(MAP, 5, [], covered=3).watermark == 7
+    assert sequences(store) == [2, 5]
+
+
+def test_all_is_there_after_a_restart(path: Path) -> None:
+    store = Store(path)
+    store.apply(MAP, 2**64 - 1, [entry(1, node_put(1, 3)), broken(2), entry(3)])
+    store.apply(OTHER, 5, [])
+    store.close()
+    store = Store(path)
+    assert store.maps() == [MAP, OTHER]
+    assert (store.watermark(MAP), store.log_id(MAP)) == (3, 2**64 - 1)
+    replayed = list(store.replay(MAP))
+    assert [(c.sequence, c.stamp_ns) for c in replayed] == [(1, 7), (3, 7)]
+    assert encode_body(replayed[0].body) == encode_body(node_put(1, 3))
+    assert [refusal.sequence for refusal in store.refusals(MAP)] == [2]
+    store.close()
+
+
+def test_a_bad_change_is_kept_aside_and_the_log_goes_on(store: Store) -> None:
+    applied = store.apply(MAP, 5, [entry(1), broken(2), entry(3)])
+    assert [c.sequence for c in applied.changes] == [1, 3]
+    assert applied.watermark == 3
+    assert [refusal.sequence for refusal in applied.refusals] == [2]
+    assert "MessagePack" in applied.refusals[0].reason
+    assert store.refusals(MAP) == list(applied.refusals)
+    assert store.refused() == 1
+    assert store.apply(MAP, 5, [entry(2)]).changes == (), "it was settled"
+
+
+def test_only_the_newest_refusals_are_given(store: Store) -> None:
+    store.apply(MAP, 5, [broken(k) for k in range(1, 31)])
+    assert [refusal.sequence for refusal in store.refusals(MAP, newest=3)] == [28, 29, 30]
+    assert store.refused() == 30
+
+
+@pytest.mark.parametrize(
+    ("claimed", "sequence"), [(MapId("r1", 1), 1), (MapId("r0", 2), 1), (MapId("r0", 1), 2)]
+)
+def test_a_change_must_be_what_its_sender_says(claimed: MapId, sequence: int) -> None:
+    message = encode_change(Change(MAP, 1, 0, NodeRetired(NodeId(*MAP, 1))))
+    read = Entry.read(claimed, sequence, message)
+    assert isinstance(read.change, str)
+    assert "came as" in read.change
+
+
+def test_another_log_of_the_same_name_is_refused(store: Store) -> None:
+    store.apply(MAP, 5, [entry(1)])
+    with pytest.raises(InvalidValue, match=r"another log goes by the name r0\.1"):
+        store.apply(MAP, 6, [entry(2)])
+    assert sequences(store) == [1]
+
+
+def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None:
+    entries = [
+        entry(1, node_put(1, landmarks=3)),
+        entry(2, edge_put(11, 1, 2, [(2, 500)])),
+        entry(3, node_put(2, landmarks=5)),
+        entry(4, edge_put(12, 1, 2, [(2, 4), (0, 0)])),
+        entry(5, edge_put(13, 1, 2, [(0, 0), (3, 0)])),
+        entry(6, edge_put(14, 1, 2, [(0, 5)])),
+    ]
+    applied = store.apply(MAP, 5, entries)
+    assert applied.refusals == (
+        Refusal(5, "edge r0.1.13 shares landmark 3 of r0.1.1, which has 3"),
+        Refusal(6, "edge r0.1.14 shares landmark 5 of r0.1.2, which has 5"),
+    )
+    assert [c.sequence for c in applied.changes] == [1, 2, 3, 4], "2 is about a node that nobody knows yet"
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.lists(st.integers(1, 12), max_size=8), max_size=12))
+def test_whatever_comes_it_is_a_log(
+    tmp_path_factory: pytest.TempPathFactory, batches: list[list[int]]
+) -> None:
+    """Against the plain meaning: a set of what came, and the longest run from one."""
+    store = Store(tmp_path_factory.mktemp("store") / "s")
+    expected = 0
+    passed_on: list[int] = []
+    for batch in batches:
+        applied = store.apply(MAP, 5, [entry(sequence) for sequence in sorted(batch)])
+        while expected + 1 in batch:
+            expected += 1
+        passed_on += [change.sequence for change in applied.changes]
+        assert applied.watermark == store.watermark(MAP) == expected
+    assert passed_on == sequences(store) == list(range(1, expected + 1))
+    store.close()
+
+
+def test_a_transaction_that_fails_leaves_nothing(path: Path, store: Store) -> None:
+    store.apply(MAP, 5, [entry(1)])
+    # As if the disk were full at the third change of a batch.
+    store._database.connection.execute(
+        "CREATE TRIGGER full BEFORE INSERT ON change WHEN NEW.sequence = 4 "
+        "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+    )
+    with pytest.raises(InvalidFile, match="disk is full"):
+        store.apply(MAP, 5, [entry(2), broken(3), entry(4)])
+    assert (store.watermark(MAP), store.refused(), sequences(store)) == (1, 0, [1])
+    store._database.connection.execute("DROP TRIGGER full")
+    assert store.apply(MAP, 5, [entry(2), broken(3), entry(4)]).watermark == 4
+
+
+def test_what_the_maps_cost_on_the_wire(store: Store) -> None:
+    assert math.isnan(store.traffic().bytes_per_node)
+    bodies: list[ChangeBody] = [node_put(1, 100), node_put(1, 120), node_put(2, 50), edge_put(11, 1, 2)]
+    entries = [entry(k, body) for k, body in enumerate(bodies, 1)]
+    store.apply(MAP, 5, entries)
+    store.apply(MAP, 5, entries)
+    sizes = [len(one.message) for one in entries]
+    traffic = store.traffic(MAP)
+    assert (traffic.nodes, traffic.node_puts, traffic.edge_puts) == (2, 3, 1)
+    assert (traffic.node_bytes, traffic.edge_bytes) == (sum(sizes[:3]), sizes[3])
+    assert traffic.bytes_per_node == pytest.approx(sum(sizes[:3]) / 3)
+    assert store.traffic(OTHER).node_puts == 0
+    assert store.traffic() == traffic
+    other = encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER)))
+    store.apply(OTHER, 5, [Entry.read(OTHER, 1, other)])
+    assert store.traffic().nodes == 3
+    assert store.traffic().payload_bytes == sum(sizes) + len(other)
+
+
+def test_links_can_be_undone_and_made_again(path: Path, store: Store) -> None:
+    links = [edge_put(k, 1, 2).edge for k in (1, 2)]
+    for link in links:
+        store.put_link(link)
+    assert [link.id for link in store.links()] == [link.id for link in links]
+    assert store.undo_link(links[0].id)
+    assert not store.undo_link(links[0].id)
+    assert not store.undo_link(NodeId("r9", 1, 1))
+    store.close()
+    again = Store(path)
+    assert [link.id for link in again.links()] == [links[1].id]
+    assert [link.id for link in again.links(undone=True)] == [links[0].id]
+    again.put_link(links[0])
+    assert len(again.links()) == 2
+    again.close()
+
+
+def test_results_are_kept_by_name(store: Store) -> None:
+    assert store.result("postures") is None
+    store.put_result("postures", b"1")
+    store.put_result("postures", b"2")
+    assert store.result("postures") == b"2"
+
+
+def test_a_journal_is_no_store(tmp_path: Path) -> None:
+    from agent.sharing.journal import Journal
+
+    Journal(tmp_path / "j", "r0").close()
+    with pytest.raises(InvalidFile, match="is not a Mapweave map store"):
+        Store(tmp_path / "j")
+
+
+def test_a_damaged_change_is_found(path: Path, store: Store) -> None:
+    store.apply(MAP, 5, [entry(1), entry(2)])
+    store.close()
+    other = sqlite3.connect(path)
+    other.execute("UPDATE change SET crc = crc + 1 WHERE sequence = 2")
+    other.commit()
+    other.close()
+    store = Store(path)
+    replay = store.replay(MAP)
+    assert next(replay).sequence == 1
+    with pytest.raises(InvalidFile, match=r"change 2 of r0\.1 is damaged"):
+        next(replay)
+    store.close()

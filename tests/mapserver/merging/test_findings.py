@@ -1,0 +1,219 @@
+"""What comparing nodes has found outlives the process, and is believed of nodes that are just so alone."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic import room, take_map
+from hybridmap.change import ChangeBody, EdgePut, NodePut
+from hybridmap.errors import InvalidFile
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from mapserver.merging.findings import PRINT_BYTES, Findings, print_of
+from mapserver.merging.findingsfile import load, save
+from mapserver.merging.findingskeeper import SUFFIX, FindingsKeeper
+from mapserver.merging.merger import Merger, MergerSettings
+from merge.graph.links import Link, RefusedLink
+from merge.graph.merged import MergedMap
+from merge.graph.verification import VerificationSettings
+from merge.incremental.decided import Decided
+from merge.incremental.settings import StepSettings
+from merge.incremental.steps import Steps
+from merge.incremental.verdicts import Verdict
+
+A, B = MapId("a", 1), MapId("b", 1)
+Log = list[tuple[MapId, ChangeBody]]
+
+
+@pytest.fixture(scope="module")
+def logged() -> Log:
+    """Two robots in three rooms, of which they share one."""
+    rng = np.random.default_rng(1)
+    world = room(0, 0, 5, 4, 500, rng) + room(5, 0, 5, 4, 700, rng) + room(10, 0, 5, 4, 500, rng)
+    log: Log = []
+    for map_id, rooms in ((A, (0, 5)), (B, (5, 10))):
+        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.9 * k) for x in rooms for k in range(7)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        log += [(map_id, body) for body in (*map(NodePut, nodes), *map(EdgePut, edges))]
+    return log
+
+
+def read(log: Log, path: Path | None = None) -> Merger:
+    merger = Merger()
+    if path is not None:
+        FindingsKeeper(path).restore(merger)
+    merger.read(log)
+    return merger
+
+
+def saved(merger: Merger, path: Path) -> Path:
+    keeper = FindingsKeeper(path)
+    keeper.save(merger, last=True)
+    return path.with_name(path.name + SUFFIX)
+
+
+def same(one: MergedMap, two: MergedMap) -> bool:
+    """To the last bit."""
+    return (
+        [link.pair for link in one.links] == [link.pair for link in two.links]
+        and [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
+        and list(one.postures) == list(two.postures)
+        and all(
+            place.merged_from_robot.mean == two.postures[node].merged_from_robot.mean
+            and np.array_equal(
+                place.merged_from_robot.covariance, two.postures[node].merged_from_robot.covariance
+            )
+            for node, place in one.postures.items()
+        )
+    )
+
+
+def random_findings(rng: np.random.Generator) -> Findings:
+    nodes = [NodeId(f"r{k % 3}", 1 + k % 2, k) for k in range(12)]
+    pairs = [(a, b) for a in sorted(nodes) for b in sorted(nodes) if a < b and rng.random() < 0.5]
+    verdicts: dict[tuple[NodeId, NodeId], Verdict] = {}
+    for pair in pairs:
+        if rng.random() < 0.5:
+            verdicts[pair] = RefusedLink(*pair, f"only {rng.integers(9)} — zu wenig")
+            continue
+        root = rng.normal(0.0, 1.0, (3, 3))
+        posture = PoseGaussian(Pose2(*rng.normal(0.0, 9.0, 3)), root @ root.T)
+        keys = ["inliers", "share", "sigma_xy"][: int(rng.integers(0, 4))]
+        evidence = {key: float(rng.normal()) for key in keys}
+        verdicts[pair] = Link(*pair, posture, rng.integers(0, 150, (int(rng.integers(0, 9)), 2)), evidence)
+    overlaps = {pair: float(rng.uniform(3, 30)) for pair in pairs}
+    links = [pair for pair, verdict in verdicts.items() if isinstance(verdict, Link)]
+    decided = Decided(frozenset(links[::2]), {node: Pose2(*rng.normal(0.0, 9.0, 3)) for node in nodes[::3]})
+    return Findings({node: rng.bytes(PRINT_BYTES) for node in nodes}, overlaps, verdicts, decided)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_read_is_what_was_saved(seed: int, tmp_path: Path) -> None:
+    one = random_findings(np.random.default_rng(seed))
+    save(tmp_path / "x", one, "me")
+    two = load(tmp_path / "x", "me")
+    assert (two.prints, two.overlaps, two.verdicts.keys()) == (one.prints, one.overlaps, one.verdicts.keys())
+    for pair, verdict in one.verdicts.items():
+        again = two.verdicts[pair]
+        if isinstance(verdict, RefusedLink):
+            assert isinstance(again, RefusedLink) and again.reason == verdict.reason
+            continue
+        assert isinstance(again, Link)
+        assert again.a_from_b.mean == verdict.a_from_b.mean
+        assert np.array_equal(again.a_from_b.covariance, verdict.a_from_b.covariance)
+        assert np.array_equal(again.shared, verdict.shared) and again.shared.dtype == np.int64
+        assert list(again.evidence.items()) == list(verdict.evidence.items())
+    assert (two.decided.believed, two.decided.places) == (one.decided.believed, one.decided.places)
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
+    with pytest.raises(InvalidFile, match="other settings"):
+        load(tmp_path / "x", "somebody else")
+
+
+def test_who_starts_again_compares_nothing_and_merges_the_same(logged: Log, tmp_path: Path) -> None:
+    first = read(logged)
+    merged = first.merged()
+    assert first.counters.verified > 50 and len(merged.components) == 1
+    saved(first, tmp_path / "store")
+    second = read(logged, tmp_path / "store")
+    assert same(merged, second.merged())
+    assert second.counters.verified == 0
+    # It goes on as if nothing had been.
+    saved(second, tmp_path / "store")
+    assert same(merged, read(logged, tmp_path / "store").merged())
+
+
+def test_large_maps_begin_from_what_was_decided(
+    logged: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    always = StepSettings(anew_up_to=0, whole_up_to=0)
+    monkeypatch.setattr("merge.incremental.islands.StepSettings", lambda: always)
+    first = read(logged)
+    merged = first.merged()
+    saved(first, tmp_path / "store")
+    again: list[int] = []
+    real = Steps.resume
+    monkeypatch.setattr(Steps, "resume", lambda *a: (again.append(1), real(*a))[1])
+    after = read(logged, tmp_path / "store").merged()
+    assert again and len(after.components) == len(merged.components)
+    assert [link.pair for link in after.links] == [link.pair for link in merged.links]
+    for node in merged.postures:
+        assert after.pose(node).distance(merged.pose(node)) < 1e-5
+
+
+def test_what_came_later_is_compared_with_all(logged: Log, tmp_path: Path) -> None:
+    first = read(logged[:-20])
+    first.merged()
+    saved(first, tmp_path / "store")
+    whole, again = read(logged), read(logged, tmp_path / "store")
+    assert same(whole.merged(), again.merged())
+    assert 0 < again.counters.verified < 0.8 * whole.counters.verified
+
+
+def test_a_node_that_is_no_longer_just_so_is_compared_again(logged: Log, tmp_path: Path) -> None:
+    first = read(logged)
+    before = first.merged()
+    saved(first, tmp_path / "store")
+    changed = before.links[0].a
+    node = first.node(changed)
+    assert node is not None
+    # Half of what it saw is gone: what links it to others is another posture, or nothing.
+    less = replace(node, landmarks=node.landmarks.take(np.arange(0, len(node.landmarks), 2)))
+    assert print_of(less) != print_of(node)
+    log = [(m, NodePut(less) if isinstance(b, NodePut) and b.node is node else b) for m, b in logged]
+    whole, again = read(log), read(log, tmp_path / "store")
+    assert same(whole.merged(), again.merged()) and not same(before, again.merged())
+    assert 0 < again.counters.verified < 0.5 * whole.counters.verified
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "other", "settings"])
+def test_what_is_damaged_is_made_anew(
+    logged: Log, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = saved_once(logged, tmp_path)
+    data = bytearray(path.read_bytes())
+    if damage == "cut":
+        data = data[: len(data) // 2]
+    elif damage == "flipped":
+        data[len(data) // 2] ^= 1
+    elif damage == "empty":
+        data = bytearray()
+    elif damage == "other":
+        data[:8] = b"whatever"
+    path.write_bytes(bytes(data))
+    settings = MergerSettings(verification=VerificationSettings(most_sigma_xy=0.15))
+    merger = Merger(None, settings if damage == "settings" else None)
+    with caplog.at_level(logging.INFO):
+        FindingsKeeper(tmp_path / "store").restore(merger)
+    assert len(caplog.records) == 1 and "compared anew" in caplog.text
+    merger.read(logged)
+    assert len(merger.merged().components) == 1
+    assert merger.counters.verified > 50
+
+
+def saved_once(logged: Log, tmp_path: Path) -> Path:
+    merger = read(logged)
+    merger.merged()
+    return saved(merger, tmp_path / "store")
+
+
+def test_a_server_that_ends_before_it_has_merged_leaves_the_file_as_it_is(
+    logged: Log, tmp_path: Path
+) -> None:
+    path = saved_once(logged, tmp_path)
+    before = path.read_bytes()
+    saved(read(logged[:10], tmp_path / "store"), tmp_path / "store")
+    assert path.read_bytes() == before
+
+
+def test_a_disk_that_takes_nothing_is_told_of(
+    logged: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    merger = read(logged)
+    merger.merged()
+    FindingsKeeper(tmp_path / "nowhere" / "store").save(merger, last=True)
+    assert "the next start takes longer" in caplog.text

@@ -1,0 +1,233 @@
+"""Every number of an explanation, computed a second time in another way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic import room, take_map
+from hybridmap.change import EdgePut, NodePut, NodeRetired
+from hybridmap.errors import InvalidValue
+from hybridmap.explanation import Standing
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.ruling import Ruling, Rulings
+from mapserver.merging.merger import Merger
+from merge.belief.consistency import ConsistencySettings
+from merge.belief.credence import FLOOR, LEAST_AREA, credences, prior_odds, standpoints
+from merge.belief.cutting import fragments_of
+from merge.explaining.explanation import explain_nodes
+from merge.explaining.maps import explain_fleet, explain_maps
+from merge.explaining.parting import joinings, partings
+from merge.graph.links import Link
+from merge.graph.merged import MergedMap
+from merge.graph.posegraph import LEAST_SIGMAS, Measurement, solve_graph
+
+A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
+
+
+@pytest.fixture(scope="module")
+def merged() -> MergedMap:
+    """Two robots in two rooms, of which they share one; a third in a room of its own."""
+    return fleet().merged()
+
+
+def fleet() -> Merger:
+    rng = np.random.default_rng(5)
+    world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng) + room(20, 0, 5, 4, 600, rng)
+    merger = Merger()
+    for map_id, rooms in ((A, (0, 5)), (B, (5,)), (C, (20,))):
+        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    return merger
+
+
+def between(merged: MergedMap) -> list[Link]:
+    return [link for link in merged.links if not link.within]
+
+
+def test_residuals_are_those_of_the_pinhole(merged: MergedMap) -> None:
+    link = between(merged)[0]
+    told = explain_nodes(merged, link.b, link.a)
+    assert told.standing is Standing.LINKED and (told.a.id, told.b.id) == link.pair
+    a, b, camera = told.a.landmarks, told.b.landmarks, told.a.camera
+    x, y, heading = link.a_from_b.mean.vector
+    turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+    for (i, j), residual in zip(told.shared, told.residuals_px, strict=True):
+        here, there, inverse = (a, b, False) if np.isfinite(a.depths[i]) else (b, a, True)
+        k, other = (j, i) if inverse else (i, j)
+        depth = float(here.depths[k])
+        u, v = here.pixels[k]
+        point = np.array([depth + camera.mount_forward, -(u - camera.cx) / camera.fx * depth])
+        height = camera.mount_height - (v - camera.cy) / camera.fy * depth
+        seen = turn @ point + [x, y] if inverse else turn.T @ (point - [x, y])
+        ahead = seen[0] - camera.mount_forward
+        predicted = [
+            camera.cx - camera.fx * seen[1] / ahead,
+            camera.cy - camera.fy * (height - camera.mount_height) / ahead,
+        ]
+        assert residual == pytest.approx(np.linalg.norm(predicted - there.pixels[other]), abs=1e-3)
+    assert {tuple(pair) for pair in told.shared} <= {tuple(pair) for pair in told.matches}
+
+
+def test_the_misfit_is_the_difference_to_the_merged_postures(merged: MergedMap) -> None:
+    for link in between(merged)[:5]:
+        misfit = explain_nodes(merged, *link.pair).misfit
+        assert misfit is not None
+        a, b = (merged.postures[node].merged_from_robot.mean for node in link.pair)
+        off = (link.a_from_b.mean.inverse() @ a.inverse() @ b).vector
+        assert np.allclose(misfit.off, off, atol=1e-12)
+        own = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2)
+        assert misfit.strain2 == pytest.approx(off @ np.linalg.inv(own) @ off, rel=1e-9)
+        assert not misfit.alone
+
+
+def without(merged: MergedMap, left_out: Link | None) -> PoseGaussian:
+    """The relative posture of a link's nodes in a graph that is solved anew without it."""
+    assert left_out is not None
+    measurements = [m for fragment in fragments_of(merged.maps) for m in fragment.measurements]
+    measurements += [
+        Measurement(*link.pair, link.a_from_b, robust=True) for link in merged.links if link is not left_out
+    ]
+    graph = solve_graph(left_out.a, Pose2(), measurements)
+    found = graph.relative([left_out.a], [left_out.b])
+    return PoseGaussian(Pose2.from_vector(found.means[0]), found.covariances[0])
+
+
+def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap) -> None:
+    links = between(merged)
+    graph = merged.graphs[0]
+    found = standpoints(links, graph, kept=True)
+    area = max(np.prod(np.ptp(graph.means[:, :2], axis=0)), LEAST_AREA)
+    for link, one in list(zip(links, found, strict=True))[::3]:
+        rest = without(merged, link)
+        off = (link.a_from_b.mean.inverse() @ rest.mean).vector
+        spread = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2) + rest.covariance + FLOOR
+        density = math.exp(-0.5 * off @ np.linalg.inv(spread) @ off) / math.sqrt(
+            np.linalg.det(2 * np.pi * spread)
+        )
+        # The graph is not quite linear, and without a link the others are weighed a little otherwise.
+        assert one.log_factor == pytest.approx(math.log(density * area * 2 * np.pi), abs=0.1)
+
+
+def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap) -> None:
+    link = between(merged)[0]
+    graph = solve_graph(
+        link.a,
+        Pose2(),
+        [m for f in fragments_of(merged.maps) for m in f.measurements]
+        + [Measurement(*link.pair, link.a_from_b, robust=True)],
+    )
+    (found,) = standpoints([link], graph, kept=True)
+    assert found.alone and found.log_factor == 0.0
+
+
+def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap) -> None:
+    rng = np.random.default_rng(1)
+    true = credences(merged)
+    assert len(true) == len(merged.links) and min(true.values()) > 0.9
+    links = between(merged)
+    shifted = [
+        Link(x.a, x.b, PoseGaussian(x.a_from_b.mean @ Pose2(*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)),
+             x.a_from_b.covariance), x.shared, x.evidence)
+        for x in links
+    ]  # fmt: skip
+    assert all(one.log_factor < -10 for one in standpoints(shifted, merged.graphs[0], kept=False))
+    assert prior_odds(merged) > 1
+
+
+def test_witnesses_close_loops_as_postures_composed_one_by_one(merged: MergedMap) -> None:
+    link = between(merged)[1]
+    told = explain_nodes(merged, *link.pair)
+    s = ConsistencySettings()
+    by_pair = {other.pair: other for other in merged.links}
+    pieces = {node: fragment for fragment in fragments_of(merged.maps) for node in fragment.nodes}
+    assert len(told.witnesses) >= 3
+    for witness in told.witnesses:
+        if (witness.a, witness.b) not in by_pair:
+            continue
+        # The merge begins each loop at the smaller pair.
+        one, other = sorted([link, by_pair[witness.a, witness.b]], key=lambda x: x.pair)
+        back = pieces[one.b].graph.relative([one.b], [other.b])
+        home = pieces[one.a].graph.relative([other.a], [one.a])
+        there, here = (PoseGaussian(Pose2.from_vector(r.means[0]), r.covariances[0]) for r in (back, home))
+        loop = one.a_from_b @ there @ other.a_from_b.inverse() @ here
+        floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+        distance2 = PoseGaussian(loop.mean, loop.covariance + floor).mahalanobis2(Pose2())
+        assert witness.distance2 == pytest.approx(distance2, rel=1e-6)
+        assert witness.agrees == (distance2 < s.gate) and witness.kept
+
+
+def test_what_was_refused_says_what_it_lacks(merged: MergedMap) -> None:
+    refused = next(r for r in merged.refused if r.link is None and r.edge is None)
+    told = explain_nodes(merged, refused.a, refused.b)
+    assert (told.standing, told.reason) == (Standing.REFUSED, refused.reason)
+    assert told.probability is None and len(told.matches) > 0
+
+
+def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> None:
+    nodes = sorted(merged.maps[A].nodes)
+    told = explain_nodes(merged, nodes[0], sorted(merged.maps[C].nodes)[0])
+    assert told.standing is Standing.UNCOMPARED and "compared now: " in told.reason
+    neighbours = explain_nodes(merged, nodes[0], nodes[1])
+    assert any("while it mapped" in claim or "turned" in claim for claim in neighbours.claims)
+
+
+def test_two_maps(merged: MergedMap) -> None:
+    one = explain_maps(merged, B, A)
+    assert one.joined and one.links == len(between(merged)) and "are one map" in one.reason
+    assert one.landmarks == sum(int(link.evidence["inliers"]) for link in between(merged))
+    apart = explain_maps(merged, A, C)
+    assert not apart.joined and "are not one map" in apart.reason
+    assert apart.unverified == sum({r.a.map, r.b.map} == {A, C} for r in merged.refused)
+    assert [e.joined for e in explain_fleet(merged, 10)] == [False, False, True]
+
+
+def test_what_people_ruled_is_told() -> None:
+    merger = fleet()
+    link = between(merger.merged())[0]
+    ruling = Ruling(link.pair, True, "anna", 0, "no")
+    merger.rule(Rulings([ruling]))
+    told = explain_nodes(merger.merged(), *link.pair)
+    assert told.standing is Standing.UNDONE and told.rulings == (ruling,)
+    assert told.probability is not None and told.probability > 0.9, (
+        "a ruling changes nothing of what was seen"
+    )
+    merger.rule(Rulings([Ruling((A, B), True, "anna", 0, "no")]))
+    apart = explain_maps(merger.merged(), A, B)
+    assert not apart.joined and "undone" in apart.reason and len(apart.nearest) == 5
+
+
+def test_a_merge_that_loses_its_support_says_so() -> None:
+    merger = fleet()
+    alone = MergedMap.empty()
+    before = merger.merged()
+    assert partings(before, before) == () == joinings(before, before)
+    (joined,) = [one for one in joinings(alone, before) if "a.1 and b.1" in one]
+    assert joined == f"a.1 and b.1 are one map now, by {len(between(before))} links"
+    merger.rule(Rulings([Ruling((A, B), True, "anna", 0, "no")]))
+    (words,) = partings(before, merger.merged())
+    assert words.startswith("a.1 and b.1 are no longer one map: ") and "refused (undone" in words
+    merger.rule(Rulings())
+    for node in before.maps[B].nodes:
+        merger.apply(B, NodeRetired(node))
+    assert partings(before, merger.merged()) == ()  # a map without nodes is part of nothing
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "words"),
+    [
+        (NodeId("a", 1, 1), NodeId("a", 1, 1), "give two nodes"),
+        (NodeId("z", 1, 1), NodeId("a", 1, 1), "there is no map z.1; known are: a.1, b.1, c.1"),
+        (NodeId("a", 1, 99), NodeId("a", 1, 1), "map a.1 has no node 99; its 12 nodes are 1 to 23"),
+    ],
+)
+def test_what_is_not_there_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str) -> None:
+    with pytest.raises(InvalidValue, match=words):
+        explain_nodes(merged, a, b)
+    with pytest.raises(InvalidValue, match="two maps"):
+        explain_maps(merged, A, A)
