@@ -79,6 +79,8 @@ def main() -> None:
     try:
         if arguments.runs < 1 or arguments.seed < 0 or arguments.split < 2:
             raise InvalidValue("--runs is at least 1, --seed at least 0, --split at least 2")
+        if arguments.scale is not None and (arguments.g2o or arguments.robots):
+            raise InvalidValue("--scale runs by itself: leave out --g2o and --robots")
         if arguments.scale is not None:
             _scale(arguments, console)
             return
@@ -225,7 +227,10 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--split", type=int, default=4, help="robots among which they are split (default 4)")
     parser.add_argument("--robots", type=Path, nargs="*", default=[], help="folders of one g2o file a robot")
     parser.add_argument(
-        "--scale", type=int, nargs="*", help="nodes of fleets at scale, in hundreds (default 300 1000)"
+        "--scale",
+        type=int,
+        nargs="*",
+        help="nodes of fleets at scale, in hundreds (300 1000); by itself",
     )
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     return parser.parse_args()

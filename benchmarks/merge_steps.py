@@ -28,6 +28,8 @@ NODES_A_MAP = 100
 ACTIVE = 4
 """Robots that go on mapping."""
 STEPS = 40
+LOOSE_SIGMA = 1.0
+"""m and rad, how loosely iSAM2 holds each map's first node: it refuses maps that nothing ties yet."""
 Figures = dict[str, float]
 
 
@@ -150,8 +152,7 @@ class Isam2:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         first = not self._means.any()
         if first:
-            held = gtsam.noiseModel.Isotropic.Sigma(3, ANCHOR_SIGMA)
-            graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*guesses[0]), held))
+            hold(graph, new, guesses)
         for row, guess in zip(new.tolist(), guesses, strict=True):
             values.insert(row, gtsam.Pose2(*guess))
         add_between(graph, part)
@@ -166,6 +167,20 @@ class Isam2:
         return self._means.copy()
 
 
+def hold(graph: Any, rows: NDArray[np.int64], poses: Array) -> None:
+    """Hold the first node, and every other map's first one loosely.
+
+    Args:
+        graph: of GTSAM.
+        rows: (K,) of nodes.
+        poses: (K, 3) m, m, rad, where they are held.
+    """
+    for row, pose in zip(rows.tolist(), poses, strict=True):
+        if row % NODES_A_MAP == 0:
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, LOOSE_SIGMA if row else ANCHOR_SIGMA)
+            graph.add(gtsam.PriorFactorPose2(row, gtsam.Pose2(*pose), noise))
+
+
 def add_between(graph: Any, part: Factors) -> None:
     """Put measurements into a GTSAM graph."""
     for a, b, mean, weight in zip(part.a.tolist(), part.b.tolist(), part.means, part.weights, strict=True):
@@ -176,8 +191,7 @@ def add_between(graph: Any, part: Factors) -> None:
 def batch(growth: Growth, start: Array) -> float:
     """Chi-square at GTSAM's batch optimum."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    held = gtsam.noiseModel.Isotropic.Sigma(3, ANCHOR_SIGMA)
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start[0]), held))
+    hold(graph, np.zeros(1, np.int64), start[:1])
     add_between(graph, growth.factors)
     for row, pose in enumerate(start):
         values.insert(row, gtsam.Pose2(*pose))

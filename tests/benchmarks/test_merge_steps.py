@@ -1,15 +1,18 @@
 """Steps beside iSAM2: all end near the batch optimum, and all is told."""
 
 import numpy as np
+import pytest
 from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.merge_steps import STEPS, Growth, stepping
 
 
-def test_all_end_near_the_optimum() -> None:
+@pytest.mark.parametrize("seed", [2, 3])
+def test_all_end_near_the_optimum(seed: int) -> None:
+    """With seed 3 a map begins that nothing ties to the others yet."""
     with Progress(console=Console(quiet=True)) as progress:
-        found = stepping(400, 2, progress)
+        found = stepping(400, seed, progress)
     assert set(found) == {"mapweave", "isam2", "isam2_exact"}
     for figures in found.values():
         assert 1.0 - 1e-6 < figures["cost_ratio"] < 1.01
