@@ -75,4 +75,5 @@ class FindingsKeeper:
 
 
 def _made_by(merger: Merger) -> str:
-    return f"{version('mapweave')} {merger.settings.candidates} {merger.settings.verification}"
+    settings = merger.settings
+    return f"{version('mapweave')} {settings.candidates} {settings.verification} {settings.merging}"

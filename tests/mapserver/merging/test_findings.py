@@ -25,6 +25,7 @@ from merge.incremental.decided import Decided
 from merge.incremental.settings import StepSettings
 from merge.incremental.steps import Steps
 from merge.incremental.verdicts import Verdict
+from merge.merging import MergeSettings
 
 A, B = MapId("a", 1), MapId("b", 1)
 Log = list[tuple[MapId, ChangeBody]]
@@ -170,7 +171,7 @@ def test_a_node_that_is_no_longer_just_so_is_compared_again(logged: Log, tmp_pat
     assert 0 < again.counters.verified < 0.5 * whole.counters.verified
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "other", "settings"])
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "other", "verification", "merging"])
 def test_what_is_damaged_is_made_anew(
     logged: Log, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -185,8 +186,12 @@ def test_what_is_damaged_is_made_anew(
     elif damage == "other":
         data[:8] = b"whatever"
     path.write_bytes(bytes(data))
-    settings = MergerSettings(verification=VerificationSettings(most_sigma_xy=0.15))
-    merger = Merger(None, settings if damage == "settings" else None)
+    settings = {
+        "verification": MergerSettings(verification=VerificationSettings(most_sigma_xy=0.15)),
+        # What large islands had decided was decided by other rules.
+        "merging": MergerSettings(merging=MergeSettings(strain=20.0)),
+    }
+    merger = Merger(None, settings.get(damage))
     with caplog.at_level(logging.INFO):
         FindingsKeeper(tmp_path / "store").restore(merger)
     assert len(caplog.records) == 1 and "compared anew" in caplog.text
