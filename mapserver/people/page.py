@@ -14,7 +14,7 @@ PAGE = """<!doctype html>
   input[type=file] { font: inherit; max-width: 100% }
   #result { margin-top: 1rem; padding: .8rem 1rem; border-radius: .5rem; background: #fff;
             border-left: .4rem solid #9aa7b4; min-height: 1.5rem }
-  #result.found { border-color: #2a8f5b } #result.ambiguous { border-color: #d29a1c }
+  #result.found { border-color: #2a8f5b } #result.ambiguous, #result.place { border-color: #d29a1c }
   #result.failed { border-color: #c0392b }
   table { border-collapse: collapse; margin-top: .6rem; font-size: .95rem }
   td, th { text-align: left; padding: .1rem .8rem .1rem 0 }
@@ -42,7 +42,8 @@ function table(candidates) {
   }
   for (const c of candidates) {
     const [x, y, turn] = c.node_from_robot;
-    table.insertRow().append(cell(c.node), cell(x.toFixed(2) + " m"), cell(y.toFixed(2) + " m"),
+    const away = m => cell(c.distance_known ? m.toFixed(2) + " m" : "not known");
+    table.insertRow().append(cell(c.node), away(x), away(y),
       cell((turn * 180 / Math.PI).toFixed(0) + "\\u00b0"), cell((100 * c.probability).toFixed(0) + " %"));
   }
   return table;

@@ -26,7 +26,7 @@ def add_to(commands: Any) -> None:
         "relocalize",
         help="ask a running server where an image was taken",
         description="Extract an image's features and ask the map server where it was taken. "
-        "Exit status 0: found; 2: unknown or ambiguous; 1: could not ask.",
+        "Exit status 0: found; 2: unknown, ambiguous, or the place without a posture; 1: could not ask.",
     )
     parser.add_argument("image", type=Path, help="png, jpg, pgm or bmp")
     parser.add_argument(

@@ -20,6 +20,12 @@ ANSWER = RelocalizeAnswer(
     "31 landmarks of r0.1.7 agree",
 )
 
+PLACE = RelocalizeAnswer(
+    Certainty.PLACE,
+    (Whereabouts(NodeId("r0", 1, 7), HERE, None, -1, 31, 0.9, distance_known=False),),
+    "31 landmarks of r0.1.7, which has no depths, agree",
+)
+
 
 class Desk:
     """Answers everything alike and remembers what was asked, or does what the test says."""
@@ -27,6 +33,7 @@ class Desk:
     def __init__(self) -> None:
         self.views: list[View] = []
         self.refusal: Exception | None = None
+        self.answer = ANSWER
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()
@@ -36,7 +43,7 @@ class Desk:
             self.views.append(look())
             if self.refusal is not None:
                 raise self.refusal
-            done.set_result(ANSWER)
+            done.set_result(self.answer)
         except Exception as error:  # noqa: BLE001 - as a worker would
             done.set_exception(error)
         return done

@@ -10,7 +10,7 @@ import pytest
 from hybridmap.errors import Busy, InvalidValue
 from mapserver.people.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.desks import Desk, picture
+from tests.mapserver.desks import PLACE, Desk, picture
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -58,6 +58,13 @@ def test_a_picture_is_answered_on_the_page(page: Browser, desk: Desk, image: Pat
     ]
     assert page.run("return document.getElementById('shown').naturalWidth") == 160
     assert desk.views[-1].camera.fx == pytest.approx(80.0)
+
+
+def test_no_distance_is_shown_that_nobody_knows(page: Browser, desk: Desk, image: Path) -> None:
+    desk.answer = PLACE
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "place")
+    assert page.run(ROWS)[1] == ["r0.1.7", "not known", "not known", "6°", "90 %"]
 
 
 def test_what_goes_wrong_is_said_on_the_page(page: Browser, desk: Desk, image: Path) -> None:
