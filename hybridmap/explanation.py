@@ -17,6 +17,8 @@ class Standing(StrEnum):
     """What has become of two nodes."""
 
     LINKED = "linked"
+    OWN = "own"
+    """Joined by an edge of their robot's own map: it drove or turned there, or recognised the place."""
     REFUSED = "refused"
     """Compared, and not linked."""
     UNDONE = "undone"
@@ -102,14 +104,14 @@ class PairExplanation:
 
 @dataclass(frozen=True, slots=True)
 class NearMiss:
-    """Two nodes of two maps that came near to being linked.
+    """Two nodes of two maps that came near to being linked, or are and might as well not be.
 
     Attributes:
         a: node of the first map.
         b: node of the second.
         matches: landmarks that look alike.
         inliers: of these, those that agree on the best posture.
-        lacks: what it lacks, in words.
+        lacks: what it lacks, in words; of a link that stands, whether routes may use it.
     """
 
     a: NodeId
@@ -132,7 +134,8 @@ class MapsExplanation:
         landmarks: behind these.
         refused: links that were found and refused.
         unverified: pairs that looked alike and showed no common posture.
-        nearest: pairs that came nearest to a link, best first; of links that were refused, then of others.
+        nearest: pairs that came nearest to a link, best first; of links that were refused, then of others. Of
+            two maps that are one the links with the fewest landmarks behind them, weakest first.
         rulings: what people have ruled about the two maps, in order.
     """
 

@@ -5,14 +5,18 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
 
 from hybridmap.errors import InvalidFile, InvalidMessage
+from hybridmap.explanation import MapsExplanation, PairExplanation
 from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import Ruling, Rulings
+from hybridmap.ruling import Ends, Ruling, Rulings
 from mapserver.answers import Answers
 from mapserver.desk import Desk
 from mapserver.log.store import Store
 from mapserver.services import guarded
+from merge.belief.consistency import ConsistencySettings
 from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
 from merge.undoing import check_ruling, reason_of
@@ -32,6 +36,7 @@ log = logging.getLogger(__name__)
 
 NAME = "rulings"
 """In the store."""
+Told = TypeVar("Told", PairExplanation, MapsExplanation)
 
 
 class RulingBook:
@@ -78,6 +83,8 @@ class Explainer:
         desk: Desk,
         book: RulingBook,
         rule: Callable[[Rulings], None],
+        settled: Callable[[], bool],
+        consistency: ConsistencySettings,
     ) -> None:
         """Begin to answer.
 
@@ -89,11 +96,15 @@ class Explainer:
             desk: explanations compare nodes, which takes long.
             book: where rulings are kept.
             rule: told all rulings whenever there is a new one.
+            settled: whether the newest answers know all that has come.
+            consistency: as in the merge.
         """
         self._answers = answers
         self._desk = desk
         self._book = book
         self._rule = rule
+        self._settled = settled
+        self._consistency = consistency
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
@@ -110,14 +121,24 @@ class Explainer:
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _explain(self, payload: bytes) -> bytes:
-        ends = decode_explain_request(payload).ends
+        told = self.explain(decode_explain_request(payload).ends)
+        return encode_pair(told) if isinstance(told, PairExplanation) else encode_maps(told)
+
+    def explain(self, ends: Ends | None) -> PairExplanation | tuple[MapsExplanation, ...]:
+        """Why two nodes or two maps are linked, or are not; without ends, each two maps. Takes its time.
+
+        Raises:
+            InvalidValue: they are not there.
+        """
+        # Asked first: what comes meanwhile may be missing in the answers.
+        settled = self._settled()
         merged = self._answers().merged
         if ends is None:
-            return encode_maps(explain_fleet(merged, MAX_MAPS_TOLD))
+            return tuple(_still(one, settled) for one in explain_fleet(merged, MAX_MAPS_TOLD))
         first, second = ends
         if isinstance(first, NodeId) and isinstance(second, NodeId):
-            return encode_pair(explain_nodes(merged, first, second))
-        return encode_maps((explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),))
+            return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
+        return (_still(explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])), settled),)
 
     def _decree(self, payload: bytes) -> bytes:
         ruling = decode_ruling(payload)
@@ -128,6 +149,11 @@ class Explainer:
         said = said_of(ruling)
         log.warning("%s", said)
         return encode_record({"said": said})
+
+
+def _still(told: Told, settled: bool) -> Told:
+    """What was not found yet is not said to be missing."""
+    return told if settled else replace(told, reason=f"{told.reason} (still merging: ask again)")
 
 
 def said_of(ruling: Ruling) -> str:

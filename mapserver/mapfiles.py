@@ -14,6 +14,7 @@ from merge.belief.cutting import fragments_of
 from merge.belief.joining import Solver
 from merge.graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
 from merge.graph.merged import MergedMap, Placement
+from merge.merging import MergeSettings
 from merge.undoing import undo
 from wire.codec import element_of
 from wire.mapfile import MapFile, RefusedPair
@@ -38,6 +39,7 @@ def map_file_of(merged: MergedMap) -> MapFile:
         tuple(RefusedPair(r.a, r.b, r.reason, _edge(merged, r)) for r in merged.refused),
         merged.rulings.made,
         merged.superseded,
+        merged.faded,
     )
 
 
@@ -52,14 +54,19 @@ def maps_of(content: MapFile) -> dict[MapId, HybridMap]:
     return maps
 
 
-def merged_of(content: MapFile) -> MergedMap:
+def merged_of(content: MapFile, settings: MergeSettings | None = None) -> MergedMap:
     """The merged map that a file holds: links and refusals as they are, postures and covariances solved anew.
 
     Nothing is judged again, so a file is explained by what was decided when it was made.
+
+    Args:
+        content: of the file.
+        settings: with which it was merged.
     """
+    s = settings or MergeSettings()
     maps, rulings = maps_of(content), Rulings(content.rulings)
     links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
-    solved = Solver(fragments_of(undo(maps, (), rulings).maps)).solve(links)
+    solved = Solver(fragments_of(undo(maps, (), rulings).maps, s.consistency, s.strain), s.huber).solve(links)
     postures = {
         node: Placement(number, posture)
         for number, graph in enumerate(solved)
@@ -68,8 +75,9 @@ def merged_of(content: MapFile) -> MergedMap:
     refused = tuple(_refused(pair) for pair in content.refused)
     components = tuple(frozenset(graph.nodes) for graph in solved)
     superseded = {node: fate for node, fate in content.superseded.items() if node in postures}
+    faded = {node: gone for node, gone in content.faded.items() if node in postures}
     parts = dict(sorted(maps.items()))
-    return MergedMap(parts, links, refused, components, postures, tuple(solved), rulings, superseded)
+    return MergedMap(parts, links, refused, components, postures, tuple(solved), rulings, superseded, faded)
 
 
 def _is_link(edge: Edge) -> bool:

@@ -109,8 +109,10 @@ class MapServer:
             self._bus, self._keys, self._name, self._in_step, self._desk, self._blockages, self.status
         )
         self._explainer = Explainer(
-            self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule
-        )
+            self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule,
+            # In lock-step whoever asks waits until all is merged.
+            lambda: self._settings.lockstep or self._upkeep.settled, self._settings.merge.consistency,
+        )  # fmt: skip
         # Wall time again: what is told now and then would not repeat itself.
         self._herald = None if self._settings.lockstep else Herald(self._bus, self._keys, self._name)
         self._teller.start()

@@ -16,6 +16,7 @@ MOST_WITNESSES = 12
 """Lines of other links; `--json` has all."""
 TITLES = {
     Standing.LINKED: "are linked",
+    Standing.OWN: "are joined",
     Standing.REFUSED: "are not linked",
     Standing.UNDONE: "are not linked",
     Standing.UNCOMPARED: "were not compared by the merge",
@@ -25,9 +26,12 @@ TITLES = {
 def pair_words(told: PairExplanation) -> list[str]:
     """The explanation of two nodes, line by line."""
     lines = [f"{told.a.id} and {told.b.id} {TITLES[told.standing]}: {told.reason}"]
+    # What a robot followed on its way need not look alike at both ends.
+    followed = told.standing is Standing.OWN and "inliers" not in told.evidence
+    agree = "were followed on the way" if followed else "agree on one posture"
     lines.append(
         f"  landmarks     {len(told.a.landmarks)} and {len(told.b.landmarks)}; "
-        f"{len(told.matches)} look alike, {len(told.shared)} agree on one posture"
+        f"{len(told.matches)} look alike, {len(told.shared)} {agree}"
     )
     if told.a_from_b is not None:
         lines.append(f"  b seen from a {_posture(told.a_from_b)}")
@@ -46,10 +50,10 @@ def pair_words(told: PairExplanation) -> list[str]:
     if told.probability is not None:
         percent = _percent(told.probability)
         lines.append(f"  probability   {percent} that it is right, judged for itself by the rest of the map")
-    agree = sum(witness.agrees for witness in told.witnesses)
     if told.witnesses:
+        count = sum(witness.agrees for witness in told.witnesses)
         lines.append(
-            f"  other links   {agree} of {len(told.witnesses)} between the same pieces of map agree:"
+            f"  other links   {count} of {len(told.witnesses)} between the same pieces of map agree:"
         )
     for witness in sorted(told.witnesses, key=lambda w: w.distance2)[:MOST_WITNESSES]:
         word = "agrees" if witness.agrees else "contradicts"
@@ -70,7 +74,7 @@ def maps_words(told: MapsExplanation) -> list[str]:
             f"  {told.refused} links refused, {told.unverified} alike pairs without a common posture"
         )
     if told.nearest:
-        lines.append("  nearest to a link:")
+        lines.append("  weakest links:" if told.joined else "  nearest to a link:")
     lines += [f"    {_near(near)}" for near in told.nearest]
     lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
     return lines

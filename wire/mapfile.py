@@ -23,13 +23,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from hybridmap.change import ChangeBody, EdgePut
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import Edge, NodeId
 from hybridmap.pose import PoseGaussian
 from hybridmap.ruling import Ruling
 from hybridmap.superseded import Superseded
 from wire.codec import MAX_BODY_BYTES, decode_body, encode_body
+from wire.landmark_codec import MAX_LANDMARKS
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import POSTURE, pack_posture, unpack_posture
 from wire.ruling_codec import pack_ruling, read_ruling
@@ -75,6 +79,7 @@ class MapFile:
         refused: of a merged map: pairs that were not linked. Edges of robots that are refused are only here.
         rulings: of people on what shall not be linked, in order.
         superseded: of a merged map: nodes that newer ones stand for.
+        faded: of a merged map: (N,) which of a node's N landmarks are thought to be gone.
     """
 
     kind: Kind
@@ -84,6 +89,7 @@ class MapFile:
     refused: tuple[RefusedPair, ...] = ()
     rulings: tuple[Ruling, ...] = ()
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
+    faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
 
 
 def write_map_file(path: Path, content: MapFile) -> None:
@@ -190,6 +196,10 @@ def _pack(content: MapFile) -> bytes:
                 [list(node), list(fate.by), fate.found, fate.distance, fate.turn]
                 for node, fate in content.superseded.items()
             ],
+            "faded": [
+                [list(node), np.packbits(gone, bitorder="little").tobytes()]
+                for node, gone in content.faded.items()
+            ],
         }
     )
 
@@ -224,8 +234,13 @@ def _unpack(content: bytes) -> MapFile:
         _read_superseded(reader, value)
         for value in (reader.array("superseded", MAX_ELEMENTS) if reader.has("superseded") else [])
     )
+    sizes = {body.node.id: len(body.node.landmarks) for body in changes if isinstance(body, NodePut)}
+    faded = dict(
+        _read_faded(reader, value, sizes)
+        for value in (reader.array("faded", MAX_ELEMENTS) if reader.has("faded") else [])
+    )
     title = reader.text("title", MAX_TITLE)
-    return MapFile(kinds[name], title, changes, postures, refused, rulings, superseded)
+    return MapFile(kinds[name], title, changes, postures, refused, rulings, superseded, faded)
 
 
 def _read_refused(reader: Reader, value: Any) -> RefusedPair:
@@ -251,6 +266,21 @@ def _read_superseded(reader: Reader, value: Any) -> tuple[NodeId, Superseded]:
     found = reader.as_integer(parts[2], "landmarks", 0, MAX_NUMBER)
     distance, turn = (reader.as_number(part, "distance or turn", 0.0, 1e6) for part in parts[3:5])
     return node, Superseded(by, found, distance, turn)
+
+
+def _read_faded(reader: Reader, value: Any, sizes: Mapping[NodeId, int]) -> tuple[NodeId, NDArray[np.bool_]]:
+    parts = reader.as_array(value, "faded landmarks", 32)
+    if len(parts) < 2:
+        raise reader.error("faded landmarks must be [node, bits]")
+    node = reader.as_node_id(parts[0], "node")
+    count = sizes.get(node)
+    if count is None:
+        raise reader.error(f"landmarks of {node} have faded, which is not there")
+    bits = reader.as_binary(parts[1], "bits", MAX_LANDMARKS)
+    if len(bits) != -(-count // 8):
+        raise reader.error(f"{len(bits)} bytes of faded landmarks do not fit the {count} of {node}")
+    packed = np.frombuffer(bits, np.uint8)
+    return node, np.unpackbits(packed, count=count, bitorder="little").astype(np.bool_)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -90,19 +90,28 @@ class Recognition:
         return len(self.pairs)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Refusal:
     """A place was not recognised.
 
     Attributes:
         reason: in words.
         matches: mutual matches.
-        inliers: of the best posture, 0 without one.
+        pairs: (K, 2) int64, landmarks that agree on the best posture; none without one.
+        node_from_robot: the best posture, which was not good enough; None if nothing agrees on any.
+        evidence: the numbers by which it was refused; empty without a posture.
     """
 
     reason: str
     matches: int
-    inliers: int = 0
+    pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    node_from_robot: PoseGaussian | None = None
+    evidence: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def inliers(self) -> int:
+        """How many landmarks agree."""
+        return len(self.pairs)
 
 
 def recognise(
@@ -199,7 +208,8 @@ def _examine(
     backward = ~forward & b.has_depth[pairs[:, 1]]
     usable = np.concatenate([pairs[forward], pairs[backward]])
     if len(usable) < s.least_inliers:
-        words = f"{len(pairs)} features match, {len(usable)} with a depth; {s.least_inliers} are needed"
+        many = "1 feature matches" if len(pairs) == 1 else f"{len(pairs)} features match"
+        words = f"{many}, {len(usable)} with a depth; {s.least_inliers} are needed"
         return Refusal(words, len(pairs))
     sightings = [
         _sightings(a, camera_a, b, camera_b, pairs[forward], s, inverted=False),
@@ -214,7 +224,7 @@ def _examine(
     evidence["rival"] = fix.rival
     reason = _objection(evidence, s)
     if reason:
-        return Refusal(reason, len(pairs), len(inliers))
+        return Refusal(reason, len(pairs), inliers, fix.node_from_robot, evidence)
     return Recognition(fix.node_from_robot, inliers, len(pairs), len(usable), fix, evidence)
 
 

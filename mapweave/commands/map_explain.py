@@ -65,13 +65,17 @@ def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> Pair
     """Two nodes of a map file, or of what a server has."""
     from mapserver.mapfiles import merged_of
     from mapweave.commands.map_ends import ask
+    from mapweave.commands.network import settings_of
+    from mapweave.settings import merge_settings
     from merge.explaining.explanation import explain_nodes
     from wire.explanation_messages import ExplainRequest, decode_pair, encode_explain_request
     from wire.keys import Keys
     from wire.mapfile import read_map_file
 
     if arguments.map is not None:
-        return explain_nodes(merged_of(read_map_file(arguments.map)), a, b)
+        settings = merge_settings(settings_of(arguments), arguments.settings)
+        merged = merged_of(read_map_file(arguments.map), settings)
+        return explain_nodes(merged, a, b, None, settings.consistency)
     request = encode_explain_request(ExplainRequest((a, b)))
     return decode_pair(ask(arguments, Keys.any_explain, request)[0].payload)
 
@@ -82,6 +86,8 @@ def explained_maps(
     """Two maps of a map file, or of what a server has; each two of them without ends."""
     from mapserver.mapfiles import merged_of
     from mapweave.commands.map_ends import ask
+    from mapweave.commands.network import settings_of
+    from mapweave.settings import merge_settings
     from merge.explaining.maps import explain_fleet, explain_maps
     from wire.explanation_messages import MAX_MAPS_TOLD, ExplainRequest, decode_maps, encode_explain_request
     from wire.keys import Keys
@@ -90,5 +96,6 @@ def explained_maps(
     if arguments.map is None:
         request = encode_explain_request(ExplainRequest(ends))
         return decode_maps(ask(arguments, Keys.any_explain, request)[0].payload)
-    merged = merged_of(read_map_file(arguments.map))
+    settings = merge_settings(settings_of(arguments), arguments.settings)
+    merged = merged_of(read_map_file(arguments.map), settings)
     return explain_fleet(merged, MAX_MAPS_TOLD) if ends is None else (explain_maps(merged, *ends),)

@@ -82,14 +82,17 @@ def _rewrite(arguments: argparse.Namespace, ruling: Ruling) -> None:
     from hybridmap.ruling import Rulings
     from mapserver.mapfiles import map_file_of, merged_of
     from mapweave.commands.map_merge import merged_with_progress
+    from mapweave.commands.network import settings_of
     from mapweave.offline import parts_of
+    from mapweave.settings import merge_settings
     from merge.undoing import check_ruling
     from wire.mapfile import read_map_file, write_map_file
 
+    settings = merge_settings(settings_of(arguments), arguments.settings)
     content = read_map_file(arguments.map, "merged")
-    check_ruling(merged_of(content), Rulings(content.rulings), ruling)
+    check_ruling(merged_of(content, settings), Rulings(content.rulings), ruling)
     maps, rulings = parts_of({arguments.map: content})
-    merged = merged_with_progress(maps, rulings + Rulings([ruling]))
+    merged = merged_with_progress(maps, rulings + Rulings([ruling]), settings)
     out = arguments.out or arguments.map
     write_map_file(out, map_file_of(merged))
     print(f"{out}: {merged.summary()}")

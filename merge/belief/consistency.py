@@ -262,7 +262,7 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
         share = link.evidence.get("share", 0.0)
         if link.weight >= s.overwhelming_inliers and share >= s.overwhelming_share:
             return ""
-    return f"only {independent} independent link of {len(kept)}, {s.least_links} must agree"
+    return f"no {s.least_links} links that share no node agree with each other, as they must"
 
 
 def group_links(

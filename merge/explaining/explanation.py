@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,28 +10,19 @@ from numpy.typing import NDArray
 from hybridmap.errors import InvalidValue
 from hybridmap.explanation import Misfit, PairExplanation, Standing, Witness
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.node import Edge, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2
-from hybridmap.reach import RECOGNISED, reach_of
 from hybridmap.recognising.matching import match
-from hybridmap.recognising.recognition import Recognition
 from merge.belief.claims import CLAIMS
 from merge.belief.consistency import ConsistencySettings, group_links, loop_distances2
 from merge.belief.credence import prior_odds, probability, standpoints
 from merge.belief.cutting import fragments_of
+from merge.explaining.own import claims, consequences, own_edge, said
 from merge.graph.fragments import fragment_by_node
-from merge.graph.links import Link, RefusedLink
+from merge.graph.links import Link, RefusedLink, link_of
 from merge.graph.merged import MergedMap
 from merge.graph.verification import VerificationSettings, examine, verify
 from merge.undoing import reason_of, undo
-
-SAID = {
-    EdgeKind.MAPPED: "drove from the one to the other while it mapped",
-    EdgeKind.TURNED: "turned on the spot from the one to the other",
-    EdgeKind.DRIVEN: "has driven from the one to the other",
-    EdgeKind.LOOP: "has recognised the one at the other",
-    EdgeKind.MERGED: "has recognised the one at the other",
-}
 
 
 def explain_nodes(
@@ -57,49 +47,60 @@ def explain_nodes(
     if a == b:
         raise InvalidValue(f"{a} twice: give two nodes")
     one, two = (node_of(merged, node) for node in sorted((a, b)))
-    link, refusal = _link(merged, one.id, two.id), _refusal(merged, one.id, two.id)
-    found = _looked_at(one, two, link or (refusal.link if refusal else None), verification)
-    ruling = merged.rulings.against(one.id, two.id)
-    retired = next((r for m, r in merged.rulings.retired.items() if m in (one.id.map, two.id.map)), None)
-    if retired is not None:
-        about = merged.rulings.about(one.id, two.id)
-        return replace(found, standing=Standing.UNDONE, reason=reason_of(retired), rulings=about)
-    witnesses: tuple[Witness, ...] = ()
-    if link is not None:
-        witnesses = _witnesses(merged, link, consistency)
-        count = sum(w.agrees and w.kept for w in witnesses)
-        standing, reason = Standing.LINKED, f"{link.weight} landmarks agree on one posture, {_others(count)}"
-    elif ruling is not None and refusal is not None and refusal.link is not None:
-        standing, reason = Standing.UNDONE, reason_of(ruling)
-    elif refusal is not None:
-        standing, reason = Standing.REFUSED, refusal.reason
-    else:
-        fresh = verify(one, two, verification)
-        words = (
-            fresh.reason
-            if isinstance(fresh, RefusedLink)
-            else f"{fresh.weight} landmarks agree on one posture"
-        )
-        standing = Standing.UNCOMPARED
-        reason = f"they share too little, are neighbours, or others share more; compared now: {words}"
-        link = None if isinstance(fresh, RefusedLink) else fresh
+    link, own = _link(merged, one.id, two.id), own_edge(merged, one.id, two.id)
+    refusal = _refusal(merged, one.id, two.id, own is not None)
     geometry = link or (refusal.link if refusal else None)
+    if geometry is not None:
+        own = None
+    elif own is not None:
+        geometry = link_of(own)
     found = replace(
-        found,
-        standing=standing,
-        reason=reason,
-        claims=(*_claims(merged, one.id, two.id), *_consequences(merged, one.id, two.id)),
+        _looked_at(one, two, geometry, verification),
+        claims=(*claims(merged, one.id, two.id, own), *consequences(merged, link, one.id, two.id)),
         rulings=merged.rulings.about(one.id, two.id),
     )
+    retired = next((r for m, r in merged.rulings.retired.items() if m in (one.id.map, two.id.map)), None)
+    if retired is not None:
+        return replace(found, standing=Standing.UNDONE, reason=reason_of(retired))
+    witnesses: tuple[Witness, ...] = ()
+    verified = geometry is not None and (own is None or own.kind in CLAIMS)
+    if geometry is None and found.a_from_b is not None:
+        geometry = Link(one.id, two.id, found.a_from_b, found.shared, found.evidence)
+    if geometry is not None and (own is None or own.kind in CLAIMS):
+        witnesses = _witnesses(merged, geometry, consistency)
+    standing, reason = _verdict(merged, (one, two), link, own, refusal, witnesses, verification)
+    found = replace(found, standing=standing, reason=reason, witnesses=witnesses)
     if geometry is None:
         return found
-    misfit, credence = _judged(merged, geometry, kept=standing is Standing.LINKED)
-    return replace(
-        found,
-        misfit=misfit,
-        probability=credence,
-        witnesses=witnesses or _witnesses(merged, geometry, consistency),
-    )
+    misfit, credence = _judged(merged, geometry, kept=link is not None or own is not None)
+    return replace(found, misfit=misfit, probability=credence if verified else None)
+
+
+def _verdict(
+    merged: MergedMap,
+    ends: tuple[Node, Node],
+    link: Link | None,
+    own: Edge | None,
+    refusal: RefusedLink | None,
+    witnesses: tuple[Witness, ...],
+    verification: VerificationSettings | None,
+) -> tuple[Standing, str]:
+    """What has become of two nodes, and why, in words."""
+    one, two = ends
+    if link is not None:
+        count = sum(w.agrees and w.kept for w in witnesses)
+        return Standing.LINKED, f"{_landmarks(link)}, {_others(count)}"
+    ruling = merged.rulings.against(one.id, two.id)
+    if ruling is not None and refusal is not None and refusal.link is not None:
+        return Standing.UNDONE, reason_of(ruling)
+    if own is not None:
+        more = f"; the merge has compared them too: {refusal.reason}" if refusal else ""
+        return Standing.OWN, f"{said(own)}{more}"
+    if refusal is not None:
+        return Standing.REFUSED, refusal.reason
+    fresh = verify(one, two, verification)
+    words = fresh.reason if isinstance(fresh, RefusedLink) else _landmarks(fresh)
+    return Standing.UNCOMPARED, f"they share too little, or others share more; compared now: {words}"
 
 
 def node_of(merged: MergedMap, node: NodeId) -> Node:
@@ -141,17 +142,19 @@ def residuals_px(a: Node, b: Node, a_from_b: Pose2, shared: NDArray[np.int64]) -
 def _looked_at(
     a: Node, b: Node, link: Link | None, verification: VerificationSettings | None
 ) -> PairExplanation:
-    """What the landmarks say. A link brings its posture; else the nodes are compared again."""
+    """What the landmarks say. A link brings its posture; else the nodes are compared again.
+
+    So what the merge refused because too little agrees is told with the little that does.
+    """
     s = verification or VerificationSettings()
     matches = match(a.landmarks.codes, b.landmarks.codes, s.recognition.matching)
     nothing = np.zeros((0, 2), np.int64)
     out = PairExplanation(a, b, Standing.UNCOMPARED, "", matches, nothing, np.zeros(0))
     if link is not None:
-        link = link.canonical()
         posture, shared, evidence = link.a_from_b, link.shared, link.evidence
     else:
         verdict = examine(a, b, s)
-        if not isinstance(verdict, Recognition):
+        if verdict.node_from_robot is None:
             return out
         posture, shared, evidence = verdict.node_from_robot, verdict.pairs, verdict.evidence
     off = residuals_px(a, b, posture.mean, shared)
@@ -162,10 +165,17 @@ def _link(merged: MergedMap, a: NodeId, b: NodeId) -> Link | None:
     return next((link for link in merged.links if link.pair == (a, b)), None)
 
 
-def _refusal(merged: MergedMap, a: NodeId, b: NodeId) -> RefusedLink | None:
-    """What became of a comparison of the two; the robots' own words are told apart from it."""
-    found = [refusal for refusal in merged.refused if refusal.pair == (a, b) and refusal.edge is None]
-    return max(found, key=lambda refusal: refusal.link is not None, default=None)
+def _refusal(merged: MergedMap, a: NodeId, b: NodeId, joined: bool) -> RefusedLink | None:
+    """What became of a comparison of the two; else of what the robot claimed."""
+    found = [r for r in merged.refused if r.pair == (a, b) and (r.edge is None or not joined)]
+    return max(found, key=lambda r: (r.edge is None, r.link is not None, r.edge or a), default=None)
+
+
+def _landmarks(link: Link) -> str:
+    if not link.doubles:
+        return f"{link.weight} landmarks agree on one posture"
+    inliers = link.weight + link.doubles
+    return f"{inliers} landmarks agree on one posture, {link.doubles} of them found at other places too"
 
 
 def _others(count: int) -> str:
@@ -216,32 +226,3 @@ def _witnesses(merged: MergedMap, link: Link, consistency: ConsistencySettings |
 
 def _without_undone(merged: MergedMap, maps: dict[MapId, HybridMap]) -> dict[MapId, HybridMap]:
     return dict(undo(maps, (), merged.rulings).maps)
-
-
-def _claims(merged: MergedMap, a: NodeId, b: NodeId) -> Iterator[str]:
-    refused = {r.edge: r.reason for r in merged.refused if r.edge is not None}
-    for one in merged.maps.values():
-        for edge in one.edges.values():
-            if {edge.a, edge.b} == {a, b}:
-                words = f"{edge.id.agent} {SAID[edge.kind]} (edge {edge.id})"
-                if edge.id in refused:
-                    words += f"; refused: {refused[edge.id]}"
-                elif edge.kind in CLAIMS:
-                    words += "; believed"
-                    if edge.kind in RECOGNISED:
-                        words += f"; {_reach(merged, edge)}"
-                yield words
-
-
-def _consequences(merged: MergedMap, a: NodeId, b: NodeId) -> Iterator[str]:
-    """What follows for routes and for the two nodes' lives."""
-    link = _link(merged, a, b)
-    if link is not None:
-        yield f"the link {_reach(merged, link.edge())}"
-    for node in (a, b):
-        if node in merged.superseded:
-            yield f"{node} is superseded: {merged.superseded[node]}"
-
-
-def _reach(merged: MergedMap, edge: Edge) -> str:
-    return reach_of(edge, node_of(merged, edge.a), node_of(merged, edge.b)).reason

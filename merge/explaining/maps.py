@@ -15,6 +15,7 @@ from hybridmap.node import MapId, NodeId
 from hybridmap.reach import reach_of
 from hybridmap.recognising.matching import match
 from merge.explaining.explanation import node_of
+from merge.explaining.own import reach_words
 from merge.explaining.parting import joined_maps
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
@@ -53,9 +54,10 @@ def explain_maps(
     refused = [r for r in about if r.link is not None]
     unverified = [r for r in about if r.link is None]
     joined = merged.joined(first, second)
-    nearest = (
-        () if joined else (*_strongest(refused), *_most_alike(merged, unverified, verification))[:MOST_NEAR]
-    )
+    if joined:
+        nearest = _weakest(merged, links)
+    else:
+        nearest = (*_strongest(refused), *_most_alike(merged, unverified, verification))[:MOST_NEAR]
     rulings = merged.rulings.about(first, second)
     reason = (
         _why_joined(merged, first, second, links)
@@ -147,13 +149,23 @@ def _why_apart(
 
 
 def _strongest(refused: Sequence[RefusedLink]) -> tuple[NearMiss, ...]:
-    """Refused links with the most landmarks behind them."""
+    """Refused links with the most landmarks behind them that are found nowhere else."""
     links = [(refusal.link, refusal.reason) for refusal in refused if refusal.link is not None]
     links.sort(key=lambda item: (-item[0].weight, item[0].pair))
-    return tuple(
-        NearMiss(*link.pair, int(link.evidence.get("matches", link.weight)), link.weight, reason)
-        for link, reason in links[:MOST_NEAR]
-    )
+    return tuple(_near(link, reason) for link, reason in links[:MOST_NEAR])
+
+
+def _weakest(merged: MergedMap, links: Sequence[Link]) -> tuple[NearMiss, ...]:
+    """Links that stand with the fewest landmarks behind them: whoever doubts a merge looks at these first."""
+    few = sorted(links, key=lambda link: (link.weight, link.pair))[:MOST_NEAR]
+    return tuple(_near(link, reach_words(merged, link.edge())) for link in few)
+
+
+def _near(link: Link, words: str) -> NearMiss:
+    inliers = int(link.evidence.get("inliers", link.weight))
+    if link.doubles:
+        words = f"{link.doubles} of these are found at other places too; {words}"
+    return NearMiss(*link.pair, int(link.evidence.get("matches", inliers)), inliers, words)
 
 
 def _most_alike(

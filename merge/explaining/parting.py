@@ -10,6 +10,7 @@ import networkx as nx
 from hybridmap.node import MapId
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
+from merge.undoing import reason_of
 
 
 def joined_maps(merged: MergedMap) -> list[frozenset[MapId]]:
@@ -88,11 +89,19 @@ def _lost(part: frozenset[MapId], before: MergedMap, after: MergedMap) -> str:
     held = _across(before.links, part, frozenset(before.maps) - part)
     pairs = {link.pair for link in held}
     reasons = Counter(r.reason for r in after.refused if r.pair in pairs and r.edge is None)
-    gone = [pair for pair in pairs if pair[0] not in after.postures or pair[1] not in after.postures]
+    retired = after.rulings.retired
+    away = [next((end.map for end in pair if end.map in retired), None) for pair in pairs]
+    gone = [
+        pair
+        for pair, which in zip(pairs, away, strict=True)
+        if which is None and (pair[0] not in after.postures or pair[1] not in after.postures)
+    ]
     told = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    for which, count in sorted(Counter(one for one in away if one is not None).items()):
+        told.append(f"{_links(count)} gone, since {reason_of(retired[which])}")
     if gone:
         told.append(f"{_links(len(gone))} gone with a node")
-    left = len(pairs) - sum(reasons.values()) - len(gone)
+    left = len(pairs) - sum(reasons.values()) - len(gone) - sum(one is not None for one in away)
     if left > 0:
         told.append(f"{_links(left)} no longer among the pairs that look most alike")
     return "; ".join(told) or "a map has fallen into pieces"

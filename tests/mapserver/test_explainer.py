@@ -5,25 +5,30 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.errors import InvalidFile
-from hybridmap.explanation import MapsExplanation, Standing
+from hybridmap.errors import InvalidFile, InvalidValue
+from hybridmap.explanation import MapsExplanation, PairExplanation, Standing
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ends, Ruling
-from mapserver.explainer import RulingBook
+from mapserver.desk import Desk, DeskSettings
+from mapserver.explainer import Explainer, RulingBook
 from mapserver.log.entry import Entry
 from mapserver.log.store import Store
 from mapserver.mapfiles import map_file_of, maps_of, merged_of
 from mapserver.merging.merger import Merger
 from mapserver.server import MapServer, ServerSettings
+from merge.belief.consistency import ConsistencySettings
 from merge.graph.merged import MergedMap
+from merge.merging import MergeSettings
 from wire.bus import Reply
 from wire.codec import encode_change
 from wire.explanation_messages import (
@@ -221,6 +226,60 @@ def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
     for link in merged.links:
         (edge,) = [b.edge for b in content.changes if isinstance(b, EdgePut) and b.edge.id == link.edge().id]
         assert 0.0 < edge.evidence["probability"] < 1.0
+
+
+def test_what_has_faded_is_in_the_file(path: Path) -> None:
+    with serving(path) as asker:
+        merged = merged_of(asker.merged())
+    node = min(merged.postures)
+    gone = np.arange(len(merged.maps[node.map].nodes[node].landmarks)) % 3 == 0
+    content = unpack_map_file(pack_map_file(map_file_of(replace(merged, faded={node: gone}))))
+    (again,) = merged_of(content).faded.items()
+    assert again[0] == node and np.array_equal(again[1], gone)
+    data = pack_map_file(replace(content, faded={node: gone}))
+    assert np.array_equal(unpack_map_file(data).faded[node], gone)
+    with pytest.raises(InvalidValue, match="do not fit"):
+        pack_map_file(replace(content, faded={node: np.ones(len(gone) + 8, np.bool_)}))
+    with pytest.raises(InvalidValue, match="which is not there"):
+        pack_map_file(replace(content, faded={NodeId("z", 1, 1): gone}))
+
+
+def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
+    bus, merged = MemoryBus(MemoryHub()), MergedMap.empty()
+    with serving(path) as asker:
+        merged = merged_of(asker.merged())
+    store, desk, settled = Store(path), Desk(DeskSettings(workers=0)), False
+    answers = SimpleNamespace(merged=merged)
+    explainer = Explainer(
+        bus, KEYS, "s0", lambda: answers, desk, RulingBook(store), lambda rulings: None, lambda: settled,
+        ConsistencySettings(),
+    )  # fmt: skip
+    pair = merged.links[0].pair
+    for ends in ((A, B), pair, None):
+        settled = False
+        told = explainer.explain(ends)
+        early = told if isinstance(told, PairExplanation) else told[0]
+        settled = True
+        told = explainer.explain(ends)
+        late = told if isinstance(told, PairExplanation) else told[0]
+        assert early.reason == f"{late.reason} (still merging: ask again)"
+    explainer.close()
+    desk.close()
+    store.close()
+    bus.close()
+
+
+def test_witnesses_are_held_to_the_gate_of_the_merge(path: Path) -> None:
+    with serving(path) as asker:
+        pair = min(links(asker.merged()))
+    strict = ServerSettings(lockstep=True, merge=MergeSettings(ConsistencySettings(gate=1e-9)))
+    hub = MemoryHub()
+    bus, asking = MemoryBus(hub), MemoryBus(hub)
+    with MapServer(bus, KEYS, path, "s0", strict):
+        reply = Asker(asking).ask(KEYS.explain("s0"), encode_explain_request(ExplainRequest(pair)))
+        assert not any(witness.agrees for witness in decode_pair(reply.payload).witnesses)
+    asking.close()
+    bus.close()
 
 
 def test_a_damaged_record_of_rulings_is_said(path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut, NodeRetired
 from hybridmap.errors import InvalidValue
 from hybridmap.explanation import Standing
-from hybridmap.node import MapId, NodeId
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.recognising.recognition import RecognitionSettings
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.merging.merger import Merger
 from merge.belief.consistency import ConsistencySettings
@@ -20,10 +23,13 @@ from merge.belief.credence import FLOOR, LEAST_AREA, credences, prior_odds, stan
 from merge.belief.cutting import fragments_of
 from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
+from merge.explaining.own import reach_words
 from merge.explaining.parting import joinings, partings
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import LEAST_SIGMAS, Measurement, solve_graph
+from merge.graph.verification import VerificationSettings
+from merge.undoing import reason_of
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 
@@ -169,18 +175,80 @@ def test_what_was_refused_says_what_it_lacks(merged: MergedMap) -> None:
     assert told.probability is None and len(told.matches) > 0
 
 
+def test_too_few_that_agree_are_told_with_their_posture(merged: MergedMap) -> None:
+    link = between(merged)[0]
+    strict = VerificationSettings(RecognitionSettings(least_inliers=12))
+    # One of the two nodes has kept eleven landmarks, all of which agree.
+    shared = link.shared[:11]
+    a = merged.maps[link.a.map].nodes[link.a]
+    few = HybridMap([NodePut(replace(a, landmarks=a.landmarks.take(shared[:, 0])))])
+    both = replace(merged, maps={**merged.maps, link.a.map: few}, links=(), refused=())
+    told = explain_nodes(both, *link.pair, strict)
+    assert told.standing is Standing.UNCOMPARED and told.a_from_b is None
+    assert "11 features match" in told.reason
+    told = explain_nodes(both, *link.pair, VerificationSettings(RecognitionSettings(least_cells=25)))
+    assert told.reason.endswith("of 24 image cells") and told.a_from_b is not None
+    assert len(told.shared) == told.evidence["inliers"] == len(told.residuals_px) >= 10
+    assert {(int(shared[i, 0]), int(j)) for i, j in told.shared} <= set(map(tuple, shared.tolist()))
+    assert told.a_from_b.mean.distance(link.a_from_b.mean) < 0.1
+    assert told.misfit is not None and told.witnesses == () and told.probability is None
+
+
 def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> None:
-    nodes = sorted(merged.maps[A].nodes)
-    told = explain_nodes(merged, nodes[0], sorted(merged.maps[C].nodes)[0])
+    told = explain_nodes(merged, sorted(merged.maps[A].nodes)[0], sorted(merged.maps[C].nodes)[0])
     assert told.standing is Standing.UNCOMPARED and "compared now: " in told.reason
-    neighbours = explain_nodes(merged, nodes[0], nodes[1])
-    assert any("while it mapped" in claim or "turned" in claim for claim in neighbours.claims)
+
+
+def test_a_robot_s_own_edge_is_told_with_its_posture(merged: MergedMap) -> None:
+    edge = min(merged.maps[A].edges.values(), key=lambda edge: edge.id)
+    told = explain_nodes(merged, edge.b, edge.a)
+    assert told.standing is Standing.OWN and told.reason.endswith(f" (edge {edge.id})")
+    assert told.a_from_b is edge.a_from_b and told.probability is None and not told.witnesses
+    assert told.misfit is not None and not told.claims
+    relative = merged.relative(edge.a, edge.b)
+    assert relative is not None
+    off = (edge.a_from_b.mean.inverse() @ relative.mean).vector
+    assert np.allclose(told.misfit.off, off, atol=1e-9)
+
+
+def test_a_loop_of_the_robot_s_own_is_told_and_what_is_ruled_of_it() -> None:
+    merger = fleet()
+    first, *_, last = sorted(merger.merged().maps[A].nodes)
+    true = merger.merged().relative(first, last)
+    assert true is not None
+    loop = Edge(NodeId("a", 1, 99), first, last, true, EdgeKind.LOOP)
+    merger.apply(A, EdgePut(loop))
+    told = explain_nodes(merger.merged(), first, last)
+    assert told.standing is Standing.OWN and told.probability is not None
+    ruling = Ruling((first, last), True, "anna", 0, "no")
+    merger.rule(Rulings([ruling]))
+    told = explain_nodes(merger.merged(), first, last)
+    assert told.standing is Standing.UNDONE and told.reason == reason_of(ruling)
+    assert any("(edge a.1.99); refused: undone by anna" in claim for claim in told.claims)
+    wrong = replace(loop, a_from_b=PoseGaussian(true.mean @ Pose2(2.0, 1.0, 1.0), true.covariance))
+    merger.rule(Rulings())
+    merger.apply(A, EdgePut(wrong))
+    told = explain_nodes(merger.merged(), first, last)
+    assert told.standing is Standing.REFUSED and "contradicts" in told.reason
+    assert told.misfit is not None and told.misfit.strain2 > 100.0
+
+
+def test_landmarks_that_have_faded_hold_no_servo(merged: MergedMap) -> None:
+    link = next(one for one in between(merged) if "can be driven" in reach_words(merged, one.edge()))
+    count = len(merged.maps[link.a.map].nodes[link.a].landmarks)
+    faded = replace(merged, faded={link.a: np.ones(count, np.bool_)})
+    told = explain_nodes(faded, *link.pair)
+    (words,) = [claim for claim in told.claims if claim.startswith("the link ")]
+    assert "not driven: no landmark stays in view" in words
+    assert words.endswith(f"({len(link.shared)} more have faded)")
 
 
 def test_two_maps(merged: MergedMap) -> None:
     one = explain_maps(merged, B, A)
     assert one.joined and one.links == len(between(merged)) and "are one map" in one.reason
     assert one.landmarks == sum(int(link.evidence["inliers"]) for link in between(merged))
+    weights = sorted(link.weight for link in between(merged))
+    assert [near.inliers for near in one.nearest] == weights[:5]
     apart = explain_maps(merged, A, C)
     assert not apart.joined and "are not one map" in apart.reason
     assert apart.unverified == sum({r.a.map, r.b.map} == {A, C} for r in merged.refused)
@@ -216,6 +284,25 @@ def test_a_merge_that_loses_its_support_says_so() -> None:
     for node in before.maps[B].nodes:
         merger.apply(B, NodeRetired(node))
     assert partings(before, merger.merged()) == ()  # a map without nodes is part of nothing
+
+
+def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
+    """Two robots in two rooms, and one that has been in both."""
+    rng = np.random.default_rng(5)
+    world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng)
+    merger = Merger()
+    for map_id, rooms in ((A, (0,)), (B, (0, 5)), (C, (5,))):
+        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    before = merger.merged()
+    assert before.joined(A, C)
+    ruling = Ruling((B, B), True, "anna", 0, "moved house")
+    merger.rule(Rulings([ruling]))
+    (words,) = partings(before, merger.merged())
+    assert words.startswith("a.1 and c.1 are no longer one map: ")
+    assert words.endswith(f" gone, since {reason_of(ruling)}") and "moved house" in words
 
 
 @pytest.mark.parametrize(
