@@ -81,6 +81,7 @@ class Merger:
         self._islands = Islands(self.settings.merging)
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
+        self._changed: set[MapId] = set()
         self._renewer = Renewer(self.settings.renewal, self.settings.verification, self.reaches)
         self._fader = Fader(self.settings.fading)
         self._rulings = Rulings()
@@ -187,15 +188,16 @@ class Merger:
                     self._verdicts.put(pair, self._known[pair[0]][pair[1]])
                 else:
                     self._verdicts.drop(pair)
-            for map_id in self._touched & self.maps.keys():
-                # Copies: a merged map stays as it was when later changes come.
+            for map_id in self._changed:
+                # Copies: a merged map stays as it was when later changes come. What did not change is not
+                # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
             merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
             renewed = self._renewer.renewed(merged)
             self._succession.follow(renewed.superseded)
             self._merged = self._fader.fade(renewed)
             self.counters.merges += 1
-            self._touched = set()
+            self._touched, self._changed = set(), set()
             self._dirty = False
         return self._merged
 
@@ -239,6 +241,7 @@ class Merger:
         """Take a change into its map, and forget what no longer holds."""
         one = self.maps.setdefault(map_id, HybridMap())
         self._touched.add(map_id)
+        self._changed.add(map_id)
         self._dirty = True
         gone = one.nodes.get(body.id) if isinstance(body, NodeRetired) else None
         for edge in one.dropped_by(body):

@@ -127,6 +127,19 @@ def test_a_merged_map_stays_as_it_was(scene: Scene) -> None:
     assert min(scene.truth) in merged.maps[A].nodes
 
 
+def test_a_map_that_only_others_are_compared_with_is_not_copied(scene: Scene) -> None:
+    """What is remembered of a map is remembered of its very copy: pieces, and links that were sorted."""
+    merger = scene.merger(scene.logs[A])
+    before = merger.merged()
+    for k, (map_id, body) in enumerate(scene.logs[B]):
+        merger.on_change(Change(map_id, k + 1, 0, body))
+    after = merger.merged()
+    assert len(after.components) == 1 and any(link.a.map == A != link.b.map for link in after.links)
+    assert after.maps[A] is before.maps[A]
+    merger.on_change(Change(B, 99, 0, NodeRetired(scene.logs[B][0][1].node.id)))  # type: ignore[union-attr]
+    assert merger.merged().maps[B] is not after.maps[B]
+
+
 def test_reading_a_store_gives_the_same_as_living_through_it(scene: Scene, merger: Merger) -> None:
     other = Merger()
     for map_id, body in scene.logs[B] + scene.logs[A]:
