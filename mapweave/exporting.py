@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +13,14 @@ import numpy as np
 
 from hybridmap.node import Edge, MapId, NodeId
 from hybridmap.pose import Pose2
-from hybridmap.route import RouteSettings, edge_cost
+from hybridmap.reach_book import ReachBook
+from hybridmap.route import edge_cost
+from mapserver.roadmap import IMPLIED, Roadmap
+from mapserver.routes import RouterSettings
 from mapweave.g2o import G2oEdge, G2oGraph, write_g2o
 from mapweave.map_part import MapPart
 from mapweave.scoring import write_tum
+from wire.whole_file import write_whole
 
 FRAME = "map"
 """What Nav2 calls the frame in which it plans."""
@@ -72,15 +77,20 @@ def export_graphml(part: MapPart, out: Path) -> list[Path]:
             heading=heading, sigma_xy=float(sigma[:2].max()), sigma_heading=float(sigma[2]),
             shared=len(edge.shared), **_link_numbers(part, edge),
         )  # fmt: skip
-    nx.write_graphml(graph, out)
+    text = io.BytesIO()
+    nx.write_graphml(graph, text)
+    write_whole(out, text.getvalue())
     return [out]
 
 
 def export_geojson(part: MapPart, out: Path) -> list[Path]:
     """A route graph as Nav2's route server loads it: points, and a line for each direction of an edge.
 
-    Ids are unique over nodes and edges, as Nav2 wants them. An edge costs what it costs our own routes.
+    Ids are unique over nodes and edges, as Nav2 wants them. The edges are those of our own routes, at
+    the same cost: what only ties postures is no way, and nodes that stand in one place are joined.
     """
+    settings = RouterSettings()
+    roads = Roadmap(part.merged, settings.near, ReachBook())
     places = {node: part.pose(node) for node in part.nodes}
     features: list[dict[str, Any]] = []
     for node, number in part.numbers.items():
@@ -91,9 +101,12 @@ def export_geojson(part: MapPart, out: Path) -> list[Path]:
             "geometry": {"type": "Point", "coordinates": _point(places[node])},
         })  # fmt: skip
     number = len(part.numbers)
-    for edge in part.graph.edges.values():
-        cost = edge_cost(edge, places, True, RouteSettings())
-        metadata = {"edge": str(edge.id), "kind": str(edge.kind), **_link_numbers(part, edge)}
+    for edge in roads.union.edges.values():
+        if edge.a not in places or edge.b not in places or edge.id in roads.closed:
+            continue
+        cost = edge_cost(edge, places, True, settings.route)
+        kind = edge.id.agent if edge.id.agent in IMPLIED else str(edge.kind)
+        metadata = {"edge": str(edge.id), "kind": kind, **_link_numbers(part, edge)}
         for start, end in ((edge.a, edge.b), (edge.b, edge.a)):
             properties = {
                 "id": number, "startid": part.numbers[start], "endid": part.numbers[end], "cost": cost,
@@ -107,7 +120,7 @@ def export_geojson(part: MapPart, out: Path) -> list[Path]:
             })  # fmt: skip
             number += 1
     text = json.dumps({"type": "FeatureCollection", "name": "graph", "features": features}, indent=1)
-    out.write_text(text + "\n", encoding="utf-8")
+    write_whole(out, f"{text}\n".encode())
     return [out]
 
 

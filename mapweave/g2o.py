@@ -20,6 +20,7 @@ import numpy as np
 
 from hybridmap.errors import InvalidFile
 from hybridmap.pose import Array, Pose2, wrap_angle
+from wire.whole_file import write_whole
 
 UPPER = np.triu_indices(3)
 KNOWN = {"VERTEX_SE2": 5, "EDGE_SE2": 12, "FIX": 2}
@@ -102,7 +103,7 @@ def write_g2o(path: Path, graph: G2oGraph, names: Mapping[int, str] | None = Non
     # Last: GTSAM's reader takes no edge behind a line that it does not know.
     lines += [f"FIX {k}" for k in graph.fixed]
     lines += [f"# {number} {name}" for number, name in (names or {}).items()]
-    path.write_text("\n".join([*lines, ""]), encoding="ascii")
+    write_whole(path, "\n".join([*lines, ""]).encode("ascii"))
 
 
 def read_g2o(path: Path) -> G2oGraph:

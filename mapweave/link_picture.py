@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from hybridmap.explanation import PairExplanation
 from hybridmap.node import Node
+from wire.whole_file import write_whole
 
 WIDTH = 12.0
 """Of a picture, inches."""
@@ -58,7 +60,9 @@ def draw_link(told: PairExplanation, path: Path) -> None:
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    image = io.BytesIO()
+    figure.savefig(image, format="png")
+    write_whole(path, image.getvalue())
 
 
 def _draw_image(axes: Any, node: Node, offset: float) -> None:

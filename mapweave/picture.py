@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,6 +15,7 @@ import numpy as np
 from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan
+from wire.whole_file import write_whole
 
 WIDTH = 12.0
 """Of a picture, inches."""
@@ -126,7 +128,9 @@ def draw_map(picture: MapPicture, path: Path) -> None:
         # Below the plan, wherever that ends: the layout makes room for what the figure owns.
         figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    image = io.BytesIO()
+    figure.savefig(image, format="png")
+    write_whole(path, image.getvalue())
 
 
 def _height(picture: MapPicture) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from hybridmap.node import Edge, MapId, NodeId
 from hybridmap.pose import Array, Pose2, wrap_angle
 from sim.floorplan import Rectangle
+from wire.whole_file import write_whole
 
 FALSE_LINK = 0.5
 """m; a link between maps that is off by more is false."""
@@ -201,4 +203,6 @@ def write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: Array) -> None:
     zero = np.zeros(len(poses))
     half = poses[:, 2] / 2
     columns = [stamps_ns / 1e9, poses[:, 0], poses[:, 1], zero, zero, zero, np.sin(half), np.cos(half)]
-    np.savetxt(path, np.stack(columns, axis=1), fmt="%.6f")
+    text = io.BytesIO()
+    np.savetxt(text, np.stack(columns, axis=1), fmt="%.6f")
+    write_whole(path, text.getvalue())

@@ -16,7 +16,6 @@ that a reader, or a loss of power, finds either the old file or the new one.
 from __future__ import annotations
 
 import hashlib
-import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -37,6 +36,7 @@ from wire.landmark_codec import MAX_LANDMARKS
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import POSTURE, pack_posture, unpack_posture
 from wire.ruling_codec import pack_ruling, read_ruling
+from wire.whole_file import write_whole
 
 MAGIC = b"MAPWEAVE"
 VERSION = 1
@@ -99,18 +99,7 @@ def write_map_file(path: Path, content: MapFile) -> None:
         InvalidValue: the content cannot be encoded.
         InvalidFile: the disk does not take it.
     """
-    data = pack_map_file(content)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with beside.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise InvalidFile(f"{path}: cannot be written ({error.strerror})") from None
+    write_whole(path, pack_map_file(content))
 
 
 def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
@@ -281,12 +270,3 @@ def _read_faded(reader: Reader, value: Any, sizes: Mapping[NodeId, int]) -> tupl
         raise reader.error(f"{len(bits)} bytes of faded landmarks do not fit the {count} of {node}")
     packed = np.frombuffer(bits, np.uint8)
     return node, np.unpackbits(packed, count=count, bitorder="little").astype(np.bool_)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a move in a folder outlast a loss of power."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

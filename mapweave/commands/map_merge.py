@@ -42,7 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
     from merge.explaining.parting import joinings
     from merge.graph.merged import MergedMap
     from wire.mapfile import read_map_file, write_map_file
+    from wire.whole_file import check_place
 
+    check_place(arguments.out)
     settings = merge_settings(settings_of(arguments), arguments.settings)
     maps, rulings = parts_of({path: read_map_file(path) for path in arguments.files})
     merged = merged_with_progress(maps, rulings, settings)

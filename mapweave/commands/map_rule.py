@@ -87,7 +87,9 @@ def _rewrite(arguments: argparse.Namespace, ruling: Ruling) -> None:
     from mapweave.settings import merge_settings
     from merge.undoing import check_ruling
     from wire.mapfile import read_map_file, write_map_file
+    from wire.whole_file import check_place
 
+    check_place(arguments.out or arguments.map)
     settings = merge_settings(settings_of(arguments), arguments.settings)
     content = read_map_file(arguments.map, "merged")
     check_ruling(merged_of(content, settings), Rulings(content.rulings), ruling)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import gtsam
@@ -132,16 +135,33 @@ def test_the_route_graph_is_what_nav2_demands(part: MapPart, tmp_path: Path) -> 
             lines.append((properties, geometry["coordinates"]))
         for value in properties["metadata"].values():
             assert type(value) in (str, int, float, bool)
-    assert (
-        len(set(ids)) == len(ids)
-        and len(points) == len(part.nodes)
-        and len(lines) == 2 * len(part.graph.edges)
-    )
+    assert len(set(ids)) == len(ids) and len(points) == len(part.nodes)
     for properties, (line,) in lines:
         assert line == [points[properties["startid"]], points[properties["endid"]]]
         assert properties["cost"] >= math.dist(*line) and type(properties["overridable"]) is bool
     ways = sorted((p["startid"], p["endid"]) for p, _ in lines)
     assert ways == sorted((b, a) for a, b in ways)
+
+
+def test_nav2_is_led_as_robots_are(merged: MergedMap, tmp_path: Path) -> None:
+    """What the servo could not drive is no way; nodes in one place are joined, and superseded ones."""
+    blind = merged.links[0].a
+    count = len(merged.maps[blind.map].nodes[blind].landmarks)
+    part = MapPart(replace(merged, faded={blind: np.ones(count, np.bool_)}))
+    (path,) = FORMATS["geojson"](part, tmp_path / "map.geojson")
+    features = json.loads(path.read_text())["features"]
+    told = [f["properties"]["metadata"] for f in features if f["geometry"]["type"] != "Point"]
+    closed = {link.edge().id for link in merged.links if blind in link.pair}
+    kinds = Counter(one["kind"] for one in told)
+    assert closed and {one["edge"] for one in told}.isdisjoint(map(str, closed))
+    assert len(told) - kinds["near"] - kinds["superseded"] == 2 * (len(part.graph.edges) - len(closed))
+    drivable = {frozenset((e.a, e.b)) for e in part.graph.edges.values() if e.id not in closed}
+    near = [
+        pair for pair in combinations(part.nodes, 2)
+        if part.pose(pair[0]).distance(part.pose(pair[1])) <= 0.5 and frozenset(pair) not in drivable
+    ]  # fmt: skip
+    assert kinds["near"] == 2 * len(near)
+    assert kinds["superseded"] == 2 * len(part.merged.superseded)
 
 
 @pytest.mark.parametrize("form", list(FORMATS))
