@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from hybridmap.errors import InvalidFile
@@ -13,28 +14,74 @@ from mapserver.mapfiles import maps_of
 from mapserver.merging.merger import Merger, MergerSettings
 from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings
+from wire.codec import encode_body
 from wire.mapfile import MapFile
 
 Progress = Callable[[int, int], None]
 """Told how many of how many nodes and edges are taken in."""
 
 
-def parts_of(files: Mapping[Path, MapFile]) -> tuple[dict[MapId, HybridMap], Rulings]:
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What there is to merge.
+
+    Attributes:
+        maps: the robots' own, by id.
+        rulings: all that people have ruled in any of the files.
+        notes: what was left aside, one sentence each.
+    """
+
+    maps: dict[MapId, HybridMap]
+    rulings: Rulings
+    notes: tuple[str, ...] = ()
+
+
+def parts_of(files: Mapping[Path, MapFile]) -> Parts:
     """The robots' own maps in some files, and all that people have ruled in any of them.
 
+    The same map twice is taken once. Of an older and a newer state of it the newer one counts: numbers are
+    never reused, so it is the one that has come further.
+
     Raises:
-        InvalidFile: two files hold the same map.
+        InvalidFile: two files hold maps of one name that are different maps, or of which nobody can tell
+            which is newer.
     """
     maps: dict[MapId, HybridMap] = {}
     origin: dict[MapId, Path] = {}
     rulings = Rulings()
-    for path, content in files.items():
-        for map_id, one in maps_of(content).items():
+    notes: list[str] = []
+    for path, content in sorted(files.items()):
+        for map_id, one in sorted(maps_of(content).items()):
             if map_id in maps:
-                raise InvalidFile(f"{path}: map {map_id} is in {origin[map_id]} too: leave one of them out")
+                known, there = maps[map_id], origin[map_id]
+                if _length(known) > _length(one):
+                    (known, there), (one, path) = (one, path), (known, there)
+                if objection := _objection(known, one):
+                    raise InvalidFile(f"map {map_id} is in {there} and in {path}: {objection}")
+                if _length(known) < _length(one):
+                    notes.append(f"map {map_id} is taken from {path}, since that in {there} is older")
             maps[map_id], origin[map_id] = one, path
         rulings += Rulings(content.rulings)
-    return maps, rulings
+    return Parts(maps, rulings, tuple(notes))
+
+
+def _length(one: HybridMap) -> int:
+    """How far a map has come: its greatest number."""
+    return max((own.number for own in (*one.nodes, *one.edges)), default=0)
+
+
+def _objection(older: HybridMap, newer: HybridMap) -> str:
+    """Why one map is not a later state of another; empty if it is."""
+    both = older.nodes.keys() & newer.nodes.keys()
+    if (older.nodes and not both) or any(older.nodes[n].stamp_ns != newer.nodes[n].stamp_ns for n in both):
+        return "these are two maps of one name, made at different times: leave one of them out"
+    if _length(older) == _length(newer) and _bytes(older) != _bytes(newer):
+        return "nobody can tell which is newer: leave one of them out"
+    return ""
+
+
+def _bytes(one: HybridMap) -> list[bytes]:
+    return sorted(encode_body(body) for body in one.contents())
 
 
 def merge_parts(

@@ -21,7 +21,8 @@ def add_to(actions: Any) -> None:
         "merge",
         help="merge map files without a server",
         description="Merge map files as the map server does: robots' own maps, or merged ones, which are "
-        "taken apart and merged anew. What people have ruled in any of them holds.",
+        "taken apart and merged anew. Of an older and a newer file of one map the newer counts. What people "
+        "have ruled in any of them holds. The result does not depend on the order of the files.",
     )
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="a .mapweave file")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the merged map's file")
@@ -46,8 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     check_place(arguments.out)
     settings = merge_settings(settings_of(arguments), arguments.settings)
-    maps, rulings = parts_of({path: read_map_file(path) for path in arguments.files})
-    merged = merged_with_progress(maps, rulings, settings)
+    parts = parts_of({path: read_map_file(path) for path in arguments.files})
+    merged = merged_with_progress(parts.maps, parts.rulings, settings)
     write_map_file(arguments.out, map_file_of(merged))
     joined = joinings(MergedMap.empty(), merged)
     apart = [one.reason for one in explain_fleet(merged, 20) if not one.joined]
@@ -60,13 +61,14 @@ def run(arguments: argparse.Namespace) -> int:
             "links": sum(not link.within for link in merged.links),
             "loops": sum(link.within for link in merged.links),
             "refused": sum(refusal.link is not None for refusal in merged.refused),
+            "notes": list(parts.notes),
             "joined": list(joined),
             "apart": apart,
         }
         print(json.dumps(outcome))
     else:
         print(f"{arguments.out}: {merged.summary()}")
-        for words in (*joined, *apart):
+        for words in (*parts.notes, *joined, *apart):
             print(f"  {words}")
     return 0
 
@@ -80,7 +82,8 @@ def merged_with_progress(
 
     from mapweave.offline import merge_parts
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("reading nodes")
 
         def told(done: int, of: int) -> None:

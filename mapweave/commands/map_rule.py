@@ -93,8 +93,8 @@ def _rewrite(arguments: argparse.Namespace, ruling: Ruling) -> None:
     settings = merge_settings(settings_of(arguments), arguments.settings)
     content = read_map_file(arguments.map, "merged")
     check_ruling(merged_of(content, settings), Rulings(content.rulings), ruling)
-    maps, rulings = parts_of({arguments.map: content})
-    merged = merged_with_progress(maps, rulings + Rulings([ruling]), settings)
+    parts = parts_of({arguments.map: content})
+    merged = merged_with_progress(parts.maps, parts.rulings + Rulings([ruling]), settings)
     out = arguments.out or arguments.map
     write_map_file(out, map_file_of(merged))
     print(f"{out}: {merged.summary()}")

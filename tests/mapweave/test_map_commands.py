@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -201,13 +202,40 @@ def test_bad_input_is_one_line(
     assert files[3].read_bytes() == before and not Path("x.png").exists()
 
 
+def test_of_an_older_and_a_newer_file_the_newer_counts(
+    files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out, older, other = (tmp_path / name for name in ("m.mapweave", "older.mapweave", "other.mapweave"))
+    content = read_map_file(files[0])
+    nodes = [body for body in content.changes if isinstance(body, NodePut)]
+    write_map_file(older, replace(content, changes=tuple(nodes[:3])))
+    for order in ([files[0], older, files[1], files[2]], [files[2], older, files[1], files[0]]):
+        words = said("map", "merge", *order, "-o", out)
+        assert f"map r0.1 is taken from {files[0]}, since that in {older} is older" in words
+        assert out.read_bytes() == files[3].read_bytes()
+    # Yesterday's merged map and today's maps; the same map twice says nothing new.
+    said("map", "merge", older, files[1], "-o", out)
+    assert "since that in" in said("map", "merge", out, *files[:3], "-o", out)
+    assert out.read_bytes() == files[3].read_bytes()
+    assert "taken from" not in said("map", "merge", out, *files[:3], "-o", out)
+    assert out.read_bytes() == files[3].read_bytes()
+    moved = [NodePut(replace(body.node, stamp_ns=body.node.stamp_ns + 1)) for body in nodes]
+    write_map_file(other, replace(content, changes=tuple(moved[:3])))
+    for rival, words in ((other, "two maps of one name"), (older, "")):
+        assert main(["map", "merge", str(files[0]), str(rival), "-o", str(tmp_path / "no")]) == bool(words)
+        assert words in capfd.readouterr().err
+    less = replace(content, changes=tuple(body for body in content.changes if body is not nodes[0]))
+    write_map_file(other, less)
+    assert main(["map", "merge", str(files[0]), str(other), "-o", str(tmp_path / "none")]) == 1
+    assert "nobody can tell which is newer" in capfd.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
 def test_files_that_do_not_fit_are_one_line(
     files: list[Path], capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     capfd.readouterr()
     out = tmp_path / "m.mapweave"
-    assert main(["map", "merge", str(files[0]), str(files[3]), "-o", str(out)]) == 1
-    assert "map r0.1 is in " in capfd.readouterr().err and not out.exists()
     assert main(["map", "unmerge", "r0.1", "r1.1", "--map", str(files[0])]) == 1
     assert "of kind agent, not merged" in capfd.readouterr().err
     assert main(["map", "unmerge", "r0.1", "r1.1", "-o", str(out)]) == 1
