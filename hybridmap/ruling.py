@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from hybridmap.errors import InvalidValue
-from hybridmap.node import MapId, NodeId
+from hybridmap.node import NUMBER, MapId, NodeId, check_name
 
 Ends = tuple[NodeId, NodeId] | tuple[MapId, MapId]
 """Two nodes, or two maps; the smaller first. The same map twice: it is about the map itself."""
+
+EXAMPLE = "two nodes look like r0.1.17 r1.1.5, two maps like r0.1 r1.1"
 
 MOST_WORDS = 300
 """Characters of a reason."""
@@ -91,6 +93,34 @@ class Rulings:
         maps = [one.map if isinstance(one, NodeId) else one for one in (first, second)]
         ends += [_ordered(*maps), *((one, one) for one in maps)]
         return tuple(ruling for ruling in self.made if ruling.ends in ends)
+
+
+def read_ends(first: str, second: str) -> Ends:
+    """Two nodes or two maps as people write them.
+
+    Raises:
+        InvalidValue: they are neither.
+    """
+    one, other = read_end(first), read_end(second)
+    if isinstance(one, NodeId) and isinstance(other, NodeId):
+        return one, other
+    if isinstance(one, NodeId) or isinstance(other, NodeId):
+        raise InvalidValue(f"{first} and {second} are a node and a map: {EXAMPLE}")
+    return one, other
+
+
+def read_end(word: str) -> NodeId | MapId:
+    """A node (r0.1.17) or a map (r0.1).
+
+    Raises:
+        InvalidValue: it is neither.
+    """
+    parts = word.split(".")
+    if len(parts) == 3:
+        return NodeId.parse(word)
+    if len(parts) != 2 or not NUMBER.fullmatch(parts[1]):
+        raise InvalidValue(f"{word!r} is neither a node nor a map: {EXAMPLE}")
+    return MapId(check_name(parts[0]), int(parts[1]))
 
 
 def _ordered(a: NodeId | MapId, b: NodeId | MapId) -> Ends:

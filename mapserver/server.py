@@ -16,7 +16,9 @@ from pathlib import Path
 from types import TracebackType
 
 from hybridmap.errors import NotConnected
+from hybridmap.explanation import MapsExplanation, PairExplanation
 from hybridmap.query import RelocalizeAnswer, View
+from hybridmap.ruling import Ends
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.desk import Desk, DeskSettings
@@ -178,6 +180,14 @@ class MapServer:
             Busy: too many ask.
         """
         return self._desk.submit(lambda: self._in_step().relocalizer.answer(look()), ticket)
+
+    def explain(self, ends: Ends | None) -> Future[PairExplanation | tuple[MapsExplanation, ...]]:
+        """Ask why two nodes or two maps are linked or are not, or each two maps, from any thread.
+
+        Raises:
+            Busy: too many ask.
+        """
+        return self._desk.submit(lambda: self._explainer.explain(ends))
 
     def _in_step(self) -> Answers:
         if self._settings.lockstep and not self.settle(SETTLE_PATIENCE):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 
 from hybridmap.explanation import MapsExplanation, NearMiss, PairExplanation, Standing
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.ruling import Ruling
+from merge.graph.links import DOUBLES
 
 MOST_WITNESSES = 12
 """Lines of other links; `--json` has all."""
@@ -31,7 +31,7 @@ def pair_words(told: PairExplanation) -> list[str]:
     agree = "were followed on the way" if followed else "agree on one posture"
     lines.append(
         f"  landmarks     {len(told.a.landmarks)} and {len(told.b.landmarks)}; "
-        f"{len(told.matches)} look alike, {len(told.shared)} {agree}"
+        f"{len(told.matches)} look alike, {len(told.shared)} {agree}{_doubles(told)}"
     )
     if told.a_from_b is not None:
         lines.append(f"  b seen from a {_posture(told.a_from_b)}")
@@ -75,74 +75,9 @@ def maps_words(told: MapsExplanation) -> list[str]:
         )
     if told.nearest:
         lines.append("  weakest links:" if told.joined else "  nearest to a link:")
-    lines += [f"    {_near(near)}" for near in told.nearest]
+    lines += [f"    {_near(near, told.reason)}" for near in told.nearest]
     lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
     return lines
-
-
-def pair_values(told: PairExplanation) -> dict[str, Any]:
-    """The explanation of two nodes for `--json`."""
-    misfit = told.misfit
-    return {
-        "a": str(told.a.id),
-        "b": str(told.b.id),
-        "standing": str(told.standing),
-        "reason": told.reason,
-        "landmarks": [len(told.a.landmarks), len(told.b.landmarks)],
-        "matches": told.matches.tolist(),
-        "shared": told.shared.tolist(),
-        "residuals_px": [None if np.isnan(value) else float(value) for value in told.residuals_px],
-        "a_from_b": None if told.a_from_b is None else _gaussian(told.a_from_b),
-        "evidence": told.evidence,
-        "probability": told.probability,
-        "misfit": None
-        if misfit is None
-        else {
-            "merged_a_from_b": _gaussian(misfit.merged_a_from_b),
-            "off": misfit.off.tolist(),
-            "strain2": misfit.strain2,
-            "alone": misfit.alone,
-        },
-        "witnesses": [
-            {"a": str(w.a), "b": str(w.b), "distance2": w.distance2, "agrees": w.agrees, "kept": w.kept}
-            for w in told.witnesses
-        ],
-        "claims": list(told.claims),
-        "rulings": [_ruling_values(ruling) for ruling in told.rulings],
-    }
-
-
-def maps_values(told: MapsExplanation) -> dict[str, Any]:
-    """The explanation of two maps for `--json`."""
-    return {
-        "first": str(told.first),
-        "second": str(told.second),
-        "joined": told.joined,
-        "reason": told.reason,
-        "links": told.links,
-        "landmarks": told.landmarks,
-        "refused": told.refused,
-        "unverified": told.unverified,
-        "nearest": [
-            {"a": str(n.a), "b": str(n.b), "matches": n.matches, "inliers": n.inliers, "lacks": n.lacks}
-            for n in told.nearest
-        ],
-        "rulings": [_ruling_values(ruling) for ruling in told.rulings],
-    }
-
-
-def _gaussian(posture: PoseGaussian) -> dict[str, Any]:
-    return {"mean": posture.mean.vector.tolist(), "covariance": posture.covariance.tolist()}
-
-
-def _ruling_values(ruling: Ruling) -> dict[str, Any]:
-    return {
-        "ends": [str(end) for end in ruling.ends],
-        "apart": ruling.apart,
-        "who": ruling.who,
-        "stamp_ns": ruling.stamp_ns,
-        "because": ruling.because,
-    }
 
 
 def _posture(posture: PoseGaussian) -> str:
@@ -155,6 +90,11 @@ def _vector(vector: Array) -> str:
     return f"{vector[0]:+.3f} m ahead, {vector[1]:+.3f} m left, {math.degrees(vector[2]):+.1f} deg"
 
 
+def _doubles(told: PairExplanation) -> str:
+    count = int(told.evidence.get(DOUBLES, 0.0))
+    return f", {count} of these are found at other places too" if count else ""
+
+
 def _sigmas(chi2: float) -> str:
     return f"{math.sqrt(chi2):.1f} standard deviations"
 
@@ -165,8 +105,10 @@ def _percent(probability: float) -> str:
     return f"{probability:.2%}" if probability > 0.0001 else f"{100.0 * probability:.2g}%"
 
 
-def _near(near: NearMiss) -> str:
-    return f"{near.a} - {near.b}: {near.matches} look alike, {near.inliers} agree; {near.lacks}"
+def _near(near: NearMiss, known: str) -> str:
+    """What is said above already of all of them is not said again of each."""
+    lacks = "".join(f"; {words}" for words in near.lacks.split("; ") if words not in known)
+    return f"{near.a} - {near.b}: {near.matches} look alike, {near.inliers} agree{lacks}"
 
 
 def _ruling(ruling: Ruling) -> str:

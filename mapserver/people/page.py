@@ -31,6 +31,7 @@ PAGE = """<!doctype html>
 <div id="result" role="status">No picture yet.</div>
 <img id="shown" alt="" hidden>
 <p><small id="status"></small></p>
+<p><small><a href="why">Why are maps one, or are not?</a></small></p>
 <script>
 const byId = id => document.getElementById(id), result = byId("result");
 const cell = text => { const td = document.createElement("td"); td.textContent = text; return td; };

@@ -1,7 +1,9 @@
-"""The map server for people: a photograph in, JSON out, and a page for phones.
+"""The map server for people: a photograph in, JSON out, why maps are one, and pages for phones.
 
-    GET /             the page
+    GET /             the page for photographs
+    GET /why          the page that says why maps are one, or are not
     GET /status       what the server holds, JSON
+    GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 Whatever goes wrong comes back as one JSON object with `error`. A server that is busy answers 503 with
@@ -26,14 +28,19 @@ from typing import Any, cast
 from urllib.parse import parse_qsl, urlsplit
 
 from hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
+from hybridmap.explanation import MapsExplanation, PairExplanation
 from hybridmap.query import RelocalizeAnswer, View
+from hybridmap.ruling import EXAMPLE, Ends, read_ends
 from mapserver.people.answer_json import answer_record
+from mapserver.people.explanation_json import explanation_record
 from mapserver.people.form import read_photo
 from mapserver.people.page import PAGE
+from mapserver.people.why_page import WHY_PAGE
 from wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
 
+PAGES = {"/": PAGE, "/why": WHY_PAGE}
 MOST_BYTES = 16 * 2**20
 """Longest body, 16 MiB."""
 PATIENCE = 10.0
@@ -44,6 +51,8 @@ POLL = 0.05
 """How soon the server notices that it is closed, s."""
 
 Locate = Callable[[Callable[[], View], int], "Future[RelocalizeAnswer]"]
+Explain = Callable[[Ends | None], "Future[PairExplanation | tuple[MapsExplanation, ...]]"]
+PATHS = {"/": "GET", "/why": "GET", "/status": "GET", "/explain": "GET", "/relocalize": "POST"}
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -63,7 +72,11 @@ class Web:
     """Listens from the start until closed. A context manager."""
 
     def __init__(
-        self, address: tuple[str, int], locate: Locate, status: Callable[[], Mapping[str, Scalar]]
+        self,
+        address: tuple[str, int],
+        locate: Locate,
+        status: Callable[[], Mapping[str, Scalar]],
+        explain: Explain,
     ) -> None:
         """Open the port and serve on threads of its own.
 
@@ -71,12 +84,13 @@ class Web:
             address: host and port; port 0 takes any.
             locate: as MapServer.locate.
             status: as MapServer.status.
+            explain: as MapServer.explain.
 
         Raises:
             NotConnected: nobody can listen there, for example since the port is taken.
         """
         try:
-            self._server = _Server(address, locate, status)
+            self._server = _Server(address, locate, status, explain)
         except OSError as error:
             reason = "the port is taken" if error.errno == errno.EADDRINUSE else error.strerror or str(error)
             raise NotConnected(f"cannot listen at http {address[0]}:{address[1]}: {reason}") from None
@@ -109,13 +123,18 @@ class _Server(ThreadingHTTPServer):
     request_queue_size = 128
 
     def __init__(
-        self, address: tuple[str, int], locate: Locate, status: Callable[[], Mapping[str, Scalar]]
+        self,
+        address: tuple[str, int],
+        locate: Locate,
+        status: Callable[[], Mapping[str, Scalar]],
+        explain: Explain,
     ) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         super().__init__(address, _Handler)
         self.locate = locate
         self.status = status
+        self.explain = explain
         self.places = threading.BoundedSemaphore(MOST_AT_ONCE)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -133,35 +152,51 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection = True
 
     def do_GET(self) -> None:
-        """The page, or the status."""
-        path = urlsplit(self.path).path
-        if path == "/":
-            self._send(HTTPStatus.OK, PAGE.encode(), "text/html; charset=utf-8")
-        elif path == "/status":
+        """The pages, the status, and why maps are one."""
+        address = urlsplit(self.path)
+        if address.path in PAGES:
+            self._send(HTTPStatus.OK, PAGES[address.path].encode(), "text/html; charset=utf-8")
+        elif address.path == "/status":
             self._tell(HTTPStatus.OK, dict(self._web.status()))
+        elif address.path == "/explain":
+            self._answer(lambda: self._explain(dict(parse_qsl(address.query, keep_blank_values=True))))
         else:
-            self._no_such(path, {"/relocalize": "POST"})
+            self._no_such(address.path)
 
     def do_POST(self) -> None:
         """Where was this taken?"""
         address = urlsplit(self.path)
         if address.path != "/relocalize":
-            self._no_such(address.path, {"/": "GET", "/status": "GET"})
+            self._no_such(address.path)
             return
         length = self._length()
-        if length is None:
-            return
+        if length is not None:
+            query = dict(parse_qsl(address.query, keep_blank_values=True))
+            self._answer(lambda: self._relocalize(length, query))
+
+    def _relocalize(self, length: int, query: dict[str, str]) -> Mapping[str, Any]:
+        body = self.rfile.read(length)
+        if len(body) < length:
+            raise InvalidValue(f"only {len(body)} of {length} bytes came")
+        photo = read_photo(self.headers.get("Content-Type", ""), body, query)
+        photo.check()
+        return answer_record(self._web.locate(photo.view, hash(photo.data)).result(PATIENCE))
+
+    def _explain(self, query: dict[str, str]) -> Mapping[str, Any]:
+        ends = None
+        if query:
+            if query.keys() != {"a", "b"}:
+                raise InvalidValue(f"write /explain?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
+            ends = read_ends(query["a"], query["b"])
+        return explanation_record(self._web.explain(ends).result(PATIENCE))
+
+    def _answer(self, answer: Callable[[], Mapping[str, Any]]) -> None:
+        """Tell what comes of a question that takes long, or why nothing does."""
         if not self._web.places.acquire(blocking=False):
             self._busy(Busy(1.0))
             return
         try:
-            body = self.rfile.read(length)
-            if len(body) < length:
-                raise InvalidValue(f"only {len(body)} of {length} bytes came")
-            query = dict(parse_qsl(address.query, keep_blank_values=True))
-            photo = read_photo(self.headers.get("Content-Type", ""), body, query)
-            photo.check()
-            answer = self._web.locate(photo.view, hash(photo.data)).result(PATIENCE)
+            content = answer()
         except Busy as busy:
             self._busy(busy)
         except InvalidValue as error:
@@ -173,10 +208,10 @@ class _Handler(BaseHTTPRequestHandler):
                 HTTPStatus.REQUEST_TIMEOUT, f"no whole image, or no answer, within {PATIENCE:g} s"
             )
         except Exception as error:  # a defect here must not look like a broken network
-            log.exception("no answer to a photograph")
+            log.exception("no answer to %s", self.path)
             self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, f"the server failed: {error}")
         else:
-            self._tell(HTTPStatus.OK, answer_record(answer))
+            self._tell(HTTPStatus.OK, content)
         finally:
             self._web.places.release()
 
@@ -201,11 +236,12 @@ class _Handler(BaseHTTPRequestHandler):
     def _web(self) -> _Server:
         return cast(_Server, self.server)
 
-    def _no_such(self, path: str, others: Mapping[str, str]) -> None:
-        if path in others:
-            self.send_error(HTTPStatus.METHOD_NOT_ALLOWED, f"use {others[path]} for {path}")
+    def _no_such(self, path: str) -> None:
+        if path in PATHS:
+            self.send_error(HTTPStatus.METHOD_NOT_ALLOWED, f"use {PATHS[path]} for {path}")
         else:
-            self.send_error(HTTPStatus.NOT_FOUND, "there are GET /, GET /status and POST /relocalize")
+            there = ", ".join(f"{method} {one}" for one, method in PATHS.items())
+            self.send_error(HTTPStatus.NOT_FOUND, f"there are {there}")
 
     def _busy(self, busy: Busy) -> None:
         self._tell(

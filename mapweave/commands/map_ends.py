@@ -7,13 +7,11 @@ import sys
 from collections.abc import Callable
 
 from hybridmap.errors import InvalidValue, NotConnected
-from hybridmap.node import NUMBER, MapId, NodeId, check_name
-from hybridmap.ruling import Ends
+from hybridmap.node import MapId, NodeId
+from hybridmap.ruling import EXAMPLE, Ends, read_end, read_ends
 from mapweave.commands.network import connect, network_of, settings_of
 from wire.bus import Reply
 from wire.keys import Keys
-
-EXAMPLE = "two nodes look like r0.1.17 r1.1.5, two maps like r0.1 r1.1"
 
 
 def ends_of(words: list[str]) -> Ends:
@@ -24,12 +22,7 @@ def ends_of(words: list[str]) -> Ends:
     """
     if len(words) != 2:
         raise InvalidValue(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
-    first, second = (_read(word) for word in words)
-    if isinstance(first, NodeId) and isinstance(second, NodeId):
-        return first, second
-    if isinstance(first, NodeId) or isinstance(second, NodeId):
-        raise InvalidValue(f"{words[0]} and {words[1]} are a node and a map: {EXAMPLE}")
-    return first, second
+    return read_ends(words[0], words[1])
 
 
 def map_of(word: str) -> MapId:
@@ -38,7 +31,7 @@ def map_of(word: str) -> MapId:
     Raises:
         InvalidValue: it is none.
     """
-    found = _read(word)
+    found = read_end(word)
     if isinstance(found, NodeId):
         raise InvalidValue(f"{word} is a node: give its map, {found.map}")
     return found
@@ -78,12 +71,3 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
         if reply.error:
             print(f"mapweave: another map server refused: {reply.error}", file=sys.stderr)
     return good
-
-
-def _read(word: str) -> NodeId | MapId:
-    parts = word.split(".")
-    if len(parts) == 3:
-        return NodeId.parse(word)
-    if len(parts) != 2 or not NUMBER.fullmatch(parts[1]):
-        raise InvalidValue(f"{word!r} is neither a node nor a map: {EXAMPLE}")
-    return MapId(check_name(parts[0]), int(parts[1]))

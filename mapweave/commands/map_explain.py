@@ -36,14 +36,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
     from hybridmap.errors import InvalidValue
     from hybridmap.node import MapId, NodeId
-    from mapweave.commands.map_ends import EXAMPLE, ends_of
-    from mapweave.explained import maps_values, maps_words, pair_values, pair_words
+    from hybridmap.ruling import EXAMPLE
+    from mapserver.people.explanation_json import explanation_record
+    from mapweave.commands.map_ends import ends_of
+    from mapweave.explained import maps_words, pair_words
 
     ends = ends_of(arguments.ends) if arguments.ends else None
     first, second = ends or (None, None)
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         pair = explained_nodes(arguments, first, second)
-        values, lines = pair_values(pair), pair_words(pair)
+        values, lines = explanation_record(pair), pair_words(pair)
         if arguments.draw is not None:
             from mapweave.link_picture import draw_link
 
@@ -55,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise InvalidValue(f"--draw needs two nodes: {EXAMPLE}")
         maps = None if ends is None else (MapId(*ends[0][:2]), MapId(*ends[1][:2]))
         told = explained_maps(arguments, maps)
-        values = {"maps": [maps_values(one) for one in told]}
+        values = explanation_record(told)
         lines = [line for one in told for line in maps_words(one)] or ["there are no two maps"]
     print(json.dumps(values) if arguments.json else "\n".join(lines))
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ def add_to(commands: Any) -> None:
         help="run the map server and the router",
         description="Keep every robot's map, merge them, tell lost robots where they are and give routes. "
         "The Zenoh router that robots connect to runs inside. With --http it also tells people where a "
-        "photograph was taken: POST /relocalize, GET /status, and a page for phones at /.",
+        "photograph was taken, and why maps are one or are not: POST /relocalize, GET /explain, GET /status, "
+        "and pages for phones at / and /why.",
     )
     parser.add_argument("--name", help="the server's name in the fleet (default: s0)")
     parser.add_argument("--data", type=Path, default=Path("out/server"), help="folder for the store")
@@ -46,6 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
     from wire.keys import Keys
     from wire.zenoh_bus import ZenohBus
 
+    # Who looks in the morning wants to know when two maps came apart.
+    logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
+    logging.getLogger("mapserver").setLevel(logging.INFO)
     settings = settings_of(arguments)
     merge = merge_settings(settings, arguments.settings)
     network = network_of(arguments, settings)
@@ -64,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
             if address is not None:
-                stack.enter_context(Web(address, server.locate, server.status))
+                stack.enter_context(Web(address, server.locate, server.status, server.explain))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
             said = ""
             while not stop.wait(1.0):

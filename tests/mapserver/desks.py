@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import cache
 
 import cv2
 import numpy as np
 
+from benchmarks.synthetic import room, take_map
+from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import Busy
-from hybridmap.node import NodeId
+from hybridmap.explanation import MapsExplanation, PairExplanation
+from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
+from hybridmap.ruling import Ends
+from mapserver.merging.merger import Merger
+from merge.explaining.explanation import explain_nodes
+from merge.explaining.maps import explain_fleet, explain_maps
+from merge.graph.merged import MergedMap
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.1), 0.02, 0.01)
 ANSWER = RelocalizeAnswer(
@@ -47,6 +56,40 @@ class Desk:
         except Exception as error:  # noqa: BLE001 - as a worker would
             done.set_exception(error)
         return done
+
+    def explain(self, ends: Ends | None) -> Future[PairExplanation | tuple[MapsExplanation, ...]]:
+        done: Future[PairExplanation | tuple[MapsExplanation, ...]] = Future()
+        if isinstance(self.refusal, Busy):
+            raise self.refusal
+        try:
+            done.set_result(_explained(ends))
+        except Exception as error:  # noqa: BLE001 - as a worker would
+            done.set_exception(error)
+        return done
+
+
+def _explained(ends: Ends | None) -> PairExplanation | tuple[MapsExplanation, ...]:
+    merged = two_maps()
+    if ends is None:
+        return explain_fleet(merged, 10)
+    first, second = ends
+    if isinstance(first, NodeId) and isinstance(second, NodeId):
+        return explain_nodes(merged, first, second)
+    return (explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),)
+
+
+@cache
+def two_maps() -> MergedMap:
+    """Two robots have looked around in one room."""
+    rng = np.random.default_rng(6)
+    world = room(0, 0, 5, 4, 700, rng)
+    merger = Merger()
+    for map_id in (MapId("r0", 1), MapId("r1", 1)):
+        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    return merger.merged()
 
 
 def picture(width: int = 160, height: int = 120, kind: str = ".png") -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -290,6 +291,8 @@ def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_
         assert served["probability"] == pytest.approx(offline["probability"], rel=1e-4)
         out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", *at)
         assert "r0.1 and r1.1 are not one map: undone with all links" in out
+    logged = (tmp_path / "logs" / "server.log").read_text()
+    assert re.search(r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d r0.1 and r1.1 are no longer one map: ", logged, re.M)
     with serving(tmp_path, port):
         end = time.monotonic() + 90
         while "r0.1 and r1.1 are not one map: undone with all links" not in (

@@ -1,0 +1,92 @@
+"""Explanations in plain values, as they are printed and sent to people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hybridmap.explanation import MapsExplanation, PairExplanation
+from hybridmap.pose import PoseGaussian
+from hybridmap.ruling import Ruling
+
+
+def explanation_record(told: PairExplanation | tuple[MapsExplanation, ...]) -> dict[str, Any]:
+    """Of two nodes, or of each two maps as `maps`."""
+    return (
+        pair_values(told)
+        if isinstance(told, PairExplanation)
+        else {"maps": [maps_values(one) for one in told]}
+    )
+
+
+def pair_values(told: PairExplanation) -> dict[str, Any]:
+    """The explanation of two nodes for `json.dumps`, with all that is needed to draw it.
+
+    Returns:
+        The fields of PairExplanation by name. `images` are [width, height] px of a and b, `pixels` where each
+        of their landmarks is in them; `matches` and `shared` are indices of landmarks.
+    """
+    misfit = told.misfit
+    return {
+        "a": str(told.a.id),
+        "b": str(told.b.id),
+        "standing": str(told.standing),
+        "reason": told.reason,
+        "landmarks": [len(node.landmarks) for node in (told.a, told.b)],
+        "images": [[node.camera.width, node.camera.height] for node in (told.a, told.b)],
+        "pixels": [np.round(node.landmarks.pixels.astype(float), 1).tolist() for node in (told.a, told.b)],
+        "matches": told.matches.tolist(),
+        "shared": told.shared.tolist(),
+        "residuals_px": [None if np.isnan(value) else float(value) for value in told.residuals_px],
+        "a_from_b": None if told.a_from_b is None else _gaussian(told.a_from_b),
+        "evidence": told.evidence,
+        "probability": told.probability,
+        "misfit": None
+        if misfit is None
+        else {
+            "merged_a_from_b": _gaussian(misfit.merged_a_from_b),
+            "off": misfit.off.tolist(),
+            "strain2": misfit.strain2,
+            "alone": misfit.alone,
+        },
+        "witnesses": [
+            {"a": str(w.a), "b": str(w.b), "distance2": w.distance2, "agrees": w.agrees, "kept": w.kept}
+            for w in told.witnesses
+        ],
+        "claims": list(told.claims),
+        "rulings": [_ruling_values(ruling) for ruling in told.rulings],
+    }
+
+
+def maps_values(told: MapsExplanation) -> dict[str, Any]:
+    """The explanation of two maps for `json.dumps`: the fields of MapsExplanation by name."""
+    return {
+        "first": str(told.first),
+        "second": str(told.second),
+        "joined": told.joined,
+        "reason": told.reason,
+        "links": told.links,
+        "landmarks": told.landmarks,
+        "refused": told.refused,
+        "unverified": told.unverified,
+        "nearest": [
+            {"a": str(n.a), "b": str(n.b), "matches": n.matches, "inliers": n.inliers, "lacks": n.lacks}
+            for n in told.nearest
+        ],
+        "rulings": [_ruling_values(ruling) for ruling in told.rulings],
+    }
+
+
+def _gaussian(posture: PoseGaussian) -> dict[str, Any]:
+    return {"mean": posture.mean.vector.tolist(), "covariance": posture.covariance.tolist()}
+
+
+def _ruling_values(ruling: Ruling) -> dict[str, Any]:
+    return {
+        "ends": [str(end) for end in ruling.ends],
+        "apart": ruling.apart,
+        "who": ruling.who,
+        "stamp_ns": ruling.stamp_ns,
+        "because": ruling.because,
+    }

@@ -1,0 +1,104 @@
+"""Why maps are one, over HTTP and on the page in a real browser: the numbers are those of the merged map."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+
+from hybridmap.errors import Busy
+from hybridmap.node import NodeId
+from mapserver.people.web import Web
+from merge.explaining.explanation import explain_nodes
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.desks import Desk, two_maps
+from tests.waiting import eventually
+
+TOLD = "return document.getElementById('told').textContent"
+LINKS = "return [...document.querySelectorAll('#told a')].map(a => a.textContent)"
+
+
+def count(kind: str) -> str:
+    return f"return document.querySelectorAll('svg {kind}').length"
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+@pytest.fixture
+def served(desk: Desk) -> Iterator[Web]:
+    with Web(("127.0.0.1", 0), desk.locate, lambda: {"summary": "8 nodes"}, desk.explain) as served:
+        yield served
+
+
+def ask(served: Web, query: str) -> tuple[int, dict]:
+    try:
+        with urlopen(f"http://127.0.0.1:{served.port}/explain{query}", timeout=20) as reply:
+            return reply.status, json.load(reply)
+    except HTTPError as error:
+        return error.code, json.load(error)
+
+
+def test_maps_and_nodes_are_explained(served: Web) -> None:
+    status, told = ask(served, "")
+    (one,) = told["maps"]
+    assert status == 200 and one["joined"] and (one["first"], one["second"]) == ("r0.1", "r1.1")
+    assert ask(served, "?a=r1.1&b=r0.1") == (200, told)
+    weakest = one["nearest"][0]
+    status, pair = ask(served, f"?a={weakest['b']}&b={weakest['a']}")
+    merged = two_maps()
+    link = next(link for link in merged.links if str(link.a) == weakest["a"] and str(link.b) == weakest["b"])
+    assert status == 200 and pair["standing"] == "linked" and pair["shared"] == link.shared.tolist()
+    assert np.allclose(pair["a_from_b"]["covariance"], link.a_from_b.covariance)
+    for side, end in enumerate(link.pair):
+        node = merged.maps[end.map].nodes[end]
+        assert pair["images"][side] == [node.camera.width, node.camera.height]
+        assert np.allclose(pair["pixels"][side], node.landmarks.pixels, atol=0.051)
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("?a=r0.1", "write /explain"),
+        ("?a=r0.1&b=r1.1&c=1", "write /explain"),
+        ("?a=r0.1&b=", "neither a node nor a map"),
+        ("?a=r0.1&b=r1.1.1", "a node and a map"),
+        ("?a=r0.1&b=r0.1", "give two maps"),
+        ("?a=r0.1.1&b=r9.1.1", "there is no map r9.1; known are: r0.1, r1.1"),
+    ],
+)
+def test_what_cannot_be_explained_is_one_line(served: Web, query: str, words: str) -> None:
+    status, told = ask(served, query)
+    assert status == 400 and words in told["error"] and "\n" not in told["error"]
+
+
+def test_a_busy_server_says_when(served: Web, desk: Desk) -> None:
+    desk.refusal = Busy(0.5)
+    status, told = ask(served, "")
+    assert status == 503 and told["retry_after"] == 0.5
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: pytest.TempPathFactory) -> None:
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        a, b = (NodeId.parse(word) for word in page.run(LINKS)[0].split(" - "))
+        page.run("document.querySelector('#told a').click()")
+        eventually(lambda: f"{a} and {b}: linked: " in page.run(TOLD))
+        told = explain_nodes(two_maps(), a, b)
+        assert page.run(count(".agree")) == len(told.shared)
+        assert page.run(count(".alike")) == len(told.matches) - len(told.shared)
+        assert page.run(count("circle")) == len(told.a.landmarks) + len(told.b.landmarks)
+        assert f"{told.a_from_b.mean.x:.3f} m ahead" in page.run(TOLD)
+        page.run("document.getElementById('all').click()")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        page.open(f"http://127.0.0.1:{served.port}/why#r0.1,<b>x")
+        eventually(lambda: "neither a node nor a map" in page.run(TOLD))
+        assert page.run("return document.querySelector('#told b')") is None
