@@ -87,13 +87,14 @@ class Desk:
         workers = self._settings.workers
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="desk") if workers else None
 
-    def submit(self, work: Callable[[], _T], ticket: int | None = None) -> Future[_T]:
+    def submit(self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True) -> Future[_T]:
         """Have something done.
 
         Args:
             work: to be done.
             ticket: the same when the same question comes again, and hardly ever that of another one; without
                 one it never has precedence.
+            usual: whether it takes as long as other questions do: else the desk learns nothing of it.
 
         Returns:
             Its result, or what it raised, some time later; Busy if it has waited too long.
@@ -104,7 +105,7 @@ class Desk:
         if self._pool is None:
             done: Future[_T] = Future()
             try:
-                done.set_result(self._timed(work))
+                done.set_result(self._timed(work, usual))
             except Exception as error:  # noqa: BLE001 - goes to whoever asks for the result, as a worker's does
                 done.set_exception(error)
             return done
@@ -117,7 +118,8 @@ class Desk:
                 self._refused += 1
                 raise Busy(self._next_appointment(wait, ticket, kept))
             self._open += 1
-        return self._pool.submit(self._unless_late, work, ticket, now + latest if wait > 0.0 else math.inf)
+        by = now + latest if wait > 0.0 else math.inf
+        return self._pool.submit(self._unless_late, work, ticket, by, usual)
 
     def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
@@ -169,16 +171,16 @@ class Desk:
             self._booked[ticket] = due
         return due - now
 
-    def _unless_late(self, work: Callable[[], _T], ticket: int | None, latest: float) -> _T:
+    def _unless_late(self, work: Callable[[], _T], ticket: int | None, latest: float, usual: bool) -> _T:
         """What a worker does with a question when its turn has come."""
         with self._lock:
             if self._clock() + self._seconds > latest:
                 self._open -= 1
                 self._refused += 1
                 raise Busy(self._next_appointment(self._wait(), ticket, True))
-        return self._timed(work)
+        return self._timed(work, usual)
 
-    def _timed(self, work: Callable[[], _T]) -> _T:
+    def _timed(self, work: Callable[[], _T], usual: bool) -> _T:
         began = self._clock()
         try:
             return work()
@@ -186,4 +188,5 @@ class Desk:
             with self._lock:
                 self._open -= self._pool is not None
                 self._answered += 1
-                self._seconds += self._settings.smoothing * (self._clock() - began - self._seconds)
+                if usual:
+                    self._seconds += self._settings.smoothing * (self._clock() - began - self._seconds)

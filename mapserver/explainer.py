@@ -117,7 +117,7 @@ class Explainer:
             closing.close()
 
     def _explain_later(self, request: Request) -> None:
-        done = self._desk.submit(lambda: self._explain(request.payload))
+        done = self._desk.submit(lambda: self._explain(request.payload), usual=False)
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _explain(self, payload: bytes) -> bytes:

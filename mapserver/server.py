@@ -187,7 +187,7 @@ class MapServer:
         Raises:
             Busy: too many ask.
         """
-        return self._desk.submit(lambda: self._explainer.explain(ends))
+        return self._desk.submit(lambda: self._explainer.explain(ends), usual=False)
 
     def _in_step(self) -> Answers:
         if self._settings.lockstep and not self.settle(SETTLE_PATIENCE):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable
 
 from hybridmap.errors import InvalidValue, NotConnected
 from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import EXAMPLE, Ends, read_end, read_ends
 from mapweave.commands.network import connect, network_of, settings_of
-from wire.bus import Reply
+from wire.bus import Bus, Reply
 from wire.keys import Keys
 
 
@@ -23,6 +24,17 @@ def ends_of(words: list[str]) -> Ends:
     if len(words) != 2:
         raise InvalidValue(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
     return read_ends(words[0], words[1])
+
+
+def _patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply]:
+    """Ask, and ask again those who are busy when they say, until the time is over."""
+    end = time.monotonic() + timeout
+    while True:
+        replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
+        pause = max((reply.retry_after for reply in replies), default=0.0)
+        if pause <= 0.0 or time.monotonic() + pause > end:
+            return replies
+        time.sleep(pause)
 
 
 def map_of(word: str) -> MapId:
@@ -59,7 +71,7 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
             raise NotConnected(
                 f"no router at {where}: start `mapweave server`, give --connect, or --map FILE"
             )
-        replies = bus.ask(key_of(keys), payload, arguments.timeout)
+        replies = _patiently(bus, key_of(keys), payload, arguments.timeout)
     finally:
         bus.close()
     if not replies:

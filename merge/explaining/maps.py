@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import networkx as nx
@@ -25,6 +26,8 @@ from merge.undoing import reason_of
 Pair = tuple[MapId, MapId]
 MOST_NEAR = 5
 """Pairs that are told of each two maps."""
+CLOSELY = 16
+"""So many two maps of a fleet are looked at closely: comparing alike pairs once more takes 50 ms each."""
 
 
 def explain_maps(
@@ -47,27 +50,8 @@ def explain_maps(
             raise InvalidValue(f"there is no map {one}; known are: {known}")
     if first == second:
         raise InvalidValue(f"{first} twice: give two maps")
-    first, second = sorted((first, second))
-    ends = {first, second}
-    links = [link for link in merged.links if {link.a.map, link.b.map} == ends]
-    about = [r for r in merged.refused if r.edge is None and {r.a.map, r.b.map} == ends]
-    refused = [r for r in about if r.link is not None]
-    unverified = [r for r in about if r.link is None]
-    joined = merged.joined(first, second)
-    if joined:
-        nearest = _weakest(merged, links)
-    else:
-        nearest = (*_strongest(refused), *_most_alike(merged, unverified, verification))[:MOST_NEAR]
-    rulings = merged.rulings.about(first, second)
-    reason = (
-        _why_joined(merged, first, second, links)
-        if joined
-        else _why_apart(merged, first, second, refused, unverified, nearest)
-    )
-    landmarks = sum(link.weight for link in links)
-    return MapsExplanation(
-        first, second, joined, reason, len(links), landmarks, len(refused), len(unverified), nearest, rulings
-    )
+    pair = min(first, second), max(first, second)
+    return _explained(merged, pair, _between(merged, [pair])[pair], merged.joined(*pair), verification, True)
 
 
 def explain_fleet(
@@ -92,7 +76,74 @@ def explain_fleet(
         return first is not None and first == second, -refused[pair], -alike[pair], pair
 
     pairs = heapq.nsmallest(most, combinations(sorted(merged.maps), 2), key=interest)
-    return tuple(explain_maps(merged, *pair, verification) for pair in pairs)
+    found = _between(merged, pairs)
+    components = [{node.map for node in component} for component in merged.components]
+    return tuple(
+        _explained(
+            merged,
+            pair,
+            found[pair],
+            any(one.issuperset(pair) for one in components),
+            verification,
+            k < CLOSELY,
+        )
+        for k, pair in enumerate(pairs)
+    )
+
+
+@dataclass(frozen=True)
+class _Between:
+    """What was found between two maps."""
+
+    links: list[Link] = field(default_factory=list)
+    refused: list[RefusedLink] = field(default_factory=list)
+    unverified: list[RefusedLink] = field(default_factory=list)
+
+
+def _between(merged: MergedMap, pairs: Collection[Pair]) -> dict[Pair, _Between]:
+    """Of all pairs at once: a large fleet has many refusals."""
+    out = {pair: _Between() for pair in pairs}
+    for link in merged.links:
+        if found := out.get((min(link.a.map, link.b.map), max(link.a.map, link.b.map))):
+            found.links.append(link)
+    for r in merged.refused:
+        if r.edge is None and (found := out.get((min(r.a.map, r.b.map), max(r.a.map, r.b.map)))):
+            (found.unverified if r.link is None else found.refused).append(r)
+    return out
+
+
+def _explained(
+    merged: MergedMap,
+    pair: Pair,
+    found: _Between,
+    joined: bool,
+    verification: VerificationSettings | None,
+    closely: bool,
+) -> MapsExplanation:
+    """Of two maps; only looked at closely are alike pairs compared once more."""
+    links, refused = found.links, found.refused
+    if joined:
+        nearest = _weakest(merged, links)
+    else:
+        nearest = _strongest(refused)
+        if closely and len(nearest) < MOST_NEAR:
+            nearest = (*nearest, *_most_alike(merged, found.unverified, verification))[:MOST_NEAR]
+    reason = (
+        _why_joined(merged, *pair, links)
+        if joined
+        else _why_apart(merged, *pair, refused, found.unverified, nearest)
+    )
+    return MapsExplanation(
+        *pair,
+        joined,
+        reason,
+        len(links),
+        sum(link.weight for link in links),
+        len(refused),
+        len(found.unverified),
+        nearest,
+        merged.rulings.about(*pair),
+    )
 
 
 def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[Link]) -> str:

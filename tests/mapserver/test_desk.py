@@ -46,6 +46,22 @@ class Counter:
         self.desk.close()
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_what_is_unusual_teaches_the_desk_nothing(workers: int) -> None:
+    """A person's question takes seconds; no robot is turned away for it afterwards."""
+    clock = Clock()
+    desk = Desk(DeskSettings(workers, first_guess=0.1), clock)
+
+    def work() -> None:
+        clock.now += 8.0
+
+    desk.submit(work, usual=False).result(20.0)
+    assert desk.counters()["answer_ms"] == 100.0 and desk.counters()["answered"] == 1
+    desk.submit(work).result(20.0)
+    assert float(desk.counters()["answer_ms"]) > 800.0
+    desk.close()
+
+
 @pytest.mark.parametrize(("workers", "seconds", "in_time"), [(1, 0.1, 0.65), (2, 0.05, 0.51), (4, 0.2, 0.23)])
 def test_what_is_taken_on_is_answered_in_time(workers: int, seconds: float, in_time: float) -> None:
     counter = Counter(DeskSettings(workers, in_time=in_time, first_guess=seconds))
@@ -97,7 +113,7 @@ class Simulated:
         queue: list[tuple[float, int]] = []  # when it came, and whose it is
 
         class Waiting:
-            def submit(self, _work: object, _call: object, ticket: int, _latest: float) -> None:
+            def submit(self, _work: object, _call: object, ticket: int, *_rest: object) -> None:
                 queue.append((0.0, ticket))
 
         self.desk._pool = Waiting()  # type: ignore[assignment]

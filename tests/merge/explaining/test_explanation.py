@@ -253,6 +253,9 @@ def test_two_maps(merged: MergedMap) -> None:
     assert not apart.joined and "are not one map" in apart.reason
     assert apart.unverified == sum({r.a.map, r.b.map} == {A, C} for r in merged.refused)
     assert [e.joined for e in explain_fleet(merged, 10)] == [False, False, True]
+    assert explain_fleet(merged, 10) == tuple(
+        explain_maps(merged, told.second, told.first) for told in explain_fleet(merged, 10)
+    )
 
 
 def test_what_people_ruled_is_told() -> None:
