@@ -55,7 +55,8 @@ class Support:
     def by_chance(self, false: FalseWitnesses) -> float:
         """Expected number of sets between the two that are as good and false.
 
-        Either by the number of witnesses that agree by chance, or by how many links a single one brings.
+        Either by how many witnesses agree by chance and how many links these bring in all, or by how many
+        links a single one brings.
 
         Args:
             false: what false witnesses are like.
@@ -67,6 +68,7 @@ class Support:
         crowded = n * false.share * false.crowded(int(self.crowds.max()))
         sets = math.lgamma(n + 1.0) - math.lgamma(m + 1.0) - math.lgamma(n - m + 1.0)
         agreeing = sets + m * math.log(false.share) + (m - 1.0) * math.log(self.coincidence)
+        agreeing += math.log(false.bringing(math.ceil(m - 1e-9), len(self.crowds)))
         return min(crowded, math.exp(min(agreeing, 700.0)))
 
 
@@ -120,6 +122,19 @@ class FalseWitnesses:
         """
         as_many = float(self.counts[min(links, MOST) - 1 :].sum())
         return (as_many + 0.5 ** (links - 1)) / (self.count + 1.0)
+
+    def bringing(self, witnesses: int, links: int) -> float:
+        """The chance that so many of them bring as many links in all, or more."""
+        if links <= witnesses or witnesses > MOST:
+            # Where so many agree, their number tells enough.
+            return 1.0
+        tails = np.array([self.crowded(k) for k in range(1, links + 2)])
+        one = tails[:-1] - tails[1:]
+        # So many links beyond the one that each brings at least, and how probable that is.
+        fewer = np.ones(1)
+        for _ in range(witnesses):
+            fewer = np.convolve(fewer, one)[: links - witnesses]
+        return max(1.0 - float(fewer.sum()), 1e-300)
 
 
 def neighbours(links: Sequence[Link], first: Fragment, second: Fragment, place: float) -> NDArray[np.bool_]:

@@ -10,7 +10,9 @@ share of how likely a false one makes it (but for the ground that a body takes).
 independent multiply, and a true merge drives their product beyond N with a chance of at most 1/N, however
 often it is looked at (Ville's inequality; Grünwald et al., "Safe testing", 2024).
 
-Bodies are also seen: what `merge.bodies.sight` makes of it is multiplied with this.
+Bodies are also seen: what `merge.bodies.sight` makes of it is multiplied with this. So is what the robots'
+cameras should have seen of each other's maps (`merge.bodies.absence`), where the bodies speak against the
+merge, but not loudly enough.
 """
 
 from __future__ import annotations
@@ -19,9 +21,12 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array
+from merge.bodies.absence import AbsenceSettings, absence
+from merge.bodies.clash import Clash
 from merge.bodies.draws import DRAWS, drawn
 from merge.bodies.sight import Looking, SightSettings, errors_in_common, looking, none_wrong, odds_against
 from merge.bodies.trails import Trail, TrailSettings, stay
@@ -45,6 +50,7 @@ class ExclusionSettings:
             against.
         trail: how well it is known where a robot is between two nodes.
         sight: what robots should have seen of each other.
+        absence: what they should have seen of each other's maps.
     """
 
     least_apart: float = 0.2
@@ -56,46 +62,7 @@ class ExclusionSettings:
     neighbourhood: float = 5.0
     trail: TrailSettings = field(default_factory=TrailSettings)
     sight: SightSettings = field(default_factory=SightSettings)
-
-
-@dataclass(frozen=True)
-class Clash:
-    """Two robots that would have been at the same place at the same time, or would have seen each other.
-
-    Attributes:
-        first: agent; the one that would have seen the other.
-        second: another one.
-        clock: that says so.
-        moments: how many moments they would have been too near, or seen each other.
-        nearest: how near they would have been, m.
-        time: when that was, s.
-        evidence: natural logarithm of the odds against the merge.
-        where: the first would have seen the second, in words; empty if they would have been in one place.
-    """
-
-    first: str
-    second: str
-    clock: str
-    moments: int
-    nearest: float
-    time: float
-    evidence: float
-    where: str = ""
-
-    @property
-    def reason(self) -> str:
-        """In words."""
-        if self.where:
-            return (
-                f"{self.first} would have seen {self.second} {self.nearest:.1f} m {self.where} "
-                f"at {self.time:.1f} s of clock {self.clock}; its sensors saw nothing there, "
-                f"{self.moments} such moments"
-            )
-        return (
-            f"{self.first} and {self.second} would have been at the same place at the same time: "
-            f"{self.nearest:.2f} m apart at {self.time:.1f} s of clock {self.clock}, "
-            f"{self.moments} such moments"
-        )
+    absence: AbsenceSettings = field(default_factory=AbsenceSettings)
 
 
 def clash_of(
@@ -133,24 +100,34 @@ def clash_of(
         return None
     spreads = (one.spreads + two.spreads)[close]
     meeting = _Meeting(times, known, distances, close, seen, least_apart)
-    # Covariances cost more than all the rest: they are asked for only if the postures as they are clash.
+    # Covariances cost more than all the rest, and views more than the sensors: they are asked for only if the
+    # postures as they are clash, as far as that could be enough.
     clear = chances_clear(apart[close], np.zeros(len(close)), spreads, least_apart)
-    odds = odds_against(seen, none_wrong(seen), least_apart, s.sight)
-    if not meeting.refuses(clear, odds, s):
+    still = none_wrong(seen)
+    odds = odds_against(seen, still, least_apart, s.sight)
+    if not meeting.refuses(clear, odds, still.weights, s, math.log(s.absence.most)):
         return None
     # Nor for all looks, where the first of them are ample.
     ample = meeting.ample(clear, odds, s)
-    bodies, sight = meeting.evidence(clear, odds, s)
+    bodies, sight = meeting.evidence(clear, odds, still.weights, s)
     shift = s.sigmas * _posture_sigmas(graph, first, second, one.nearest[close], two.nearest[close])
     clear = chances_clear(apart[close], shift, spreads, least_apart)
     for some in sorted({ample, len(times)}):
         part = replace(meeting, seen=seen.take(seen.moments < some))
         errors = errors_in_common(graph, part.seen, s.sight) if len(part.seen) else none_wrong(part.seen)
         moved = odds_against(part.seen, errors, least_apart, s.sight)
-        if part.refuses(clear, moved, s):
-            evidence = sum(part.evidence(clear, moved, s))
+        if part.refuses(clear, moved, errors.weights, s):
+            evidence = sum(part.evidence(clear, moved, errors.weights, s))
             return _clash(graph, (first, second), meeting, odds[0] if sight > bodies else None, evidence)
-    return None
+    if not part.refuses(clear, moved, errors.weights, s, math.log(s.absence.most)):
+        return None
+    views = absence(graph, first, second, s.absence)
+    absent = views.evidence(s.absence)
+    if not part.refuses(clear, moved, errors.weights, s, absent):
+        return None
+    evidence = sum(part.evidence(clear, moved, errors.weights, s)) + absent
+    clash = _clash(graph, (first, second), meeting, odds[0] if sight > bodies else None, evidence)
+    return replace(clash, blank=int(views.show_nothing(s.absence).sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,21 +188,42 @@ class _Meeting:
         out: Array = np.log(np.where(counts > 0, sums / np.maximum(counts, 1), 1.0))
         return out
 
-    def refuses(self, clear: Array, odds: Array, s: ExclusionSettings) -> bool:
-        """Whether that is enough to refuse a merge, in all S ways in which postures may be wrong."""
-        evidence = self.by_bodies(clear, s) + self.by_sight(odds, s)
-        witnesses = np.cumsum(evidence > math.log(2.0), axis=1)
-        # What was enough at any time is enough: later meetings do not make it possible.
-        enough = (witnesses >= s.least_witnesses) & (np.cumsum(evidence, axis=1) >= -math.log(s.doubt))
-        return bool(enough.any(axis=1).all())
+    def refuses(
+        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings, besides: float = 0.0
+    ) -> bool:
+        """Whether that is enough to refuse a merge.
 
-    def evidence(self, clear: Array, odds: Array, s: ExclusionSettings) -> tuple[float, float]:
-        """By bodies and by sight, when it was most, in the way in which it is least."""
+        Args:
+            clear: as in `by_bodies`.
+            odds: as in `by_sight`.
+            weights: (S,) how probable each way is in which postures may be wrong.
+            s: what is enough.
+            besides: natural logarithm of the odds against the merge that other evidence gives.
+        """
+        by_window, total = self._added(clear, odds, weights, s)
+        # What was enough at any time is enough: later meetings do not make it possible.
+        witnesses = np.cumsum(by_window > math.log(2.0))
+        return bool(((witnesses >= s.least_witnesses) & (total + besides >= -math.log(s.doubt))).any())
+
+    def _added(self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings) -> tuple[Array, Array]:
+        """(W,) logarithms of the odds against the merge that each window adds to those before, and (W,) sums.
+
+        Over all ways in which postures may be wrong, each as probable as it is: the later windows meet those
+        that the earlier ones have left.
+        """
+        by_way = np.cumsum(self.by_bodies(clear, s) + self.by_sight(odds, s), axis=1)
+        total: Array = -scipy.special.logsumexp(-by_way, axis=0, b=weights[:, None])
+        added: Array = np.diff(total, prepend=0.0)
+        return added, total
+
+    def evidence(
+        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings
+    ) -> tuple[float, float]:
+        """By bodies and by sight, when it was most."""
         by_bodies = np.cumsum(self.by_bodies(clear, s))
-        by_sight = np.cumsum(self.by_sight(odds, s), axis=1)
-        sight = by_sight[np.argmin((by_bodies + by_sight).max(axis=1))]
-        most = int(np.argmax(by_bodies + sight))
-        return float(by_bodies[most]), float(sight[most])
+        _, total = self._added(clear, odds, weights, s)
+        most = int(np.argmax(total))
+        return float(by_bodies[most]), float(total[most] - by_bodies[most])
 
     def ample(self, clear: Array, odds: Array, s: ExclusionSettings) -> int:
         """Number of moments after which there is twice as much evidence as is asked for; all, if never."""

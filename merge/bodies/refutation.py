@@ -12,7 +12,8 @@ from hybridmap.node import MapId, NodeId
 from merge.belief.consistency import ConsistencySettings
 from merge.belief.groups import LinkGroup
 from merge.belief.joining import Solver
-from merge.bodies.exclusion import Clash, ExclusionSettings, clash_of
+from merge.bodies.clash import Clash
+from merge.bodies.exclusion import ExclusionSettings, clash_of
 from merge.bodies.trails import Trail, trails_of
 from merge.graph.links import Link
 from merge.graph.posegraph import PoseGraph

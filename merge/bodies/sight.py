@@ -21,8 +21,9 @@ bodies overlap are left to `merge.bodies.exclusion`: so these odds are fair give
 may be multiplied with those.
 
 What is wrong with the robots' postures is wrong at all moments alike, of which draws for single moments
-know nothing. So all postures are moved by as much as they may be wrong together, in the ways in which they
-are most uncertain. A merge is refuted only if it is so wherever they are moved.
+know nothing. So all postures are moved together, in the ways in which they are most uncertain, by up to three
+standard deviations. Each way is as probable as it is: under a merge what was measured is as likely as it is
+on average over all of them, and the odds against the merge are one over the mean of their inverses.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from itertools import product
 
 import numpy as np
 import scipy.linalg
+import scipy.stats
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array
@@ -51,7 +53,7 @@ class SightSettings:
             robots are round, but a square hides this much to four of five sides.
         margin: a ray went on if it is longer by more than this than where it would have met the robot, m;
         margin_share: and by this share of it.
-        sigmas: the postures may be wrong by as many standard deviations.
+        sigmas: the postures are moved by so many standard deviations, in every direction.
         floor_xy: error of how the two maps lie to each other that no covariance tells of, m.
     """
 
@@ -60,7 +62,7 @@ class SightSettings:
     core: float = 0.8
     margin: float = 0.1
     margin_share: float = 0.05
-    sigmas: float = 2.0
+    sigmas: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0)
     floor_xy: float = 0.03
 
 
@@ -149,10 +151,12 @@ class Errors:
     Attributes:
         shifts: (S, M, 2) m, how the other one would then be elsewhere, as the observers see it.
         rest: (M, 2, 2) m^2, covariance of what is wrong with each look alone.
+        weights: (S,) how probable each way is.
     """
 
     shifts: Array
     rest: Array
+    weights: Array
 
 
 MODES = 3
@@ -161,7 +165,7 @@ MODES = 3
 
 def none_wrong(seen: Looking) -> Errors:
     """All postures are what they are thought to be."""
-    return Errors(np.zeros((1, len(seen), 2)), np.zeros((len(seen), 2, 2)))
+    return Errors(np.zeros((1, len(seen), 2)), np.zeros((len(seen), 2, 2)), np.ones(1))
 
 
 def errors_in_common(graph: PoseGraph, seen: Looking, settings: SightSettings | None = None) -> Errors:
@@ -170,8 +174,7 @@ def errors_in_common(graph: PoseGraph, seen: Looking, settings: SightSettings | 
     Args:
         graph: of the nodes.
         seen: at least one look.
-        settings: the shifts are none, and half of `sigmas` and `sigmas` standard deviations along each
-            component and between them.
+        settings: the shifts are `sigmas` standard deviations along each component and between them.
     """
     s = settings or SightSettings()
     rows = np.unique(np.concatenate([seen.observers, seen.others]))
@@ -194,13 +197,22 @@ def errors_in_common(graph: PoseGraph, seen: Looking, settings: SightSettings | 
         covariance, subset_by_index=[len(covariance) - count, len(covariance) - 1]
     )
     modes = vectors * np.sqrt(np.maximum(values, 0.0))
-    ways = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=count) if any(way)])
-    ways /= np.linalg.norm(ways, axis=1)[:, None]
-    ways = np.concatenate([np.zeros((1, count)), 0.5 * s.sigmas * ways, s.sigmas * ways])
+    ways, weights = _shells(count, np.array(s.sigmas))
     by_look = modes.reshape(len(seen), 2, count)
     own = covariance.reshape(len(seen), 2, len(seen), 2)[looks, :, looks, :]
     rest = own - by_look @ by_look.transpose(0, 2, 1)
-    return Errors((ways @ modes.T).reshape(len(ways), len(seen), 2), rest)
+    return Errors((ways @ modes.T).reshape(len(ways), len(seen), 2), rest, weights)
+
+
+def _shells(count: int, radii: Array) -> tuple[Array, Array]:
+    """(S, count) points of a normal distribution, on shells of ascending radii, and (S,) their weights."""
+    ways = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=count) if any(way)])
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    edges = np.concatenate([[0.0], (radii[:-1] + radii[1:]) / 2.0, [np.inf]])
+    shells = np.diff(scipy.stats.chi(count).cdf(edges))
+    points = [radius * ways if radius > 0.0 else np.zeros((1, count)) for radius in radii]
+    weights = [np.full(len(some), shell / len(some)) for some, shell in zip(points, shells, strict=True)]
+    return np.concatenate(points), np.concatenate(weights)
 
 
 def _rotations(headings: Array) -> Array:

@@ -47,6 +47,7 @@ class Trail:
         times: (N,) s, ascending.
         radius: of the robot, m; 0 if not all nodes tell.
         looks: what its proximity sensors saw at each node.
+        views: what its camera saw there: the N nodes themselves.
     """
 
     clock: str
@@ -54,6 +55,7 @@ class Trail:
     times: Array
     radius: float
     looks: Looks
+    views: tuple[Node, ...]
 
     @property
     def agent(self) -> str:
@@ -73,7 +75,8 @@ def trails_of(nodes: Collection[Node]) -> tuple[Trail, ...]:
         times = np.array([node.stamp_ns for node in known]) / NANOSECONDS
         radius = min(node.radius for node in known)
         looks = Looks.of([node.ranges for node in known])
-        trails.append(Trail(clock, tuple(node.id for node in known), times, radius, looks))
+        ids = tuple(node.id for node in known)
+        trails.append(Trail(clock, ids, times, radius, looks, tuple(known)))
     return tuple(trails)
 
 

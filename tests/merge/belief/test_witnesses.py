@@ -72,6 +72,25 @@ def test_sets_that_chance_makes_are_as_many_as_told() -> None:
     assert two.by_chance(false) == pytest.approx(count, rel=0.05)
 
 
+def test_links_that_witnesses_bring_in_all_against_draws() -> None:
+    """As if one more had been heard that brings one link, or with half the chance another one, and so on."""
+    rng = np.random.default_rng(3)
+    false = FalseWitnesses(5.0, np.array([6.0, 3.0, 0.0, 1.0]))
+    brought = np.where(
+        rng.random((200_000, 3)) < 1 / 11,
+        rng.geometric(0.5, (200_000, 3)),
+        rng.choice([1, 2, 4], p=[0.6, 0.3, 0.1], size=(200_000, 3)),
+    )
+    for witnesses, links in ((1, 2), (1, 5), (2, 3), (2, 6), (3, 4), (3, 9), (3, 3), (2, 1)):
+        share = (brought[:, :witnesses].sum(axis=1) >= links).mean()
+        assert false.bringing(witnesses, links) == pytest.approx(share, abs=0.003)
+    # Two places that bring three links each are rarer than two that bring one each.
+    pair = Support(np.array([1, 1]), np.ones(9, np.int64), 0.03)
+    rich = Support(np.array([3, 3, 3, 3, 3, 3]), np.ones(9, np.int64), 0.03)
+    assert rich.witnesses == pytest.approx(pair.witnesses)
+    assert rich.by_chance(false) < 0.2 * pair.by_chance(false)
+
+
 def test_who_is_judged_is_not_the_measure_of_it() -> None:
     one = Support(np.array([1, 1, 1]), np.array([2, 2]), 0.1)
     other = Support(np.array([1]), np.array([1, 1, 1, 4, 4, 4, 4]), 0.1)

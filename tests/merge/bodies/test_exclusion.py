@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from hybridmap.camera import Camera
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from merge.bodies.exclusion import Clash, ExclusionSettings, chances_clear, clash_of
+from merge.bodies.clash import Clash
+from merge.bodies.exclusion import ExclusionSettings, chances_clear, clash_of
 from merge.bodies.trails import Trail, trails_of
 from merge.graph.posegraph import PoseGraph
 

@@ -16,7 +16,8 @@ from hybridmap.change import NodePut
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
-from merge.bodies.exclusion import Clash, ExclusionSettings, clash_of
+from merge.bodies.clash import Clash
+from merge.bodies.exclusion import ExclusionSettings, clash_of
 from merge.bodies.sight import SightSettings
 from merge.bodies.trails import trails_of
 from merge.graph.posegraph import PoseGraph

@@ -1,0 +1,158 @@
+"""Views that show nothing of what another robot has mapped there: told from views that were hidden."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from hybridmap.camera import Camera
+from hybridmap.node import Landmarks, Node, NodeId
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.ranges import Ranges
+from merge.bodies.absence import AbsenceSettings, Views, absence, should_show
+from merge.bodies.exclusion import ExclusionSettings, clash_of
+from merge.bodies.trails import Trail, trails_of
+from merge.graph.posegraph import PoseGraph
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
+HALF = 2.5
+"""Of a square room, m."""
+S = AbsenceSettings()
+NOTHING, SOMETHING = math.log((1 - S.alike) / S.missed), math.log(S.alike / (1 - S.missed))
+
+
+class Room:
+    """Four walls with features, of which some may be others than a twin's."""
+
+    def __init__(self, changed: tuple[int, ...] = ()) -> None:
+        self.points, self.codes = [], []
+        for wall in range(4):
+            rng = np.random.default_rng([1, wall])
+            along, up = rng.uniform(-HALF, HALF, 400), rng.uniform(0.0, 1.2, 400)
+            angle = wall * math.pi / 2
+            here = Pose2(HALF * math.cos(angle), HALF * math.sin(angle), angle)
+            self.points.append(np.column_stack([here.apply(np.column_stack([0 * along, along])), up]))
+            looks = np.random.default_rng([2 if wall in changed else 1, wall, 1])
+            self.codes.append(looks.integers(0, 256, (400, 32), np.uint8))
+
+    def node(self, node_id: NodeId, stamp: float, pose: Pose2, ranges: Ranges | None = None) -> Node:
+        points = np.concatenate(self.points)
+        seen = pose.inverse().apply(points)
+        pixels = CAMERA.project(seen)
+        inside = CAMERA.contains(pixels)
+        # A camera far from a corner sees no wall through another one.
+        shown = np.flatnonzero(inside)[:150]
+        landmarks = Landmarks(
+            pixels[shown].astype(np.float32), np.concatenate(self.codes)[shown],
+            seen[shown, 0].astype(np.float32), np.full(len(shown), 0.02, np.float32),
+        )  # fmt: skip
+        origin = PoseGaussian(Pose2(), np.zeros((3, 3)))
+        return Node(node_id, round(1e9 * stamp), origin, CAMERA, landmarks, "net", 0.16, ranges or Ranges())
+
+
+def meeting(
+    mine: Room, other: Room, late: float = 0.0, looks: int = 0, sigma: float = 0.01
+) -> tuple[PoseGraph, Trail, Trail]:
+    """Two robots half a metre apart turn on the spot; at first the one looks about with its sensors."""
+    free = Ranges(np.linspace(-np.pi, np.pi, 64, endpoint=False), np.full(64, 2.3), 3.0)
+    nodes, means = [], []
+    for agent, room, x, wait in (("a", mine, 0.0, 0.0), ("b", other, 0.5, late)):
+        for k in range(12):
+            pose = Pose2(x, 0.0, k % 4 * math.pi / 2)
+            ranges = free if agent == "a" and k < looks else None
+            nodes.append(room.node(NodeId(agent, 1, k), wait + 4.0 * k, pose, ranges))
+            means.append(pose.vector)
+    information = scipy.sparse.csc_matrix(scipy.sparse.diags(np.full(3 * len(nodes), sigma**-2)))
+    graph = PoseGraph(nodes[0].id, tuple(node.id for node in nodes), np.array(means), information)
+    first, second = (trails_of([node for node in nodes if node.id.agent == agent])[0] for agent in "ab")
+    return graph, first, second
+
+
+def test_the_same_room_speaks_for_a_merge() -> None:
+    views = absence(*meeting(Room(), Room()))
+    assert len(views.expected) == 24 and (views.found > 0.7 * views.expected).all()
+    assert views.evidence(S) == pytest.approx(4 * SOMETHING)
+
+
+@pytest.mark.parametrize("changed", [(0,), (1, 3), (0, 1, 2, 3)])
+def test_walls_that_are_others_speak_against_it_once_each(changed: tuple[int, ...]) -> None:
+    views = absence(*meeting(Room(), Room(changed)))
+    assert views.show_nothing(S).sum() == 6 * len(changed)
+    expected = len(changed) * NOTHING + (4 - len(changed)) * SOMETHING
+    assert views.evidence(S) == pytest.approx(min(expected, math.log(S.most)))
+
+
+def test_nothing_is_said_of_other_hours_or_of_postures_that_nobody_knows() -> None:
+    other = Room((0, 1, 2, 3))
+    assert len(absence(*meeting(Room(), other, late=4000.0)).expected) == 0
+    assert len(absence(*meeting(Room(), other, sigma=0.2)).expected) == 0
+
+
+def test_what_stands_before_hides_and_what_nobody_looked_at_is_not_missed() -> None:
+    """Against rays that are marched: a board before half of the wall, and a view with half of its depths."""
+    rng = np.random.default_rng(3)
+    room = Room()
+    node = room.node(NodeId("a", 1, 0), 0.0, Pose2())
+    view = room.node(NodeId("b", 1, 0), 0.0, Pose2(0.3, 0.0, 0.05))
+    shown, pixels = should_show(node, view, Pose2(0.3, 0.0, 0.05), S)
+    assert len(shown) > 60
+    # A board 1 m before the view: landmarks on it, to the left of the middle.
+    left = np.column_stack([rng.uniform(5, 140, 60), rng.uniform(5, 235, 60)]).astype(np.float32)
+    board = Landmarks(
+        left, rng.integers(0, 256, (60, 32), np.uint8), *np.tile([[1.0], [0.02]], 60).astype("f4")
+    )
+    old = view.landmarks.take(view.landmarks.pixels[:, 0] > 160)
+    both = Landmarks(*(np.concatenate([getattr(old, n), getattr(board, n)]) for n in
+                       ("pixels", "codes", "depths", "depth_sigmas")))  # fmt: skip
+    hidden, _ = should_show(node, replace(view, landmarks=both), Pose2(0.3, 0.0, 0.05), S)
+    assert 10 < len(hidden) < len(shown) and set(hidden) < set(shown)
+    where = dict(zip(shown.tolist(), pixels[:, 0], strict=True))
+    assert min(where[k] for k in hidden.tolist()) > 140 - S.around * CAMERA.fx
+    # Without the board nobody knows how far the view looked there.
+    half, _ = should_show(node, replace(view, landmarks=old), Pose2(0.3, 0.0, 0.05), S)
+    assert min(where[k] for k in half.tolist()) > 160 - S.around * CAMERA.fx
+    # From another side, or much nearer, things look different.
+    for posture in (Pose2(0.0, 1.5, -0.4), Pose2(1.2, 0.0, 0.0)):
+        near = room.node(NodeId("b", 1, 0), 0.0, posture)
+        assert len(should_show(node, near, posture, S)[0]) < 0.2 * len(shown)
+
+
+@pytest.mark.parametrize("missed", [0.0, 0.01, S.missed])
+def test_a_true_merge_has_odds_of_at_most_one_on_average(missed: float) -> None:
+    """Views miss as seldom as is allowed, all views of one place together or each by itself."""
+    rng = np.random.default_rng(4)
+    for together in (True, False):
+        odds = []
+        for _ in range(4000):
+            places = np.repeat(rng.uniform(-20, 20, (rng.integers(1, 9), 2)), 3, axis=0)
+            draws = rng.random(len(places) // 3).repeat(3) if together else rng.random(len(places))
+            expected = np.full(len(places), 40)
+            odds.append(math.exp(Views(places, expected, np.where(draws < missed, 0, 15)).evidence(S)))
+        assert np.mean(odds) < 1.0 + 3.0 * np.std(odds) / math.sqrt(len(odds))
+
+
+def test_it_tips_the_scales_and_never_decides_alone() -> None:
+    """Three looks in which the sensors saw nothing are 500 to 1; 1000 are asked for."""
+    twin = Room((0, 2))
+    found = clash_of(*meeting(Room(), twin, looks=3))
+    assert found is not None and found.blank == 12
+    assert "12 views of theirs show nothing of what the other one mapped there" in found.reason
+    assert clash_of(*meeting(Room(), Room(), looks=3)) is None
+    deaf = ExclusionSettings(absence=AbsenceSettings(most=1.0))
+    assert clash_of(*meeting(Room(), twin, looks=3), deaf) is None
+    assert clash_of(*meeting(Room(), Room((0, 1, 2, 3)))) is None
+    # Four looks are enough by themselves, and nothing is said of views.
+    alone = clash_of(*meeting(Room(), Room(), looks=4))
+    assert alone is not None and alone.blank == 0 and alone.reason.endswith("such moments")
+
+
+def test_places_and_not_the_order_of_views_make_witnesses() -> None:
+    rng = np.random.default_rng(5)
+    places: Array = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]])[rng.integers(0, 3, 20)]
+    views = Views(places + rng.uniform(-0.2, 0.2, (20, 2)), np.full(20, 30), rng.integers(0, 3, 20) * 10)
+    order = rng.permutation(20)
+    other = Views(views.places[order], views.expected[order], views.found[order])
+    assert len(set(views.witnesses(S))) == 3
+    assert views.evidence(S) == pytest.approx(other.evidence(S))
