@@ -51,6 +51,8 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
     rulings = Rulings()
     notes: list[str] = []
     for path, content in sorted(files.items()):
+        if not content.changes:
+            notes.append(f"there is nothing in {path}")
         for map_id, one in sorted(maps_of(content).items()):
             if map_id in maps:
                 known, there = maps[map_id], origin[map_id]

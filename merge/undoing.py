@@ -105,6 +105,8 @@ def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
         return
     if known is not None:
         raise InvalidValue(f"{first} and {second} are apart already: {reason_of(known)}")
+    for end in (first, second):
+        merged.check(end)
     pairs = [link.pair for link in merged.links]
     false = {refusal.edge for refusal in merged.refused}
     pairs += [
@@ -120,9 +122,7 @@ def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
 
 
 def _check_retirement(merged: MergedMap, known: Ruling | None, ruling: Ruling, which: MapId) -> None:
-    if which not in merged.maps:
-        there = ", ".join(map(str, merged.maps)) or "none"
-        raise InvalidValue(f"there is no map {which}; known are: {there}")
+    merged.check(which)
     if ruling.apart and known is not None:
         raise InvalidValue(f"map {which} is retired already: {reason_of(known)}")
     if not ruling.apart and known is None:

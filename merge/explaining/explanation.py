@@ -109,15 +109,8 @@ def node_of(merged: MergedMap, node: NodeId) -> Node:
     Raises:
         InvalidValue: it is not there; the words say what is.
     """
-    one = merged.maps.get(node.map)
-    if one is None:
-        known = ", ".join(map(str, merged.maps)) or "none"
-        raise InvalidValue(f"there is no map {node.map}; known are: {known}")
-    if node not in one.nodes:
-        numbers = sorted(n.number for n in one.nodes)
-        span = f"its {len(numbers)} nodes are {numbers[0]} to {numbers[-1]}" if numbers else "it has no nodes"
-        raise InvalidValue(f"map {node.map} has no node {node.number}; {span}")
-    return one.nodes[node]
+    merged.check(node)
+    return merged.maps[node.map].nodes[node]
 
 
 def residuals_px(a: Node, b: Node, a_from_b: Pose2, shared: NDArray[np.int64]) -> Array:

@@ -45,9 +45,7 @@ def explain_maps(
         InvalidValue: the same map twice, or one that is not there.
     """
     for one in (first, second):
-        if one not in merged.maps:
-            known = ", ".join(map(str, merged.maps)) or "none"
-            raise InvalidValue(f"there is no map {one}; known are: {known}")
+        merged.check(one)
     if first == second:
         raise InvalidValue(f"{first} twice: give two maps")
     pair = min(first, second), max(first, second)

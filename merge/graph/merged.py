@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.change import EdgePut
+from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -17,6 +18,9 @@ from hybridmap.ruling import Rulings
 from hybridmap.superseded import Superseded
 from merge.graph.links import Link, RefusedLink
 from merge.graph.posegraph import PoseGraph
+
+MOST_NAMES = 20
+"""Maps that are named where one is mistyped."""
 
 
 class Placement(NamedTuple):
@@ -131,6 +135,24 @@ class MergedMap:
             return None
         found = self.graphs[component].relative([a], [b])
         return PoseGaussian(Pose2.from_vector(found.means[0]), found.covariances[0])
+
+    def check(self, end: NodeId | MapId) -> None:
+        """Refuse a node or a map that is not there.
+
+        Raises:
+            InvalidValue: the words say what is.
+        """
+        which = MapId(*end[:2])
+        one = self.maps.get(which)
+        if one is None:
+            known = [str(other) for other in self.maps]
+            some = ", ".join(known[:MOST_NAMES]) or "none"
+            more = f" and {len(known) - MOST_NAMES} more" if len(known) > MOST_NAMES else ""
+            raise InvalidValue(f"there is no map {which}; known are: {some}{more}")
+        if isinstance(end, NodeId) and end not in one.nodes:
+            numbers = sorted(node.number for node in one.nodes)
+            span = f"its {len(numbers)} nodes are {numbers[0]} to {numbers[-1]}" if numbers else "it has none"
+            raise InvalidValue(f"map {which} has no node {end.number}; {span}")
 
     def joined(self, first: MapId, second: MapId) -> bool:
         """Whether any node of one map is in one component with any of the other."""
