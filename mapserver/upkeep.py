@@ -84,7 +84,7 @@ class Upkeep:
         self._answers = self._answers_from(MergedMap.empty())
         self._compared = self._answers.merged
         self._dirty = self._reading = self._curious = False
-        self._event = ""
+        self._event = self._plight = ""
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
         self._thread = threading.Thread(target=self._work, name="merge", daemon=True)
@@ -96,8 +96,8 @@ class Upkeep:
 
     @property
     def event(self) -> str:
-        """The newest of what has become one map, or is no longer one, with the reason."""
-        return self._event[:MOST_WORDS]
+        """What holds up merging; else the newest of what has become one map, or is no longer one, and why."""
+        return (self._plight or self._event)[:MOST_WORDS]
 
     @property
     def settled(self) -> bool:
@@ -256,7 +256,7 @@ class Upkeep:
 
     def _look_around(self) -> None:
         """A little of what comes before the first merge: it must not hold up what comes."""
-        self._event = f"{self._merger.uncompared} nodes are still to be compared with others"
+        self._plight = f"{self._merger.uncompared} nodes are still to be compared with others"
         try:
             self._merger.look_around(LOOK_AT_ONCE)
         except Exception:  # the merge tries again, and says so if it cannot
@@ -286,14 +286,15 @@ class Upkeep:
             self._answers, self._compared = self._answers_from(merged), merged
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("the merged map could not be made anew")
-            self._event = "the merged map could not be made anew: see the server's log"
+            self._plight = "the merged map could not be made anew: see the server's log"
             return
         finally:
             self._done = self._applied
-        self._curious = True
-        for words in joinings(before, merged):
+        self._curious, self._plight = True, ""
+        joined, parted = joinings(before, merged), partings(before, merged)
+        for words in joined:
             log.info("%s", words)
-            self._event = words
-        for words in partings(before, merged):
+        for words in parted:
             log.warning("%s", words)
-            self._event = words
+        # Of what happens at once, that something came apart is what people must know.
+        self._event = "; ".join(parted or joined) or self._event

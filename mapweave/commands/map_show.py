@@ -17,6 +17,10 @@ def add_to(actions: Any) -> None:
     )
     show.add_argument("file", type=Path, help="a .mapweave file")
     show.add_argument("--out", type=Path, metavar="PNG", help="picture (default: beside the file, as .png)")
+    show.add_argument(
+        "--component", type=int, default=0, metavar="N",
+        help="which part that is one is drawn (default: 0, the largest)",
+    )  # fmt: skip
     show.add_argument("--no-picture", action="store_true", help="summary only")
     show.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     show.set_defaults(run=run)
@@ -26,6 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the summary, draw the picture."""
     import numpy as np
 
+    from hybridmap.errors import InvalidValue
     from hybridmap.hybrid_map import HybridMap
     from hybridmap.node import EdgeKind
     from hybridmap.ruling import Rulings
@@ -35,15 +40,20 @@ def run(arguments: argparse.Namespace) -> int:
     content = read_map_file(arguments.file)
     hybrid = HybridMap(content.changes)
     if content.postures:
-        # Components have frames of their own; only the largest can be drawn without pretending.
+        # Components have frames of their own; only one can be drawn without pretending.
         sizes: dict[int, int] = {}
         for component, _ in content.postures.values():
             sizes[component] = sizes.get(component, 0) + 1
-        largest = max(sizes, key=lambda c: (sizes[c], -c))
-        postures = {n: p.mean for n, (c, p) in content.postures.items() if c == largest}
+        postures = {n: p.mean for n, (c, p) in content.postures.items() if c == arguments.component}
     else:
         sizes = {k: len(nodes) for k, nodes in enumerate(hybrid.components())}
         postures = {n.id: n.map_from_robot.mean for n in hybrid.nodes.values()}
+        # A robot's own map has one frame, whatever hangs together in it.
+        arguments.component = 0
+    if arguments.component not in sizes and sizes:
+        raise InvalidValue(
+            f"the map has no component {arguments.component}; its components are 0 to {len(sizes) - 1}"
+        )
     landmarks = [len(n.landmarks) for n in hybrid.nodes.values()]
     kinds: dict[str, int] = {}
     for edge in hybrid.edges.values():
@@ -71,7 +81,12 @@ def run(arguments: argparse.Namespace) -> int:
             if n.id in postures
         ]
         points = np.concatenate(seen) if seen else np.zeros((0, 2))
-        draw_map(MapPicture(content.title, postures, list(hybrid.edges.values()), landmarks=points), out)
+        title = content.title
+        if len(postures) < len(hybrid.nodes):
+            which = f"component {arguments.component}" if len(sizes) > 1 else "what is in use"
+            title += f"\ndrawn: {which}, {len(postures)} of {len(hybrid.nodes)} nodes"
+            summary["drawn"] = f"{which}, {len(postures)} nodes"
+        draw_map(MapPicture(title, postures, list(hybrid.edges.values()), landmarks=points), out)
         summary["picture"] = str(out)
     if arguments.json:
         print(json.dumps(summary))

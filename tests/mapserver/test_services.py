@@ -195,6 +195,7 @@ def test_a_merge_that_fails_is_logged_and_the_next_one_succeeds(
     served.quick_ones()
     served.server._upkeep._dirty = True
     assert served.server.settle(20)
+    assert "could not be made anew" not in str(served.server.status()["event"])
     assert not served.where().error
 
 

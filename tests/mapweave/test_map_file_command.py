@@ -89,6 +89,12 @@ def test_the_summary_of_a_merged_map(merged_file, capfd, tmp_path):
     assert found["edges"] == {"turned": 2 * (len(TOUR) - 1), "merged": 1}
     assert (found["links"], found["components"]) == (1, 2)
     assert (tmp_path / "pictures" / "m.png").stat().st_size > 5000
+    assert found["drawn"] == f"component 0, {2 * len(TOUR) - 1} nodes"
+    found = summary(capfd, merged_file, "--out", tmp_path / "other.png", "--component", 1)
+    assert found["drawn"] == "component 1, 1 nodes"
+    assert (tmp_path / "other.png").read_bytes() != (tmp_path / "pictures" / "m.png").read_bytes()
+    assert main(["map", "show", str(merged_file), "--component", "2"]) == 1
+    assert "has no component 2; its components are 0 to 1" in capfd.readouterr().err
 
 
 def test_without_a_picture_none_is_drawn(agent_file, capfd):
