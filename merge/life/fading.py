@@ -1,24 +1,31 @@
 """Fading: landmarks that later views should have shown again and again, and did not, are thought to be gone.
 
-A landmark is there or it is not. From one view of its place to the next it may have gone, or come back. A
+A landmark is there or it is not. From one visit of its place to the next it may have gone, or come back. A
 view that should show it finds it with a probability q if it is there, and by mistake with a small one if it
-is not. So what is believed of it is a hidden Markov chain of two states, filtered forward from view to view
+is not. So what is believed of it is a hidden Markov chain of two states, filtered forward from visit to visit
 (compare the persistence filter of Rosen, Mason and Leonard, ICRA 2016). How often a landmark that is there is
 found again is measured in each view by all that it should show: descriptors fail, and nodes keep only some of
-what they saw. The views are those of verified links, whose relative postures the merged map knows.
+what they saw.
 
-A view should show a landmark if it projects well into the image, from a distance and direction from which it
-looks alike, and nothing that the view knows the depth of stands before it.
+That a view misses one landmark says little, for it misses most. But landmarks go together: who moves a
+cupboard moves all of its landmarks. So a landmark that a view does not find is judged with those around it,
+as one thing that is there or is gone. Somebody may stand before it unknown to all, for as long as a visit
+takes; so no single visit is enough.
+
+The views are all that stand near in the merged map, linked with the node or not: the better a place is known
+to have changed, the fewer are linked with it. A view that is not linked tells only if the merged map is sure
+where it stands.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Array, Pose2
@@ -26,6 +33,9 @@ from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import PoseGraph
 from merge.life.ages import is_older
+from merge.life.looks import Look, LookSettings
+
+SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -33,51 +43,44 @@ class FadingSettings:
     """When a landmark has faded.
 
     Attributes:
-        margin_px: it should be seen if it projects this far inside the image.
-        scale: and if its distance has changed by at most this factor.
-        aside: and if it is seen from a direction that differs by at most this, rad.
-        before_px: something hides it that is seen this near to it in the image,
-        before: at less than this share of its distance.
+        looks: when it should be seen, and when it is.
         rates: within which the share is held that a view finds of what it should show.
         least_shown: a view that should show fewer landmarks tells nothing.
+        sure: m, m and rad, nor does one that the merged map does not place within one sigma of this.
+        usual: share of what it should show that a view finds, as far as it tells nothing better,
+        weight: with the weight of so many landmarks.
+        thing: m, landmarks that are nearer than this to each other go together.
+        hidden: probability that a thing is hidden during a visit by what nobody knows of.
         mistaken: probability that a landmark that is gone is found all the same.
-        goes: probability that a landmark has gone from one view to the next.
+        goes: probability that a landmark has gone from one visit to the next.
         comes: that one that had gone is back.
         at_first: probability that it was really there when it was mapped.
         faint: a landmark that is there with less than this has faded.
         moved: m, by which two nodes may move to each other before their views are compared anew.
+        near: m, views of a place that are not linked with it stand within this,
+        turned: rad, and are turned by at most this.
+        most: so many of them are looked at, the newest.
+        again: s, views of one map that lie nearer in time are of one visit.
     """
 
-    margin_px: float = 12.0
-    scale: float = 1.6
-    aside: float = math.radians(25.0)
-    before_px: float = 12.0
-    before: float = 0.8
+    looks: LookSettings = field(default_factory=LookSettings)
     rates: tuple[float, float] = (0.1, 0.9)
     least_shown: int = 15
-    mistaken: float = 0.02
+    sure: tuple[float, float, float] = (0.05, 0.05, 0.03)
+    usual: float = 0.1
+    weight: float = 15.0
+    thing: float = 0.3
+    hidden: float = 0.05
+    mistaken: float = 0.01
     goes: float = 0.02
     comes: float = 0.02
     at_first: float = 0.95
     faint: float = 0.2
     moved: float = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """What one later view tells of a node's landmarks.
-
-    Attributes:
-        link: between the node and the view.
-        between: node_from_view by which it was worked out.
-        expected: (N,) which landmarks the view should show.
-        found: (N,) which it shows.
-    """
-
-    link: Link
-    between: Pose2
-    expected: NDArray[np.bool_]
-    found: NDArray[np.bool_]
+    near: float = 2.5
+    turned: float = math.radians(45.0)
+    most: int = 12
+    again: float = 120.0
 
 
 class Fader:
@@ -95,96 +98,167 @@ class Fader:
         self._graphs: tuple[PoseGraph, ...] = ()
 
     def fade(self, merged: MergedMap) -> MergedMap:
-        """The same map with the landmarks that have faded.
+        """The same map with the landmarks that have faded, of nodes that no others stand for.
 
         Args:
             merged: the next merged map of the same fleet.
         """
         solved = {id(graph) for graph in self._graphs}
-        changed = [node for graph in merged.graphs if id(graph) not in solved for node in graph.nodes]
-        here = frozenset(changed)
         self._graphs = merged.graphs
-        later: dict[NodeId, list[tuple[Node, Link]]] = {}
-        for link in merged.links:
-            if link.a in here:
-                a, b = (merged.maps[end.map].nodes[end] for end in link.pair)
-                old, new = (a, b) if is_older(a, b) else (b, a)
-                later.setdefault(old.id, []).append((new, link))
         for table in (self._looks, self._faded):
-            for node_id in [node_id for node_id in table if merged.component_of(node_id) is None]:
+            for node_id in [one for one in table if merged.component_of(one) is None]:
                 del table[node_id]
-        for node_id in changed:
-            node = merged.maps[node_id.map].nodes[node_id]
-            views = sorted(later.get(node_id, ()), key=lambda view: (view[0].stamp_ns, view[0].id))
-            before = {id(look.link): look for look in self._looks.get(node_id, ())}
-            looks = [self._look(merged, node, new, link, before.get(id(link))) for new, link in views]
-            self._looks[node_id] = looks
-            gone = presence(len(node.landmarks), looks, self._settings) < self._settings.faint
-            self._faded.pop(node_id, None)
-            if gone.any():
-                self._faded[node_id] = gone
+        links: dict[NodeId, dict[NodeId, Link]] = {}
+        for link in merged.links:
+            for one, other in (link.pair, link.pair[::-1]):
+                links.setdefault(one, {})[other] = link
+        for graph in merged.graphs:
+            if id(graph) not in solved:
+                self._fade(merged, graph, links)
         living = {one: gone for one, gone in sorted(self._faded.items()) if one not in merged.superseded}
         return replace(merged, faded=living)
 
-    def _look(self, merged: MergedMap, old: Node, new: Node, link: Link, known: Look | None) -> Look:
-        between = merged.pose(old.id).inverse() @ merged.pose(new.id)
-        if known is not None:
-            off = known.between.inverse() @ between
-            if max(off.distance(Pose2()), abs(off.heading)) < self._settings.moved:
-                return known
-        found = np.zeros(len(old.landmarks), np.bool_)
-        found[link.shared[:, 0 if link.a == old.id else 1]] = True
-        return Look(link, between, expected(old, new, between, self._settings), found)
+    def _fade(self, merged: MergedMap, graph: PoseGraph, links: dict[NodeId, dict[NodeId, Link]]) -> None:
+        nodes = [merged.maps[node.map].nodes[node] for node in graph.nodes]
+        tree = cKDTree(graph.means[:, :2])
+        for row, node in enumerate(nodes):
+            if node.id in merged.superseded:
+                continue
+            linked = links.get(node.id, {})
+            turns = graph.means[:, 2] - graph.means[row, 2]
+            near = [
+                nodes[k]
+                for k in tree.query_ball_point(graph.means[row, :2], self._settings.near)
+                if math.cos(turns[k]) > math.cos(self._settings.turned)
+            ]
+            views = self._views(node, near, [nodes[graph.rows[one]] for one in linked])
+            self._looks[node.id] = looks = self._seen(merged, graph, node, views, linked)
+            s = self._settings
+            gone = presence(things(node, s.thing), [one for one in looks if tells(one, s)], s) < s.faint
+            self._faded.pop(node.id, None)
+            if gone.any():
+                self._faded[node.id] = gone
+
+    def _views(self, node: Node, near: Sequence[Node], linked: Sequence[Node]) -> list[Node]:
+        """Later views of a node's place, the earliest first."""
+        s = self._settings
+        known = {one.id for one in linked}
+        others = [one for one in near if one.id not in known and is_older(node, one)]
+        others = [
+            one
+            for one in others
+            if one.id.map != node.id.map or one.stamp_ns - node.stamp_ns > s.again * SECOND
+        ]
+        newest = sorted(others, key=lambda one: (one.stamp_ns, one.id))[-s.most :]
+        views = [*(one for one in linked if is_older(node, one)), *newest]
+        return sorted(views, key=lambda one: (one.stamp_ns, one.id))
+
+    def _seen(
+        self, merged: MergedMap, graph: PoseGraph, node: Node, views: list[Node], linked: dict[NodeId, Link]
+    ) -> list[Look]:
+        """What the views tell; what they told before holds while they stand to the node as they did."""
+        s = self._settings
+        before = {id(look.view): look for look in self._looks.get(node.id, ())}
+        looks: list[Look] = []
+        doubted: list[int] = []
+        for view in views:
+            between = merged.pose(node.id).inverse() @ merged.pose(view.id)
+            link, look = linked.get(view.id), before.get(id(view))
+            if look is None or look.node is not node or look.link is not link or self._off(look, between):
+                look = Look.of(node, view, link, between, s.looks)
+                if link is None and look.expected.sum() >= s.least_shown:
+                    doubted.append(len(looks))
+            looks.append(look)
+        if doubted:
+            there = graph.relative([node.id] * len(doubted), [looks[k].view.id for k in doubted])
+            sigmas = np.sqrt(np.diagonal(there.covariances, axis1=1, axis2=2))
+            for k, those in zip(doubted, sigmas, strict=True):
+                looks[k] = replace(looks[k], sure=bool((those <= s.sure).all()))
+        return looks
+
+    def _off(self, look: Look, between: Pose2) -> bool:
+        off = look.between.inverse() @ between
+        return max(off.distance(Pose2()), abs(off.heading)) >= self._settings.moved
 
 
-def expected(old: Node, new: Node, old_from_new: Pose2, s: FadingSettings) -> NDArray[np.bool_]:
-    """(N,) which landmarks of a node another view should show.
+def tells(look: Look, s: FadingSettings) -> bool:
+    """Whether a view tells anything: it should show enough, and stands where it is thought to."""
+    return int(look.expected.sum()) >= s.least_shown and look.sure
+
+
+def things(node: Node, size: float) -> NDArray[np.bool_]:
+    """(N, N) which landmarks of a node may be of one thing; each is so with itself.
 
     Args:
-        old: the node.
-        new: the view.
-        old_from_new: how they stand.
-        s: when a landmark should be seen.
+        node: has N landmarks.
+        size: m, what is nearer to each other may be.
     """
-    points = old.points_in_robot
-    from_new = old_from_new.inverse().apply(points)
-    pixels = new.camera.project(from_new)
-    eye_old = np.array([old.camera.mount_forward, 0.0])
-    eye_new = old_from_new.apply(np.array([[new.camera.mount_forward, 0.0, 0.0]]))[0, :2]
-    ray_old, ray_new = points[:, :2] - eye_old, points[:, :2] - eye_new
-    far_old, far_new = np.linalg.norm(ray_old, axis=1), np.linalg.norm(ray_new, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = np.maximum(far_old, far_new) / np.minimum(far_old, far_new)
-        cosine = (ray_old * ray_new).sum(axis=1) / (far_old * far_new)
-        alike = (ratio < s.scale) & (cosine > math.cos(s.aside))
-    shown: NDArray[np.bool_] = new.camera.contains(pixels, s.margin_px) & alike
-    candidates = np.flatnonzero(shown)
-    if len(candidates):
-        depth = from_new[candidates, 0] - new.camera.mount_forward
-        known = new.landmarks.take(new.landmarks.has_depth)
-        apart = np.linalg.norm(pixels[candidates, None] - known.pixels[None], axis=2)
-        before = (apart < s.before_px) & (known.depths[None] < s.before * depth[:, None])
-        shown[candidates[before.any(axis=1)]] = False
-    return shown
+    points = node.points_in_robot
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near: NDArray[np.bool_] = (apart < size) | np.eye(len(points), dtype=np.bool_)
+    return near
 
 
-def presence(count: int, looks: Iterable[Look], s: FadingSettings) -> Array:
-    """(count,) probability that each landmark is still there after some views, the earliest first.
+def presence(together: NDArray[np.bool_], looks: Sequence[Look], s: FadingSettings) -> Array:
+    """(N,) probability that each landmark of a node is still there after some views.
 
     Args:
-        count: landmarks of the node.
-        looks: later views of it.
+        together: (N, N) which of them may be of one thing, see `things`.
+        looks: later views of it that tell something, the earliest first.
         s: how landmarks come and go.
     """
-    there = np.full(count, s.at_first)
-    for look in looks:
-        shown = look.expected | look.found
-        if look.expected.sum() < s.least_shown:
-            continue
-        rate = float(np.clip((look.found & look.expected).sum() / look.expected.sum(), *s.rates))
-        there = np.where(shown, there * (1.0 - s.goes) + (1.0 - there) * s.comes, there)
-        if_there = np.where(look.found, rate, 1.0 - rate)
-        if_gone = np.where(look.found, s.mistaken, 1.0 - s.mistaken)
-        both = there * if_there + (1.0 - there) * if_gone
-        there = np.where(shown, there * if_there / both, there)
+    there = np.full(len(together), s.at_first)
+    for visit in visits(looks, s.again):
+        # Of the visit's views together: if it is there and in sight, there and hidden, and gone.
+        in_sight, hidden, gone = np.ones((3, len(together)))
+        told = np.zeros(len(together), np.bool_)
+        for look in visit:
+            again = look.found & look.expected
+            rate = found_again(together, look, s)
+            # One that is found is there, whatever is around it; one that is not is judged with its thing.
+            seen = np.where(look.found, 1, together @ again.astype(np.int64))
+            missed = np.where(look.found, 0, together @ (look.expected & ~look.found).astype(np.int64))
+            tells_of = look.expected | look.found
+            in_sight *= np.where(tells_of, rate**seen * (1.0 - rate) ** missed, 1.0)
+            hidden *= np.where(tells_of, seen == 0, 1.0)
+            gone *= np.where(tells_of, s.mistaken**seen * (1.0 - s.mistaken) ** missed, 1.0)
+            told |= tells_of
+        if_there = (1.0 - s.hidden) * in_sight + s.hidden * hidden
+        prior = there * (1.0 - s.goes) + (1.0 - there) * s.comes
+        posterior = prior * if_there / (prior * if_there + (1.0 - prior) * gone)
+        there = np.where(told, posterior, there)
     return there
+
+
+def visits(looks: Sequence[Look], again: float) -> list[list[Look]]:
+    """Looks visit by visit.
+
+    Args:
+        looks: the earliest first.
+        again: s, views of one map that lie nearer to the one before are of one visit.
+    """
+    found: list[list[Look]] = []
+    for look in looks:
+        view, last = look.view, found[-1][-1].view if found else None
+        if last is None or last.id.map != view.id.map or view.stamp_ns - last.stamp_ns >= again * SECOND:
+            found.append([])
+        found[-1].append(look)
+    return found
+
+
+def found_again(together: NDArray[np.bool_], look: Look, s: FadingSettings) -> float:
+    """How often a view finds a landmark that it should show and that is there.
+
+    That is measured where it finds something else of the same thing, as far as there is enough of it: so what
+    has gone does not count.
+
+    Args:
+        together: (N, N) which landmarks may be of one thing.
+        look: what the view shows.
+        s: within which bounds.
+    """
+    again = look.found & look.expected
+    others: NDArray[np.int64] = together @ again.astype(np.int64) - again
+    firm = look.expected & (others > 0)
+    rate = ((again & firm).sum() + s.usual * s.weight) / (firm.sum() + s.weight)
+    return float(np.clip(rate, *s.rates))

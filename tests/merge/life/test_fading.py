@@ -16,49 +16,88 @@ from hybridmap.pose import Pose2, PoseGaussian
 from mapserver.living import without_faded
 from mapserver.merging.merger import Merger, MergerSettings
 from merge.graph.links import Link
-from merge.life.fading import Fader, FadingSettings, Look, expected, presence
+from merge.life.fading import FadingSettings, found_again, presence, things
+from merge.life.looks import Look, expected
 from merge.life.renewal import RenewalSettings
 
 S = FadingSettings()
+L = S.looks
 SHARP = Sensing(unknown_depth=0.0, clutter=5, most=150)
 
 
-def look(shown: list[bool], found: list[bool]) -> Look:
-    """A view that finds half of what it should show; the first landmarks are those in question."""
+ALONE = np.eye(21, dtype=np.bool_)
+"""Each landmark is a thing of its own."""
+WORLD = room(0, 0, 6, 4, 40, np.random.default_rng(0))
+NODE = take_node(
+    WORLD, NodeId("a", 1, 1), Pose2(2, 2, 0), PoseGaussian(Pose2(), np.eye(3)), np.random.default_rng(0)
+)
+
+
+def look(shown: list[bool], found: list[bool], visit: int = 0) -> Look:
+    """A view that finds half of what it should show besides; the first landmarks are those in question."""
     rest = [True] * 20
     half = [True, False] * 10
     link = Link(NodeId("a", 1, 1), NodeId("b", 1, 1), PoseGaussian(Pose2(), np.eye(3)))
-    return Look(link, Pose2(), np.array(shown + rest), np.array(found + half))
+    view = replace(NODE, stamp_ns=visit * 10**12)
+    return Look(NODE, view, link, Pose2(), np.array(shown + rest), np.array(found + half))
 
 
 @pytest.mark.parametrize("story", list(product([None, False, True], repeat=4)))
 def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]) -> None:
-    """Every sequence of there and gone, weighed with its probability and that of what was seen."""
-    looks = [look([seen is not None], [bool(seen)]) for seen in story]
+    """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
+    looks = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
     weights = {True: 0.0, False: 0.0}
-    told = [seen for seen in story if seen is not None]
-    rates = [(one.found & one.expected).sum() / one.expected.sum() for one in looks]
-    rates = [rate for rate, seen in zip(rates, story, strict=True) if seen is not None]
+    told = [(seen, found_again(ALONE, one, S)) for seen, one in zip(story, looks, strict=True)]
+    told = [(seen, rate) for seen, rate in told if seen is not None]
     for states in product([True, False], repeat=len(told) + 1):
-        weight = S.at_first if states[0] else 1 - S.at_first
-        for (before, now), seen, rate in zip(pairwise(states), told, rates, strict=True):
-            stays = 1 - S.goes if before else 1 - S.comes
-            weight *= stays if now == before else 1 - stays
-            likely = rate if now else S.mistaken
-            weight *= likely if seen else 1 - likely
-        weights[states[-1]] += weight
-    there = presence(21, looks, S)[0]
+        for veils in product([True, False], repeat=len(told)):
+            weight = S.at_first if states[0] else 1 - S.at_first
+            for (before, now), veil, (seen, rate) in zip(pairwise(states), veils, told, strict=True):
+                stays = 1 - S.goes if before else 1 - S.comes
+                weight *= stays if now == before else 1 - stays
+                weight *= S.hidden if veil else 1 - S.hidden
+                # Who finds by mistake what is gone finds it whatever stands there.
+                likely = (0.0 if veil else rate) if now else S.mistaken
+                weight *= likely if seen else 1 - likely
+            weights[states[-1]] += weight
+    there = presence(ALONE, looks, S)[0]
     assert there == pytest.approx(weights[True] / sum(weights.values()), abs=1e-12)
 
 
-def test_it_takes_many_views_to_fade_and_one_to_come_back() -> None:
-    missed, hit = look([True], [False]), look([True], [True])
-    course = [presence(21, [missed] * k, S)[0] for k in range(20)]
+def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None:
+    """Six landmarks of one thing that all are missed; and one of which nothing is around."""
+    together = np.eye(26, dtype=np.bool_)
+    together[:6, :6] = True
+    # Neighbours that are found tell how often this view finds what is there.
+    together[6:, 6:] = True
+
+    def after(misses: int, hits: int = 0, things: np.ndarray = together) -> np.ndarray:
+        story = [look([True] * 6, [False] * 6, k) for k in range(misses)]
+        story += [look([True] * 6, [True] + [False] * 5, misses + k) for k in range(hits)]
+        return presence(things, story, S)
+
+    course = [after(k)[0] for k in range(12)]
     assert all(later < earlier for earlier, later in pairwise(course))
-    first = next(k for k, there in enumerate(course) if there < S.faint)
-    assert 3 <= first <= 10
-    assert presence(21, [*[missed] * 19, hit], S)[0] > 0.5 > S.faint
-    assert presence(21, [look([False], [False])] * 20, S)[0] == S.at_first, "nobody could have seen it"
+    assert course[1] > S.faint > course[3]
+    assert after(11, 1)[0] > S.faint, "it is back"
+    assert (after(0, 4) > S.faint)[:6].all(), "what is missed beside what is found is not gone"
+    one_visit = [look([True] * 6, [False] * 6, 0)] * 9
+    assert presence(together, one_visit, S)[0] > S.faint, "somebody may have stood before it all the while"
+    lonely = np.eye(26, dtype=np.bool_)
+    lonely[6:, 6:] = True
+    alone = [after(k, things=lonely)[0] for k in range(14)]
+    assert 4 <= next(k for k, there in enumerate(alone) if there < S.faint) <= 12
+    nobody = [look([False] * 6, [False] * 6, k) for k in range(20)]
+    assert presence(together, nobody, S)[0] == S.at_first, "nobody could have seen it"
+
+
+def test_landmarks_near_each_other_may_be_of_one_thing() -> None:
+    together = things(NODE, 0.5)
+    points = NODE.points_in_robot
+    for i, j in product(range(len(points)), repeat=2):
+        near = i == j or bool(np.linalg.norm(points[i] - points[j]) < 0.5)
+        assert together[i, j] == near
+    assert together.any(axis=1).all() and not together.all()
 
 
 def test_expected_is_what_is_in_view_near_enough_and_not_hidden() -> None:
@@ -70,22 +109,22 @@ def test_expected_is_what_is_in_view_near_enough_and_not_hidden() -> None:
     old, new = (
         take_node(world, NodeId("r", k, 1), pose, nothing, rng, SHARP) for k, pose in ((1, here), (2, there))
     )
-    shown = expected(old, new, here.inverse() @ there, S)
+    shown = expected(old, new, here.inverse() @ there, L)
     points = here.apply(old.points_in_robot)
     known = there.apply(new.points_in_robot)
     seen = 0
     for k, point in enumerate(points):
         pixel = CAMERA.project(there.inverse().apply(point[None]))[0]
-        inside = bool(CAMERA.contains(pixel, S.margin_px))
+        inside = bool(CAMERA.contains(pixel, L.margin_px))
         eyes = [pose.apply(np.array([[CAMERA.mount_forward, 0.0, 0.0]]))[0, :2] for pose in (here, there)]
         rays = [point[:2] - eye for eye in eyes]
         far = [float(np.hypot(*ray)) for ray in rays]
         angle = np.arccos(np.clip(rays[0] @ rays[1] / far[0] / far[1], -1, 1))
-        fits = inside and max(far) / min(far) < S.scale and angle < S.aside
+        fits = inside and max(far) / min(far) < L.scale and angle < L.aside
         depth = there.inverse().apply(point[None])[0, 0] - CAMERA.mount_forward
         hidden = any(
-            np.hypot(*(new.landmarks.pixels[j] - pixel)) < S.before_px
-            and there.inverse().apply(other[None])[0, 0] - CAMERA.mount_forward < S.before * depth
+            np.hypot(*(new.landmarks.pixels[j] - pixel)) < L.before_px
+            and there.inverse().apply(other[None])[0, 0] - CAMERA.mount_forward < L.before * depth
             for j, other in enumerate(known)
         )
         assert shown[k] == (fits and not hidden)
@@ -108,7 +147,7 @@ def test_furniture_that_is_moved_fades_and_comes_back() -> None:
     for epoch, now in enumerate(epochs, start=1):
         tour = [Pose2(2.6 + 0.5 * k, 2.0 + rng.normal(0, 0.04), 0.05 * k) for k in range(2)]
         _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
-        merged = Fader().fade(merger.merged())
+        merged = merger.merged()
         node = merged.maps[MapId("r1", 1)].nodes[NodeId("r1", 1, 1)]
         if first is None:
             first = _behind(world, tour[0], node.points_in_robot, thing)
@@ -119,6 +158,35 @@ def test_furniture_that_is_moved_fades_and_comes_back() -> None:
     assert told[9][first].mean() > 0.6, "what has gone has faded"
     assert told[9][~first].mean() < 0.25, "what is there has not, most of it"
     assert told[12][first].mean() < 0.5 * told[9][first].mean(), "what is back is used again"
+
+
+def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it() -> None:
+    """The wall behind has stayed, and tells where the robot stands; half of what is there is found."""
+    rng = np.random.default_rng(3)
+    world = room(0, 0, 6, 4, 1200, rng)
+    wall = np.flatnonzero(world.normals[:, 0] < -0.5)
+    other = replace(world, vectors=world.vectors.copy())
+    other.vectors[wall] = random_vectors(len(wall), rng)
+    fading = FadingSettings(usual=0.5)
+    merger = Merger(settings=MergerSettings(renewal=RenewalSettings(found=10_000), fading=fading))
+    shares = []
+    for epoch, now in enumerate([world, *[other] * 4], start=1):
+        x, y = rng.normal([3.2, 2.0], 0.05)
+        tour = [Pose2(x, y, turn + rng.normal(0, 0.02)) for turn in (np.pi, 0.0)]
+        _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
+        merged = merger.merged()
+        assert len(merged.components) == 1
+        behind, before = (merged.maps[MapId("r1", 1)].nodes[NodeId("r1", 1, k)] for k in (1, 3))
+        if epoch == 1:
+            gone = _behind(world, tour[1], before.points_in_robot, wall)
+        assert not any(before.id in link.pair for link in merged.links)
+        shares.append(
+            [merged.faded.get(n.id, np.zeros(len(n.landmarks), np.bool_)) for n in (behind, before)]
+        )
+    assert gone.sum() >= 30
+    assert not shares[1][1].any(), "one visit is not enough"
+    assert shares[-1][1][gone].mean() > 0.6
+    assert shares[-1][0].mean() < 0.2
 
 
 def _drive(
