@@ -61,8 +61,8 @@ class AbsenceSettings:
     near: float = 1.5
     turn: float = math.radians(50.0)
     lasting: float = 3600.0
-    most_nodes: int = 6
-    most_views: int = 200
+    most_nodes: int = 4
+    most_views: int = 80
     sigma_xy: float = 0.15
     sigma_heading: float = math.radians(3.0)
     margin: float = 0.04
