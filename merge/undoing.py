@@ -118,6 +118,13 @@ def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
     for a, b in pairs:
         if {a, b} == {first, second} or {a.map, b.map} == {first, second}:
             return
+    for edge in merged.maps[MapId(*first[:2])].edges.values():
+        if {edge.a, edge.b} == {first, second} and edge.kind not in CLAIMS:
+            way = f"their robot's way (edge {edge.id}, {edge.kind})"
+            raise InvalidValue(
+                f"{first} and {second} are joined by {way}, and what was measured on it stands; a map "
+                "that is wrong as a whole can be retired"
+            )
     raise InvalidValue(f"no link joins {first} and {second}: there is nothing to undo")
 
 

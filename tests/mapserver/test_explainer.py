@@ -190,7 +190,7 @@ def test_one_link_of_many_can_be_undone(path: Path) -> None:
         assert links(asker.merged()) == before - {pair}
         neighbours = (NodeId("a", 1, 1), NodeId("a", 1, 3))
         if neighbours not in before:
-            assert "nothing to undo" in asker.rule(neighbours).error
+            assert "joined by their robot's way" in asker.rule(neighbours).error
 
 
 def test_merged_without_a_server_is_the_same(path: Path) -> None:

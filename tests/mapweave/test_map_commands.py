@@ -184,6 +184,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
         (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes"),
         (["explain", "--draw", "x.png"], "--draw needs two nodes"),
         (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo"),
+        (["unmerge", "r0.1.3", "r0.1.1"], "joined by their robot's way (edge r0.1.2, "),
         (["unmerge", "r0.1", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
         (["unmerge", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; its 4 nodes are 1 to 7"),
         (["unmerge", "r0.1", "r0.1"], "two different maps"),
