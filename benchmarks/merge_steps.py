@@ -21,7 +21,8 @@ from benchmarks.merge_building import LINK_SIGMAS, LOOKS, TURN_SIGMAS, WALK_SIGM
 from hybridmap.pose import Array
 from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
 from merge.graph.posegraph import ANCHOR_SIGMA
-from merge.incremental.factors import Factors, RelaxSettings, relax
+from merge.incremental.factors import Factors
+from merge.incremental.relaxing import RelaxSettings, relax
 from merge.incremental.settings import StepSettings
 
 NODES_A_MAP = 100

@@ -1,10 +1,9 @@
-"""Measurements of a large pose graph in columns, and Gauss-Newton on as much of it as a change bears on."""
+"""Measurements of a large pose graph in columns."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,9 +12,12 @@ from numpy.typing import NDArray
 
 from hybridmap.pose import Array
 from hybridmap.recognising.pose_arrays import adjoints, compose_poses, inverse_poses
-from merge.graph.posegraph import Measurement, factorized
+from merge.graph.posegraph import Measurement
 
 Rows = NDArray[np.int64]
+CURVED = 0.99
+"""Share of the curvature of Huber's loss that Newton's steps heed: with all of it, nothing would hold what a
+single limited measurement ties."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,122 +129,56 @@ class Factors:
         limited = self.robust & (size > huber)
         return float(np.where(limited, huber * (size - 0.5 * huber), 0.5 * squared).sum())
 
-    def system(self, means: Array, huber: float) -> tuple[sparse.csc_matrix, Array]:
-        """(3N, 3N) information of all right perturbations, and (3N,) how the residuals pull at them."""
+    @cached_property
+    def _layout(self) -> tuple[Rows, Rows, Rows, Rows]:
+        """Of the blocks (a, a), (a, b), (b, a), (b, b): their order by rows and columns, and where in it each
+        seat of the information begins; rows and columns of the seats.
+        """
+        rows, columns = np.concatenate([self.a, self.a, self.b, self.b]), np.concatenate([self.a, self.b] * 2)
+        order = np.lexsort([columns, rows])
+        rows, columns = rows[order], columns[order]
+        new = np.ones(len(rows), np.bool_)
+        new[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1])
+        starts = np.flatnonzero(new)
+        return order, starts, rows[starts], columns[starts]
+
+    def system(self, means: Array, huber: float, curved: bool = False) -> tuple[sparse.csc_matrix, Array]:
+        """(3N, 3N) information of all right perturbations, and (3N,) how the residuals pull at them.
+
+        Args:
+            means: (N, 3) where the nodes are.
+            huber: normalised residual from which a robust measurement pulls no harder.
+            curved: with the curvature of the loss: what pulls no harder resists no more where it pulls
+                either. That is Newton's step, which is good near the solution only.
+        """
         off = self.residuals(means)
         weights = self.weights
-        size = np.sqrt(np.einsum("ni,nij,nj->n", off, weights, off))
-        held_back = self.robust & (size > huber)
-        if held_back.any():
+        pulled = np.einsum("nij,nj->ni", weights, off)
+        squared = np.einsum("ni,ni->n", off, pulled)
+        limited = np.flatnonzero(self.robust & (squared > huber**2))
+        if len(limited):
+            held_back = huber / np.sqrt(squared[limited])
             weights = weights.copy()
-            weights[held_back] *= (huber / size[held_back])[:, None, None]
+            if curved:
+                along = np.einsum("ni,nj->nij", pulled[limited], pulled[limited])
+                weights[limited] -= CURVED * along / squared[limited, None, None]
+            weights[limited] *= held_back[:, None, None]
+            pulled[limited] *= held_back[:, None]
         by_b = _inverse_right_jacobians(off)
         by_a = -by_b @ adjoints(compose_poses(inverse_poses(means[self.b]), means[self.a]))
         from_a, from_b = by_a.transpose(0, 2, 1) @ weights, by_b.transpose(0, 2, 1) @ weights
-        blocks = np.concatenate([from_a @ by_a, from_a @ by_b, from_b @ by_a, from_b @ by_b])
-        rows, columns = np.concatenate([self.a, self.a, self.b, self.b]), np.concatenate([self.a, self.b] * 2)
-        k = np.arange(3)
-        i = np.broadcast_to(3 * rows[:, None, None] + k[:, None], blocks.shape)
-        j = np.broadcast_to(3 * columns[:, None, None] + k, blocks.shape)
-        shape = (3 * len(means), 3 * len(means))
         pull = np.zeros((len(means), 3))
-        np.add.at(pull, self.a, -np.einsum("nij,nj->ni", from_a, off))
-        np.add.at(pull, self.b, -np.einsum("nij,nj->ni", from_b, off))
-        entries = (blocks.ravel(), (i.ravel(), j.ravel()))
-        return sparse.csc_matrix(sparse.coo_matrix(entries, shape=shape)), pull.ravel()
-
-
-@dataclass(frozen=True)
-class RelaxSettings:
-    """How far a change is followed through the graph.
-
-    Attributes:
-        least: nodes that are moved at first.
-        growth: so many times as many are moved next, if those at the rim would go on moving.
-        rim_xy: moves of nodes at the rim that do not matter, m.
-        rim_heading: the same, rad.
-        rounds: of Gauss-Newton at most.
-        step: they end when nothing moves by more than this, m or rad.
-    """
-
-    least: int = 400
-    growth: int = 4
-    rim_xy: float = 3e-4
-    rim_heading: float = 1e-4
-    rounds: int = 25
-    step: float = 1e-8
-
-
-def relax(
-    factors: Factors, means: Array, held: Rows, touched: Rows, huber: float, s: RelaxSettings
-) -> tuple[Array, Rows]:
-    """Optimise what a change bears on, from where it was.
-
-    Nodes further and further away are moved along, until those at the rim stay where they are. What is not
-    moved holds the rest.
-
-    Args:
-        factors: all measurements.
-        means: (N, 3) where the nodes are.
-        held: rows that never move, one in each component.
-        touched: rows where something has changed.
-        huber: normalised residual from which a robust measurement pulls no harder.
-        s: how far.
-
-    Returns:
-        Where the nodes are then, and the rows that were moved.
-    """
-    fixed = np.zeros(len(means), np.bool_)
-    fixed[held] = True
-    if not len(touched):
-        return means, touched
-    before, rows = means, factors.around(touched, s.least, len(means))
-    # How far the change reaches is seen before it is worked out to the last digit.
-    rough = replace(s, step=max(s.step, 0.5 * min(s.rim_xy, s.rim_heading)))
-    while True:
-        means = _moved(factors, means, rows[~fixed[rows]], huber, rough)
-        inside = np.zeros(len(means), np.bool_)
-        inside[rows] = True
-        index = factors.at(rows)
-        a, b = factors.a[index], factors.b[index]
-        rim = np.unique(np.concatenate([a[~inside[b]], b[~inside[a]]]))
-        off = np.abs(compose_poses(inverse_poses(before[rim]), means[rim]))
-        moves = (off[:, :2] >= s.rim_xy).any(axis=1) | (off[:, 2] >= s.rim_heading)
-        if not moves.any():
-            return _moved(factors, means, rows[~fixed[rows]], huber, s), rows
-        # Where the rim stays, nothing more has to be moved.
-        more = math.ceil((s.growth - 1) * len(rows) * moves.mean())
-        rows = np.union1d(rows, factors.around(rim[moves], more, len(means)))
-
-
-def _moved(factors: Factors, means: Array, free: Rows, huber: float, s: RelaxSettings) -> Array:
-    """Gauss-Newton on some nodes, the others held."""
-    if not len(free):
-        return means
-    index = factors.at(free)
-    others = np.setdiff1d(np.concatenate([factors.a[index], factors.b[index]]), free)
-    rows = np.concatenate([free, others])
-    row_of = np.zeros(len(means), np.int64)
-    row_of[rows] = np.arange(len(rows))
-    part, here, n = factors.take(index, row_of), means[rows], 3 * len(free)
-    cost, damping = part.cost(here, huber), 0.0
-    for _ in range(s.rounds):
-        information, pull = part.system(here, huber)
-        inner = information[:n, :n]
-        damped = inner + sparse.diags(damping * inner.diagonal()) if damping else inner
-        step = factorized(damped).solve(pull[:n]).reshape(-1, 3)
-        moved = here.copy()
-        moved[: len(free)] = compose_poses(here[: len(free)], step)
-        after = part.cost(moved, huber)
-        if after > cost * (1.0 + 1e-12) + 1e-12:
-            damping = max(10.0 * damping, 1e-4)
-            continue
-        here, cost, damping = moved, after, 0.1 * damping
-        if np.abs(step).max() < s.step:
-            break
-    out = means.copy()
-    out[free] = here[: len(free)]
-    return out
+        np.add.at(pull, self.a, -np.einsum("nji,nj->ni", by_a, pulled))
+        np.add.at(pull, self.b, -np.einsum("nji,nj->ni", by_b, pulled))
+        order, starts, rows, columns = self._layout
+        blocks = np.concatenate([from_a @ by_a, from_a @ by_b, from_b @ by_a, from_b @ by_b])[order]
+        seats = np.add.reduceat(blocks, starts) if len(starts) else blocks
+        begins = np.searchsorted(rows, np.arange(len(means) + 1))
+        shape = (3 * len(means), 3 * len(means))
+        by_rows = sparse.bsr_matrix((seats, columns, begins), shape=shape).tocsr()
+        # Columns of a symmetric matrix are its rows.
+        entries = by_rows.data, by_rows.indices, by_rows.indptr
+        return sparse.csc_matrix(entries, shape=shape), pull.ravel()
 
 
 def _logarithms(poses: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from merge.incremental.factors import RelaxSettings
+from merge.incremental.relaxing import RelaxSettings
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,11 @@ from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap, Postures
 from merge.incremental.clashes import falling
 from merge.incremental.decided import Decided
-from merge.incremental.factors import RelaxSettings, Rows, relax
+from merge.incremental.factors import Rows
 from merge.incremental.graph import WideGraph
 from merge.incremental.joining import join
 from merge.incremental.ledger import Ledger, ends_of
+from merge.incremental.relaxing import RelaxSettings, relax
 from merge.incremental.settings import StepSettings
 from merge.incremental.sheets import Assembly, MapPair, Sheet
 from merge.incremental.verdicts import Verdicts

@@ -13,8 +13,8 @@ from hybridmap.ruling import Ruling, Rulings
 from merge.graph.candidates import Pair
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
-from merge.incremental.factors import RelaxSettings, relax
 from merge.incremental.graph import WideGraph
+from merge.incremental.relaxing import RelaxSettings, relax
 from merge.incremental.verdicts import Verdict, Verdicts
 from merge.merging import merge_maps
 from merge.undoing import undo

@@ -14,9 +14,10 @@ from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.recognising.pose_arrays import compose_poses
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import Measurement, PoseGraph
-from merge.incremental.factors import Factors, RelaxSettings
+from merge.incremental.factors import Factors
 from merge.incremental.graph import WideGraph
 from merge.incremental.islands import Islands
+from merge.incremental.relaxing import RelaxSettings
 from merge.incremental.settings import StepSettings
 from merge.incremental.steps import Steps
 from merge.merging import MergeSettings
