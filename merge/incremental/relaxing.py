@@ -85,7 +85,7 @@ def relax(
 def _moving_rim(
     factors: Factors, before: Array, means: Array, rows: Rows, s: RelaxSettings
 ) -> tuple[Rows, float]:
-    """Rows with neighbours that were not moved, and that have moved; and how many of all at the rim these are."""
+    """Rows that have moved beside rows that were held; and how many these are of all at the rim."""
     inside = np.zeros(len(means), np.bool_)
     inside[rows] = True
     index = factors.at(rows)

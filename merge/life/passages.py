@@ -56,6 +56,10 @@ class Passages:
                 self._links.setdefault(end, []).append(link)
         self._false = {refusal.edge for refusal in merged.refused if refusal.edge is not None}
 
+    def has(self, node: NodeId) -> bool:
+        """Whether a node is left."""
+        return node not in self._gone
+
     def remove(self, node: NodeId) -> None:
         """Leave a node out from now on."""
         self._gone.add(node)

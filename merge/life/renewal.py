@@ -21,9 +21,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hybridmap.node import Node, NodeId
-from hybridmap.pose import Pose2, wrap_angle
+from hybridmap.pose import Pose2
 from hybridmap.reach import ReachSettings, least_in_view
 from hybridmap.reach_book import ReachBook
+from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
 from hybridmap.superseded import Superseded
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
@@ -157,6 +158,7 @@ class _Round:
         for node, fate in fates.items():
             self._stands_for.setdefault(fate.by, set()).add(node)
         self._passages = passages
+        self._basins: dict[NodeId, list[tuple[NodeId, Pose2]]] = {}
 
     def revive(self) -> set[NodeId]:
         """Give life back to nodes whose successor is too far off now, or shown to be wrong."""
@@ -201,11 +203,8 @@ class _Round:
 
     def _since(self, node: NodeId) -> int:
         """How many newer nodes of other visits, superseded or not, are within the basin."""
-        one, count = self._nodes[node], 0
-        for other in self._passages.around(node, self._settings.reach.farthest, also_gone=True):
-            newer = is_older(one, self._nodes[other]) and not self._one_visit(one, self._nodes[other])
-            count += newer and abs(self._between(node, other).heading) <= self._settings.reach.widest
-        return count
+        one, others = self._nodes[node], (self._nodes[other] for other, _ in self._like(node))
+        return sum(is_older(one, other) and not self._one_visit(one, other) for other in others)
 
     def _try(self, node: NodeId) -> None:
         """Leave a node out if others stand for it, and for all that it stood for."""
@@ -231,21 +230,32 @@ class _Round:
 
     def _heir(self, orphan: NodeId, but: NodeId) -> Superseded | None:
         """Who stands for a node if it is not the one given: the living one that is most like it."""
-        around = self._passages.around(orphan, self._settings.reach.farthest)
-        for other in sorted(around, key=lambda one: (self._unlikeness(orphan, one), one)):
-            if other != but:
-                fate = self._covers(orphan, other)
+        for other, between in self._like(orphan):
+            if other != but and self._passages.has(other):
+                fate = self._covers(orphan, other, between)
                 if fate is not None:
                     return fate
         return None
 
-    def _covers(self, one: NodeId, other: NodeId) -> Superseded | None:
-        """Whether the other one can stand for the one."""
+    def _like(self, node: NodeId) -> list[tuple[NodeId, Pose2]]:
+        """Nodes within the basin, living or not, and how they stand to it: those most like it first."""
+        if node not in self._basins:
+            s = self._settings.reach
+            around = self._passages.around(node, s.farthest, also_gone=True)
+            here = self._merged.pose(node).vector[None]
+            there = np.array([self._merged.pose(other).vector for other in around]).reshape(-1, 3)
+            between = compose_poses(inverse_poses(here), there)
+            distances, turns = np.hypot(between[:, 0], between[:, 1]), np.abs(between[:, 2])
+            order = np.argsort(distances / s.farthest + turns / s.widest, kind="stable")
+            inside = (distances <= s.farthest) & (turns <= s.widest)
+            self._basins[node] = [
+                (around[k], Pose2.from_vector(between[k])) for k in order[inside[order]].tolist()
+            ]
+        return self._basins[node]
+
+    def _covers(self, one: NodeId, other: NodeId, between: Pose2) -> Superseded | None:
+        """Whether the other one, which is within the basin, can stand for the one."""
         s, a, b = self._settings, self._nodes[one], self._nodes[other]
-        between = self._between(one, other)
-        distance, turn = between.distance(Pose2()), abs(between.heading)
-        if distance > s.reach.farthest or turn > s.reach.widest:
-            return None
         if self._one_visit(a, b):
             return None
         if b.landmarks.has_depth.sum() < min(s.depths * a.landmarks.has_depth.sum(), s.enough):
@@ -255,7 +265,9 @@ class _Round:
             return None
         link = link if link.a == one else link.turned()
         found = least_in_view(link.shared, a, b, between, s.reach.stops)
-        return Superseded(other, found, distance, turn) if found >= s.found else None
+        if found < s.found:
+            return None
+        return Superseded(other, found, between.distance(Pose2()), abs(between.heading))
 
     def _compare(self, a: Node, b: Node) -> Link | None:
         """A link between two nodes that the merge had no need to compare; one that it refused is none."""
@@ -276,10 +288,6 @@ class _Round:
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2:
         return self._merged.pose(a).inverse() @ self._merged.pose(b)
-
-    def _unlikeness(self, a: NodeId, b: NodeId) -> float:
-        between, s = self._between(a, b), self._settings.reach
-        return between.distance(Pose2()) / s.farthest + abs(wrap_angle(between.heading)) / s.widest
 
 
 def _ordered(a: NodeId, b: NodeId) -> tuple[NodeId, NodeId]:
