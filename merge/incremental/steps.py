@@ -233,9 +233,9 @@ class Steps:
         self._relax(self._all.rows(sorted(there)), how, self._plain)
         self._keep()
 
-    def _relax_all(self, believed: bool) -> None:
-        rows = np.arange(len(self._all.means))
-        self._relax(rows, replace(self._steps.relax, least=len(rows)), believed)
+    def _relax_all(self, believed: bool, step: float | None = None) -> None:
+        rows, how = np.arange(len(self._all.means)), self._steps.relax
+        self._relax(rows, replace(how, least=len(rows), step=step or how.step), believed)
         self._keep()
 
     def _relax(self, rows: Rows, how: RelaxSettings, believed: bool) -> None:
@@ -252,7 +252,7 @@ class Steps:
         elif last:
             self._relax_all(believed=False)
         else:
-            self._follow(nodes, replace(self._steps.relax, rim_xy=3e-3, rim_heading=1e-3, step=1e-3))
+            self._relax_all(believed=False, step=1e-4)
         return self._all
 
     def _strained(self) -> list[Link]:
