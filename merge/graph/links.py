@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ class Link:
     shared: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     evidence: dict[str, float] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def pair(self) -> tuple[NodeId, NodeId]:
         """(a, b): there is at most one link between two nodes."""
         return self.a, self.b

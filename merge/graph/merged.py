@@ -42,14 +42,17 @@ class Postures(Mapping[NodeId, Placement]):
     def __init__(self, graphs: Sequence[PoseGraph]) -> None:
         """Take the components, largest first."""
         self._graphs = tuple(graphs)
-        self._numbers: dict[MapId, list[int]] = {}
+        self._numbers: dict[tuple[str, int], list[int]] = {}
         for number, graph in enumerate(self._graphs):
             for map_id in graph.maps:
                 self._numbers.setdefault(map_id, []).append(number)
 
     def number(self, node: NodeId) -> int | None:
         """Of the node's component; None if it is not there."""
-        return next((k for k in self._numbers.get(node.map, ()) if node in self._graphs[k].rows), None)
+        for number in self._numbers.get(node[:2], ()):
+            if node in self._graphs[number].rows:
+                return number
+        return None
 
     def pose(self, node: NodeId) -> Pose2:
         """Where a node is, without covariance, which costs more than all the rest.

@@ -28,7 +28,7 @@ def neighbours(sheets: Mapping[MapId, Sheet], changed: set[MapId]) -> list[MapId
     boxes = {
         map_id: (sheet.means[:, :2].min(axis=0) - SIGHT / 2, sheet.means[:, :2].max(axis=0) + SIGHT / 2)
         for map_id, sheet in sheets.items()
-        if len(sheet.nodes) and any(node.clock for node in sheet.one.nodes.values())
+        if len(sheet.nodes) and sheet.clocked
     }
     near = {
         other

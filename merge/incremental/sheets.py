@@ -38,6 +38,7 @@ class Sheet:
         factors: its own measurements that are believed.
         means: (N, 3) m, m, rad, where the nodes are in the merged map.
         undone: claims of it that people have ruled out.
+        clocked: whether any of its nodes has a clock that others may share.
     """
 
     one: HybridMap
@@ -47,6 +48,7 @@ class Sheet:
     factors: Factors
     means: Array
     undone: tuple[RefusedLink, ...] = ()
+    clocked: bool = False
 
     @staticmethod
     def of(
@@ -80,7 +82,8 @@ class Sheet:
                     near = there[int(np.abs(numbers - node.number).argmin())]
                     pose = known[near] @ (piece.graph.pose(near).inverse() @ piece.graph.pose(node))
                 means[rows[node]] = (pose or piece.graph.pose(node)).vector
-        return Sheet(one, pieces, nodes, rows, factors, means, tuple(undone))
+        clocked = any(node.clock for node in one.nodes.values())
+        return Sheet(one, pieces, nodes, rows, factors, means, tuple(undone), clocked)
 
     def said(self) -> set[tuple[NodeId, NodeId, Pose2]]:
         """Its own measurements."""

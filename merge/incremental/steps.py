@@ -61,6 +61,7 @@ class Steps:
         self._since = self._rough = 0
         self._touched: set[NodeId] = set()
         self._plain = True
+        self._ruled: Rulings | None = None
         self._moved: Rows = np.zeros(0, np.int64)
         self._all = Assembly({}, {})
 
@@ -118,6 +119,7 @@ class Steps:
         """
         self._leave(self._sheets.keys() - maps.keys())
         changed = {one for one in maps if self._place(one, maps[one], rulings)}
+        self._ruled = rulings
         fresh = {pair for pair in news if pair[0] in maps and pair[1] in maps}
         known, ledger = self._ledger.known, self._ledger
         ledger.weigh(fresh, verdicts)
@@ -188,6 +190,8 @@ class Steps:
     ) -> bool:
         """Make the sheet of a map anew if it has changed."""
         s, before = self._settings, self._sheets.get(map_id)
+        if before is not None and before.one is one and rulings is self._ruled:
+            return False
         undone = undo({map_id: one}, (), rulings)
         gone = [r.edge for r in undone.refused]
         if before is not None and before.one is one and gone == [r.edge for r in before.undone]:
