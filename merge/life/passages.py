@@ -12,9 +12,9 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId, NodeId
 from hybridmap.reach import RECOGNISED
 from hybridmap.reach_book import ReachBook
-from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import PoseGraph
+from merge.life.adjacency import Adjacency
 
 
 class Passages:
@@ -26,7 +26,7 @@ class Passages:
     def __init__(
         self,
         merged: MergedMap,
-        links: Iterable[Link],
+        links: Adjacency,
         reaches: ReachBook,
         near: float,
         foreign: Iterable[Edge] = (),
@@ -36,7 +36,7 @@ class Passages:
 
         Args:
             merged: the map.
-            links: of it, of the components that are asked about.
+            links: of it.
             reaches: what is known of edges; it is written to.
             near: m, nodes nearer than this to each other stand in one place.
             foreign: edges that lead out of the maps that tell them, see `ForeignEdges`.
@@ -50,10 +50,7 @@ class Passages:
         for edge in foreign:
             for end in (edge.a, edge.b):
                 self._foreign.setdefault(end, []).append(edge)
-        self._links: dict[NodeId, list[Link]] = {}
-        for link in links:
-            for end in link.pair:
-                self._links.setdefault(end, []).append(link)
+        self._links = links
         self._false = {refusal.edge for refusal in merged.refused if refusal.edge is not None}
 
     def has(self, node: NodeId) -> bool:
@@ -131,7 +128,7 @@ class Passages:
     def _edges(self, node: NodeId) -> Iterator[Edge]:
         one = self._merged.maps[node.map]
         own = (one.edges[edge_id] for _, _, edge_id in one.graph.edges(node, keys=True))
-        links = (link.edge() for link in self._links.get(node, ()))
+        links = (link.edge() for link in self._links.at(node))
         for edge in (*own, *links, *self._foreign.get(node, ())):
             if edge.id not in self._false and self._drivable(edge):
                 yield edge

@@ -30,6 +30,7 @@ from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import PoseGraph
 from merge.graph.verification import VerificationSettings
+from merge.life.adjacency import Adjacency
 from merge.life.ages import is_older
 from merge.life.comparisons import Comparisons
 from merge.life.passages import ForeignEdges, Passages
@@ -85,7 +86,7 @@ class Renewer:
         self._reaches = reaches or ReachBook()
         self._fates: dict[NodeId, Superseded] = {}
         self._seen: dict[NodeId, Node] = {}
-        self._linked: set[tuple[NodeId, NodeId]] = set()
+        self._links = Adjacency()
         self._graphs: tuple[PoseGraph, ...] = ()
         self._foreign = ForeignEdges()
         self._firm: dict[NodeId, NodeId] = {}
@@ -99,9 +100,8 @@ class Renewer:
         nodes = self._changed(merged)
         anew = {node for node, one in nodes.items() if self._seen.get(node) is not one}
         self._seen |= nodes
-        links = [link for link in merged.links if link.a in nodes]
-        fresh = anew | {node for link in links if link.pair not in self._linked for node in link.pair}
-        self._linked = {link.pair for link in merged.links}
+        fresh = {node for link in self._links.follow(merged.links) for node in link.pair}
+        fresh = anew | fresh & nodes.keys()
         # One that is known better is judged anew, as are those that it stood for.
         for node, fate in tuple(self._fates.items()):
             if node not in self._seen or fate.by not in self._seen or {node, fate.by} & anew:
@@ -110,8 +110,8 @@ class Renewer:
         if nodes:
             s = self._settings
             foreign = self._foreign.of(merged.maps)
-            passages = Passages(merged, links, self._reaches, s.near, foreign, self._fates)
-            this = _Round(merged, nodes, links, self._fates, self._firm, passages, self._comparisons, s)
+            passages = Passages(merged, self._links, self._reaches, s.near, foreign, self._fates)
+            this = _Round(merged, nodes, self._links, self._fates, self._firm, passages, self._comparisons, s)
             this.look_at(fresh | this.revive())
         return replace(merged, superseded=dict(sorted(self._fates.items())))
 
@@ -142,7 +142,7 @@ class _Round:
         self,
         merged: MergedMap,
         nodes: dict[NodeId, Node],
-        links: Iterable[Link],
+        links: Adjacency,
         fates: dict[NodeId, Superseded],
         firm: dict[NodeId, NodeId],
         passages: Passages,
@@ -152,7 +152,7 @@ class _Round:
         self._merged, self._nodes, self._fates, self._firm = merged, nodes, fates, firm
         self._settings = settings
         self._comparisons = comparisons
-        self._links = {link.pair: link for link in links}
+        self._links = links
         self._refused = {refusal.pair for refusal in merged.refused if refusal.edge is None}
         self._stands_for: dict[NodeId, set[NodeId]] = {}
         for node, fate in fates.items():
@@ -260,7 +260,7 @@ class _Round:
             return None
         if b.landmarks.has_depth.sum() < min(s.depths * a.landmarks.has_depth.sum(), s.enough):
             return None
-        link = self._links.get(_ordered(one, other)) or self._compare(a, b)
+        link = self._links.between(one, other) or self._compare(a, b)
         if link is None:
             return None
         link = link if link.a == one else link.turned()
