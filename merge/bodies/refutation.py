@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import networkx as nx
+import numpy as np
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -20,6 +21,8 @@ from merge.graph.posegraph import PoseGraph
 
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, smaller first."""
+SIGHT = 8.0
+"""Robots further apart than this neither meet nor see each other, m."""
 
 
 class Refutation:
@@ -94,17 +97,37 @@ class Refutation:
     def _clashes(self, solved: Sequence[PoseGraph]) -> Iterator[tuple[Key, Clash]]:
         """Pairs of fragments in one component that clash, by whichever clock says so most clearly."""
         for graph in solved:
-            names = [name for name in self._trails if name in graph.rows]
-            for k, first in enumerate(names):
-                for second in names[k + 1 :]:
-                    found = [
-                        clash_of(graph, one, two, self._exclusion)
-                        for one in self._trails[first]
-                        for two in self._trails[second]
-                    ]
-                    clashes = [clash for clash in found if clash is not None]
-                    if clashes:
-                        yield (first, second), max(clashes, key=lambda clash: clash.evidence)
+            trails = [
+                (name, trail) for name, some in self._trails.items() if name in graph.rows for trail in some
+            ]
+            found: dict[Key, list[Clash]] = {}
+            for k, other in _near(graph, [trail for _, trail in trails]):
+                (first, one), (second, two) = trails[k], trails[other]
+                clash = clash_of(graph, one, two, self._exclusion) if first != second else None
+                if clash is not None:
+                    found.setdefault((first, second), []).append(clash)
+            for key, clashes in found.items():
+                yield key, max(clashes, key=lambda clash: clash.evidence)
+
+
+def _near(graph: PoseGraph, trails: Sequence[Trail]) -> Iterator[tuple[int, int]]:
+    """Pairs of trails of different robots that overlap in time, by one clock, and come near each other.
+
+    Of a thousand robots in a large building few ever meet, and to look closely takes long.
+    """
+    if not trails:
+        return
+    clocks = np.unique([trail.clock for trail in trails], return_inverse=True)[1]
+    agents = np.unique([trail.agent for trail in trails], return_inverse=True)[1]
+    times = np.array([(trail.times[0], trail.times[-1]) for trail in trails])
+    places = [graph.means[graph.index(trail.nodes), :2] for trail in trails]
+    low, high = np.array([(one.min(axis=0), one.max(axis=0)) for one in places]).transpose(1, 0, 2)
+    for k in range(len(trails) - 1):
+        rest = slice(k + 1, None)
+        near = (clocks[rest] == clocks[k]) & (agents[rest] != agents[k])
+        near &= (times[rest, 0] <= times[k, 1]) & (times[rest, 1] >= times[k, 0])
+        near &= ((low[rest] <= high[k] + SIGHT) & (high[rest] >= low[k] - SIGHT)).all(axis=1)
+        yield from ((k, k + 1 + other) for other in np.flatnonzero(near).tolist())
 
 
 def _weakest_on_the_way(weights: Mapping[Key, int], start: NodeId, end: NodeId) -> Key:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridmap.node import MapId, NodeId
 from merge.belief.joining import Solver
-from merge.bodies.refutation import Refutation
+from merge.bodies.refutation import SIGHT, Refutation
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link
 from merge.incremental.graph import WideGraph
@@ -19,8 +19,6 @@ from merge.merging import MergeSettings
 
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, smaller first."""
-SIGHT = 8.0
-"""Robots further apart than this neither meet nor see each other, m."""
 
 
 def neighbours(sheets: Mapping[MapId, Sheet], changed: set[MapId]) -> list[MapId]:

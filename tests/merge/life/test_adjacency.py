@@ -12,20 +12,21 @@ from merge.graph.links import Link
 from merge.life.adjacency import Adjacency
 
 NODES = [NodeId(agent, 1, number) for agent in ("r0", "r1") for number in range(4)]
+Ends = tuple[NodeId, NodeId]
 PAIRS = [(a, b) for k, a in enumerate(NODES) for b in NODES[k + 1 :]]
 
 
-def link(pair: tuple[NodeId, NodeId]) -> Link:
+def link(pair: Ends) -> Link:
     return Link(*pair, PoseGaussian(Pose2(), np.eye(3)))
 
 
 @given(st.lists(st.dictionaries(st.sampled_from(PAIRS), st.integers(0, 1), max_size=12), max_size=6))
 def test_the_last_links_are_told_and_only_new_pairs_are_fresh(
-    rounds: list[dict[tuple[NodeId, NodeId], int]],
+    rounds: list[dict[Ends, int]],
 ) -> None:
     # Two links of each pair: it may be measured anew.
     links = [{pair: link(pair) for pair in PAIRS} for _ in range(2)]
-    known, before = Adjacency(), set[tuple[NodeId, NodeId]]()
+    known, before = Adjacency(), set[Ends]()
     for chosen in rounds:
         now = [links[which][pair] for pair, which in chosen.items()]
         assert {one.pair for one in known.follow(now)} == set(chosen) - before
