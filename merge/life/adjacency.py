@@ -9,10 +9,15 @@ from merge.graph.links import Link
 
 
 class Adjacency:
-    """Which links there are at a node. Only what has come or gone costs more than a glance."""
+    """Which links there are at a node. Only what has come or gone costs more than a glance.
+
+    Attributes:
+        touched: nodes at which links have come or gone with the last merged map.
+    """
 
     def __init__(self) -> None:
         """No links yet."""
+        self.touched: set[NodeId] = set()
         self._links: dict[int, Link] = {}
         self._at: dict[NodeId, dict[NodeId, Link]] = {}
 
@@ -26,6 +31,7 @@ class Adjacency:
         gone = [link for key, link in self._links.items() if key not in now]
         come = [link for key, link in now.items() if key not in self._links]
         fresh = [link for link in come if self.between(link.a, link.b) is None]
+        self.touched = {node for link in (*gone, *come) for node in link.pair}
         for link in gone:
             for one, other in (link.pair, link.pair[::-1]):
                 del self._at[one][other]

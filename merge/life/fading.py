@@ -20,7 +20,7 @@ where it stands.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,7 +32,9 @@ from hybridmap.pose import Array, Pose2
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import PoseGraph
+from merge.life.adjacency import Adjacency
 from merge.life.ages import is_older
+from merge.life.drift import Drift
 from merge.life.looks import Look, LookSettings
 
 SECOND = 1_000_000_000
@@ -93,9 +95,13 @@ class Fader:
             settings: when a landmark has faded.
         """
         self._settings = settings or FadingSettings()
+        s = self._settings
         self._looks: dict[NodeId, list[Look]] = {}
         self._faded: dict[NodeId, NDArray[np.bool_]] = {}
         self._graphs: tuple[PoseGraph, ...] = ()
+        self._links = Adjacency()
+        # Two nodes have drifted by a part of what matters each, since one of them was looked at and before.
+        self._drift = Drift(s.moved / 8.0, s.moved / (4.0 * s.near))
 
     def fade(self, merged: MergedMap) -> MergedMap:
         """The same map with the landmarks that have faded, of nodes that no others stand for.
@@ -105,39 +111,59 @@ class Fader:
         """
         solved = {id(graph) for graph in self._graphs}
         self._graphs = merged.graphs
-        for table in (self._looks, self._faded):
-            for node_id in [one for one in table if merged.component_of(one) is None]:
-                del table[node_id]
-        links: dict[NodeId, dict[NodeId, Link]] = {}
-        for link in merged.links:
-            for one, other in (link.pair, link.pair[::-1]):
-                links.setdefault(one, {})[other] = link
+        self._links.follow(merged.links)
+        for node_id in self._drift.gone(merged.components):
+            self._looks.pop(node_id, None)
+            self._faded.pop(node_id, None)
         for graph in merged.graphs:
             if id(graph) not in solved:
-                self._fade(merged, graph, links)
+                self._fade(merged, graph)
         living = {one: gone for one, gone in sorted(self._faded.items()) if one not in merged.superseded}
         return replace(merged, faded=living)
 
-    def _fade(self, merged: MergedMap, graph: PoseGraph, links: dict[NodeId, dict[NodeId, Link]]) -> None:
+    def _fade(self, merged: MergedMap, graph: PoseGraph) -> None:
         nodes = [merged.maps[node.map].nodes[node] for node in graph.nodes]
-        tree = cKDTree(graph.means[:, :2])
-        for row, node in enumerate(nodes):
-            if node.id in merged.superseded:
-                continue
-            linked = links.get(node.id, {})
-            turns = graph.means[:, 2] - graph.means[row, 2]
-            near = [
-                nodes[k]
-                for k in tree.query_ball_point(graph.means[row, :2], self._settings.near)
-                if math.cos(turns[k]) > math.cos(self._settings.turned)
-            ]
+        tree, s = cKDTree(graph.means[:, :2]), self._settings
+        for row in self._affected(graph, nodes, tree, merged.superseded):
+            node = nodes[row]
+            linked = {link.b if link.a == node.id else link.a: link for link in self._links.at(node.id)}
+            near = [nodes[k] for k in self._around(graph, row, tree)]
             views = self._views(node, near, [nodes[graph.rows[one]] for one in linked])
+            before = self._looks.get(node.id)
             self._looks[node.id] = looks = self._seen(merged, graph, node, views, linked)
-            s = self._settings
+            if before is not None and list(map(id, before)) == list(map(id, looks)):
+                continue
             gone = presence(things(node, s.thing), [one for one in looks if tells(one, s)], s) < s.faint
             self._faded.pop(node.id, None)
             if gone.any():
                 self._faded[node.id] = gone
+
+    def _affected(
+        self, graph: PoseGraph, nodes: Sequence[Node], tree: cKDTree, but: Container[NodeId]
+    ) -> list[int]:
+        """Rows of nodes of which the later views may tell something else than they did before."""
+        told = self._drift.told(nodes, graph.means)
+        touched = [graph.rows[node] for node in self._links.touched if node in graph.rows]
+        seen = np.array([node.id in self._looks for node in nodes], np.bool_)
+        affected = told | ~seen
+        affected[touched] = True
+        if not told.all():
+            for row in np.flatnonzero(told).tolist():
+                affected[self._around(graph, row, tree)] = True
+                views = (one for link in self._links.at(nodes[row].id) for one in link.pair)
+                affected[[graph.rows[one] for one in views]] = True
+        rows = np.flatnonzero(affected).tolist()
+        for node in (nodes[row].id for row in rows if nodes[row].id in but):
+            # If it comes back to life it is looked at anew.
+            self._looks.pop(node, None)
+        return [row for row in rows if nodes[row].id not in but]
+
+    def _around(self, graph: PoseGraph, row: int, tree: cKDTree) -> list[int]:
+        """Rows of nodes that stand near a node and look about the same way, itself among them."""
+        near = np.sort(tree.query_ball_point(graph.means[row, :2], self._settings.near))
+        turns = np.cos(graph.means[near, 2] - graph.means[row, 2])
+        out: list[int] = near[turns > math.cos(self._settings.turned)].tolist()
+        return out
 
     def _views(self, node: Node, near: Sequence[Node], linked: Sequence[Node]) -> list[Node]:
         """Later views of a node's place, the earliest first."""

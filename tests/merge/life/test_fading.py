@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,11 @@ from benchmarks.synthetic import CAMERA, Sensing, World, random_vectors, room, t
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.pose import Array, Pose2, PoseGaussian
 from mapserver.living import without_faded
 from mapserver.merging.merger import Merger, MergerSettings
 from merge.graph.links import Link
-from merge.life.fading import FadingSettings, found_again, presence, things
+from merge.life.fading import Fader, FadingSettings, found_again, presence, things
 from merge.life.looks import Look, expected
 from merge.life.renewal import RenewalSettings
 
@@ -187,6 +188,41 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     assert not shares[1][1].any(), "one visit is not enough"
     assert shares[-1][1][gone].mean() > 0.6
     assert shares[-1][0].mean() < 0.2
+
+
+def test_only_what_is_new_is_looked_at_and_tells_what_all_would(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From drive to drive, nodes that others stand for included, as a fader that sees the last map alone."""
+    rng = np.random.default_rng(4)
+    world = room(0, 0, 12, 4, 1400, rng)
+    thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
+    other = replace(world, vectors=world.vectors.copy())
+    other.vectors[thing] = random_vectors(len(thing), rng)
+    fading = FadingSettings(moved=0.01)
+    merger = Merger(settings=MergerSettings(fading=fading))
+    judged: list[int] = []
+
+    def counted(*args: Any) -> Array:
+        judged.append(1)
+        return presence(*args)
+
+    monkeypatch.setattr("merge.life.fading.presence", counted)
+    counts, faded, agree = [], 0, []
+    for epoch, now in enumerate([world, *[other] * 6], start=1):
+        # The first drives go through all of the room, the last ones through its western end.
+        xs = np.arange(1.0, 11.0 if epoch < 5 else 3.0, 0.5)
+        tour = [Pose2(x, 2.0 + rng.normal(0, 0.04), rng.normal(0, 0.03)) for x in xs]
+        _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
+        judged.clear()
+        merged = merger.merged()
+        counts.append(len(judged))
+        anew = Fader(fading).fade(replace(merged, faded={})).faded
+        for one in set(anew) | set(merged.faded):
+            none = np.zeros(len(merged.maps[one.map].nodes[one].landmarks), np.bool_)
+            agree.append((anew.get(one, none) == merged.faded.get(one, none)).mean())
+        faded += sum(gone.sum() for gone in merged.faded.values())
+    assert faded > 10 and np.mean(agree) > 0.98
+    assert len(merged.superseded) > 5
+    assert max(counts[5:]) < 0.7 * counts[3], "the eastern end is left alone"
 
 
 def _drive(
