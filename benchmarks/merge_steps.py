@@ -16,6 +16,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from benchmarks.merge_building import LINK_SIGMAS, LOOKS, TURN_SIGMAS, WALK_SIGMAS, Building
 from hybridmap.pose import Array
@@ -126,7 +128,13 @@ class Mapweave:
             self._rough = 0
             touched = np.unique(np.concatenate([factors.a, factors.b]))
             how = RelaxSettings(least=len(touched))
-        self._means, _ = relax(factors, self._means, np.zeros(1, np.int64), touched, np.inf, how)
+        ties = sparse.coo_matrix(
+            (np.ones(len(factors)), (factors.a, factors.b)), shape=(len(self._means),) * 2
+        )
+        # A map that begins may not be tied to the others yet: one node of each piece is held.
+        pieces = connected_components(ties, directed=False)[1]
+        held = np.unique(pieces, return_index=True)[1]
+        self._means, _ = relax(factors, self._means, held, touched, np.inf, how)
         return self._means
 
 

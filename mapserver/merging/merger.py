@@ -220,8 +220,9 @@ class Merger:
             del self._uncompared[node_id]
 
     def _take_over(self) -> None:
-        """Take over all verdicts of before; whatever comes now is found anew."""
-        if self._before is not None:
+        """Take over all verdicts of before, once nodes are read; whatever comes now is found anew."""
+        # A server merges before it has read its store if people's rulings come first.
+        if self._before is not None and self.maps:
             for pair, verdict in self._before.verdicts(self.node):
                 if pair[1] not in self._known.get(pair[0], {}):
                     self._judge(pair, verdict)

@@ -14,6 +14,7 @@ from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidFile
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.ruling import Rulings
 from mapserver.merging.findings import PRINT_BYTES, Findings, print_of
 from mapserver.merging.findingsfile import load, save
 from mapserver.merging.findingskeeper import SUFFIX, FindingsKeeper
@@ -213,6 +214,20 @@ def test_a_server_that_ends_before_it_has_merged_leaves_the_file_as_it_is(
     before = path.read_bytes()
     saved(read(logged[:10], tmp_path / "store"), tmp_path / "store")
     assert path.read_bytes() == before
+
+
+def test_a_merge_before_the_store_is_read_leaves_what_is_known(logged: Log, tmp_path: Path) -> None:
+    """Rulings come first: on a busy machine they were merged alone, and all was compared again."""
+    path = saved_once(logged, tmp_path)
+    before = path.read_bytes()
+    merger, keeper = Merger(), FindingsKeeper(tmp_path / "store")
+    keeper.restore(merger)
+    merger.rule(Rulings())
+    assert not merger.merged().maps
+    keeper.save(merger, last=True)
+    assert path.read_bytes() == before
+    merger.read(logged)
+    assert len(merger.merged().components) == 1 and merger.counters.verified == 0
 
 
 def test_a_disk_that_takes_nothing_is_told_of(
