@@ -29,6 +29,7 @@ from hybridmap.node import Node
 from hybridmap.pose import Array, Pose2
 from hybridmap.recognising.matching import match
 from merge.bodies.trails import Trail
+from merge.graph.inview import InView
 from merge.graph.posegraph import PoseGraph
 
 
@@ -196,21 +197,10 @@ def should_show(
         node_from_view: how they stand.
         s: when a landmark should be seen.
     """
-    points = node.points_in_robot
-    from_view = node_from_view.inverse().apply(points)
-    pixels = view.camera.project(from_view)
-    eye = np.array([[node.camera.mount_forward, 0.0, 0.0]])
-    eye_of_view = node_from_view.apply(np.array([[view.camera.mount_forward, 0.0, 0.0]]))
-    ray, ray_of_view = points[:, :2] - eye[:, :2], points[:, :2] - eye_of_view[:, :2]
-    far, far_of_view = np.linalg.norm(ray, axis=1), np.linalg.norm(ray_of_view, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = np.maximum(far, far_of_view) / np.minimum(far, far_of_view)
-        cosine = (ray * ray_of_view).sum(axis=1) / (far * far_of_view)
-        alike = (ratio < s.scale) & (cosine > math.cos(s.aside))
-    shown = np.flatnonzero(view.camera.contains(pixels, s.margin * view.camera.fx) & alike)
+    there = InView.of(node, view, node_from_view, s.margin * view.camera.fx, s.scale, s.aside)
+    shown = np.flatnonzero(there.fits)
     known = view.landmarks.take(view.landmarks.has_depth)
-    off = np.linalg.norm(pixels[shown, None] - known.pixels[None], axis=2) / view.camera.fx
-    depths = from_view[shown, 0] - view.camera.mount_forward
-    about, before = off < s.around, known.depths[None] < s.before * depths[:, None]
+    off = np.linalg.norm(there.pixels[shown, None] - known.pixels[None], axis=2) / view.camera.fx
+    about, before = off < s.around, known.depths[None] < s.before * there.depths[shown, None]
     clear = (about & ~before).any(axis=1) & ~(about & before).any(axis=1)
-    return shown[clear], pixels[shown[clear]]
+    return shown[clear], there.pixels[shown[clear]]

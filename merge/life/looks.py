@@ -18,6 +18,7 @@ from hybridmap.descriptor import decode, rounding_noise
 from hybridmap.node import Node
 from hybridmap.pose import Pose2
 from hybridmap.recognising.matching import squared_distances
+from merge.graph.inview import InView
 from merge.graph.links import Link
 
 
@@ -102,23 +103,11 @@ def expected(old: Node, new: Node, old_from_new: Pose2, s: LookSettings) -> NDAr
         old_from_new: how they stand.
         s: when a landmark should be seen.
     """
-    points = old.points_in_robot
-    from_new = old_from_new.inverse().apply(points)
-    pixels = new.camera.project(from_new)
-    eye_old = np.array([old.camera.mount_forward, 0.0])
-    eye_new = old_from_new.apply(np.array([[new.camera.mount_forward, 0.0, 0.0]]))[0, :2]
-    ray_old, ray_new = points[:, :2] - eye_old, points[:, :2] - eye_new
-    far_old, far_new = np.linalg.norm(ray_old, axis=1), np.linalg.norm(ray_new, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = np.maximum(far_old, far_new) / np.minimum(far_old, far_new)
-        cosine = (ray_old * ray_new).sum(axis=1) / (far_old * far_new)
-        alike = (ratio < s.scale) & (cosine > math.cos(s.aside))
-    shown: NDArray[np.bool_] = new.camera.contains(pixels, s.margin_px) & alike
-    candidates = np.flatnonzero(shown)
+    there = InView.of(old, new, old_from_new, s.margin_px, s.scale, s.aside)
+    shown, candidates = there.fits, np.flatnonzero(there.fits)
     if len(candidates):
-        depth = from_new[candidates, 0] - new.camera.mount_forward
         known = new.landmarks.take(new.landmarks.has_depth)
-        apart = np.linalg.norm(pixels[candidates, None] - known.pixels[None], axis=2)
-        before = (apart < s.before_px) & (known.depths[None] < s.before * depth[:, None])
+        apart = np.linalg.norm(there.pixels[candidates, None] - known.pixels[None], axis=2)
+        before = (apart < s.before_px) & (known.depths[None] < s.before * there.depths[candidates, None])
         shown[candidates[before.any(axis=1)]] = False
     return shown
