@@ -58,9 +58,8 @@ class Steps:
         self._ledger = Ledger(self._sheets, settings.consistency)
         self._own: dict[MapId, list[RefusedLink]] = {}
         self._groups: dict[MapPair, list[LinkGroup]] = {}
-        self._since = self._rough = 0
+        self._since, self._rough, self._plain = 0, 0, True
         self._touched: set[NodeId] = set()
-        self._plain = True
         self._ruled: Rulings | None = None
         self._moved: Rows = np.zeros(0, np.int64)
         self._all = Assembly({}, {})
@@ -243,20 +242,17 @@ class Steps:
         self._keep()
 
     def _relax(self, rows: Rows, how: RelaxSettings, believed: bool) -> None:
-        held = self._all.anchors()
-        huber = math.inf if believed else self._settings.huber
-        self._all.means, moved = relax(self._all.factors, self._all.means, held, rows, huber, how)
+        huber, one = math.inf if believed else self._settings.huber, self._all
+        one.means, moved = relax(one.factors, one.means, one.anchors(), rows, huber, how)
         self._moved = np.union1d(self._moved, np.concatenate([moved, rows]))
 
     def _settled(self, whole: Assembly, nodes: set[NodeId], last: bool) -> Assembly:
-        """Optimise between two rounds of joining; all at once, if what was refused is heard once more."""
+        """Optimise between two rounds of joining; exactly, if what was refused is heard once more."""
         self._all = whole
         if self._plain:
             self._follow(nodes)
-        elif last:
-            self._relax_all(believed=False)
         else:
-            self._relax_all(believed=False, step=1e-4)
+            self._relax_all(believed=False, step=None if last else 1e-4)
         return self._all
 
     def _strained(self) -> list[Link]:
