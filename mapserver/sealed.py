@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import InvalidFile
+from wire.whole_file import write_whole
 
 DIGEST = 32
 """Bytes of SHA-256."""
@@ -37,20 +36,9 @@ def seal(path: Path, magic: bytes, parts: Iterable[NDArray[Any]]) -> None:
     out.write(magic)
     for part in parts:
         np.lib.format.write_array(out, np.ascontiguousarray(part), allow_pickle=False)
-    data = out.getbuffer()
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.name, delete=False) as file:
-            try:
-                file.write(data)
-                file.write(hashlib.sha256(data).digest())
-                file.flush()
-                os.fsync(file.fileno())
-                Path(file.name).replace(path)
-            except BaseException:
-                Path(file.name).unlink(missing_ok=True)
-                raise
-    except OSError as error:
-        raise InvalidFile(f"{path}: cannot be saved ({error.strerror or error})") from None
+    digest = hashlib.sha256(out.getbuffer()).digest()
+    out.write(digest)
+    write_whole(path, out.getbuffer())
 
 
 def unseal(path: Path, magic: bytes) -> Iterator[NDArray[Any]]:

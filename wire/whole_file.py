@@ -9,7 +9,7 @@ from pathlib import Path
 from hybridmap.errors import InvalidFile
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes | memoryview) -> None:
     """Write a file beside its place, then move it there.
 
     Raises:
