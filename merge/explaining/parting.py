@@ -12,6 +12,9 @@ from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.undoing import reason_of
 
+MOST_NAMED = 4
+"""Maps that are named one by one."""
+
 
 def joined_maps(merged: MergedMap) -> list[frozenset[MapId]]:
     """Sets of maps that are one, of single ones too, by their smallest; maps without nodes are in none."""
@@ -57,18 +60,33 @@ def joinings(before: MergedMap, after: MergedMap) -> tuple[str, ...]:
         For example `r1.1 and r3.1 are one map now, by 8 links`.
     """
     part_of = {one: part for part in joined_maps(before) for one in part}
-    out = []
+    wholes = []
     for whole in joined_maps(after):
-        known = sorted(
-            {part_of[one] & whole for one in whole if one in part_of}, key=lambda p: (-len(p), min(p))
-        )
+        known = {part_of[one] & whole for one in whole if one in part_of}
         news = [frozenset([one]) for one in sorted(whole) if one not in part_of]
-        parts = [*known, *news]
-        for part in parts[1:]:
-            count = len(_across(after.links, part, whole - part))
-            by = f"by {count} link{'' if count == 1 else 's'}" if count else "by way of others"
-            out.append(f"{_named(parts[0])} and {_named(part)} are one map now, {by}")
+        wholes.append([*sorted(known, key=lambda p: (-len(p), min(p))), *news])
+    seat = {one: (k, n) for k, parts in enumerate(wholes) for n, part in enumerate(parts) for one in part}
+    ties: dict[tuple[int, int], Counter[int]] = {}
+    for link in after.links:
+        a, b = seat[link.a.map], seat[link.b.map]
+        if a != b:
+            ties.setdefault(a, Counter())[b[1]] += 1
+            ties.setdefault(b, Counter())[a[1]] += 1
+    out = []
+    for k, parts in enumerate(wholes):
+        # Those first that a link joins to what is one already; so each link is counted once.
+        joined, counts, left = parts[0], Counter(ties.get((k, 0))), list(range(1, len(parts)))
+        while left:
+            n = next((n for n in left if counts[n]), left[0])
+            left.remove(n)
+            by = _links(counts[n]) if counts[n] else "way of others"
+            out.append(f"{_briefly(joined)} and {_named(parts[n])} are one map now, by {by}")
+            joined, counts = joined | parts[n], counts + ties.get((k, n), Counter())
     return tuple(out)
+
+
+def _briefly(maps: frozenset[MapId]) -> str:
+    return _named(maps) if len(maps) <= MOST_NAMED else f"{len(maps)} maps with {min(maps)}"
 
 
 def _named(maps: Iterable[MapId]) -> str:

@@ -289,6 +289,23 @@ def test_a_merge_that_loses_its_support_says_so() -> None:
     assert partings(before, merger.merged()) == ()  # a map without nodes is part of nothing
 
 
+def test_what_joins_at_once_is_told_map_by_map_and_each_link_once() -> None:
+    """A server that starts again joins all maps with one merge; it told some links twice."""
+    rng = np.random.default_rng(5)
+    world = room(0, 0, 5, 4, 900, rng)
+    merger = Merger()
+    for map_id in [MapId(name, 1) for name in "abcdef"]:
+        nodes, edges = take_map(world, map_id, [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)], rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    merged = merger.merged()
+    assert len(merged.components) == 1
+    told = joinings(MergedMap.empty(), merged)
+    assert told[0].startswith("a.1 and ") and told[-1].startswith("5 maps with a.1 and ") and len(told) == 5
+    count = sum(int(words.rsplit(" by ", 1)[1].split()[0]) for words in told)
+    assert count == sum(not link.within for link in merged.links)
+
+
 def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
     """Two robots in two rooms, and one that has been in both."""
     rng = np.random.default_rng(5)
