@@ -89,7 +89,7 @@ class MapServer:
         # In lock-step all must come about again as it did, the cells of the index too.
         self._keeper = None if s.lockstep else PlaceKeeper(self._store, path)
         index = self._keeper.index if self._keeper else None
-        findings = None if s.lockstep else FindingsKeeper(path)
+        findings = None if s.lockstep else FindingsKeeper(path, fresh=not self._store.positions())
         self._upkeep = Upkeep(
             s.merge_share, by_itself=not s.lockstep, index=index, merge=s.merge, keeper=findings
         )

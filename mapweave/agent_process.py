@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -28,6 +29,9 @@ from wire.keys import Keys
 from wire.mapfile import MapFile, write_map_file
 from wire.metered import MeteredBus
 from wire.zenoh_bus import ZenohBus
+
+SILENCE = 2.0
+"""s; who waits longer for its body says so."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +221,8 @@ def run_agent(
     cv2.setNumThreads(1)
     console = Console(stderr=True)
     show = _progress(console, options)
-    agent = Agent(robot.describe, bus, keys, settings, options, show, console.print)
+    describe = partial(_describe, robot, bus, console, options.name)
+    agent = Agent(describe, bus, keys, settings, options, show, console.print)
     with show:
         try:
             agent.run(robot, stop)
@@ -229,6 +234,22 @@ def run_agent(
             agent.replicator.flush(10.0)
             _hand_over(console, agent.replicator, bus, options)
             agent.close()
+
+
+def _describe(robot: Robot, bus: ZenohBus, console: Console, name: str) -> RobotDescription:
+    """What the body says of itself; whoever has to wait for that is told what for."""
+
+    def say() -> None:
+        there = "" if bus.connected() else "; no router in reach: start `mapweave server` or give --connect"
+        console.print(f"{name}: waits for its body{there}", soft_wrap=True)
+
+    patience = threading.Timer(SILENCE, say)
+    patience.daemon = True
+    patience.start()
+    try:
+        return robot.describe()
+    finally:
+        patience.cancel()
 
 
 def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options: AgentOptions) -> None:

@@ -43,9 +43,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except OSError as error:
-        # A folder that is a file, a disk that is full: the system's words say it best.
+        # A disk that is full, a folder that may not be written: the system's words say it best, but for one.
+        what = error.strerror or error
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            what = "is a file; give a folder, or a place where one can be made"
         where = f"{error.filename}: " if error.filename else ""
-        print(f"mapweave: {where}{error.strerror or error}", file=sys.stderr)
+        print(f"mapweave: {where}{what}", file=sys.stderr)
         return 1
 
 

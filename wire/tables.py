@@ -28,7 +28,11 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise SettingsError(f"{path}: no such file") from None
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise SettingsError(f"{path}: is not text in UTF-8, as TOML must be") from None
+    except (ValueError, RecursionError) as error:
         # Besides what is no TOML: numbers of thousands of digits, tables nested a thousand deep.
         raise SettingsError(f"{path}: {error}") from None
 

@@ -24,8 +24,10 @@ def read_grey(path: Path, camera: Camera | None = None, told: str = "the camera"
         (H, W) grey.
 
     Raises:
-        DeviceError: it is no image, or none of the size that the camera takes.
+        DeviceError: it is not there, no image, or none of the size that the camera takes.
     """
+    if not path.exists():
+        raise DeviceError(f"{path}: no such file")
     # OpenCV warns of a missing file on its own, past all logging.
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:

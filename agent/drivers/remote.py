@@ -83,7 +83,8 @@ class RemoteRobot:
         if self._description is None:
             self._description = self._ask(self._describe_key, b"", decode_description)
             if self._description is None:
-                raise DeviceError(f"{self._describe_key}: {ENDED}")
+                why = "stopped before its body has answered" if self._closed.is_set() else ENDED
+                raise DeviceError(f"{self._describe_key}: {why}")
         return self._description
 
     def sense(self) -> Observation | None:

@@ -10,6 +10,7 @@ import csv
 import math
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,10 @@ def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, f
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
         camera = Camera(
-            width=_whole(values["width"]), height=_whole(values["height"]), fx=float(values["fx"]),
-            fy=float(values["fy"]), cx=float(values["cx"]), cy=float(values["cy"]),
-            mount_height=float(values["height_m"]), mount_forward=float(values.get("forward_m", 0.0)),
+            width=_whole(values["width"]), height=_whole(values["height"]), fx=_number(values, "fx"),
+            fy=_number(values, "fy"), cx=_number(values, "cx"), cy=_number(values, "cy"),
+            mount_height=_number(values, "height_m"),
+            mount_forward=_number(values, "forward_m") if "forward_m" in values else 0.0,
         )  # fmt: skip
         k1, k2, p1, p2, k3 = (float(k) for k in values.get("distortion", (0.0,) * 5))
         if not all(math.isfinite(k) for k in (k1, k2, p1, p2, k3)):
@@ -136,6 +138,15 @@ class Replay:
         """Nothing to let go of."""
 
 
+def _number(values: Mapping[str, Any], name: str) -> float:
+    value = values[name]
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        # A row of a table that is too short holds None.
+        raise ValueError(f"{name} {'is missing' if value is None else f'{value!r} is no number'}") from None
+
+
 def _whole(value: Any) -> int:
     if not isinstance(value, int):
         # What fits nowhere is refused rather than rounded: half a frame or pixel is a mistake.
@@ -165,7 +176,11 @@ def _read_odometry(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float6
     """(count, 2) forward m and turn rad since the image before."""
     try:
         with path.open(newline="") as file:
-            rows = [(float(r["forward_m"]), float(r["turn_rad"])) for r in csv.DictReader(file)]
+            reader = csv.DictReader(file)
+            try:
+                rows = [(_number(row, "forward_m"), _number(row, "turn_rad")) for row in reader]
+            except ValueError as error:
+                raise DeviceError(f"{path}: line {reader.line_num}: {error}") from None
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file; without odometry nothing tells the map's scale") from None
     except KeyError as missing:

@@ -25,13 +25,15 @@ WORTHWHILE = 0.02
 class FindingsKeeper:
     """Brings them back at the start, and saves them after merges. Only the merging thread may call it."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, fresh: bool = False) -> None:
         """Take note of where they lie.
 
         Args:
             path: of the store's file; they lie beside it.
+            fresh: the store is new: nobody need be told that nothing is known of its nodes.
         """
         self._path = path.with_name(path.name + SUFFIX)
+        self._fresh = fresh
         self._saved: tuple[int, int] = (0, 0)
         self._rest_until = 0.0
 
@@ -41,7 +43,8 @@ class FindingsKeeper:
         try:
             findings = load(self._path, _made_by(merger))
         except InvalidFile as error:
-            log.info("nodes are compared anew: %s", error)
+            if self._path.exists() or not self._fresh:
+                log.info("nodes are compared anew: %s", error)
             findings = Findings()
         else:
             log.info(

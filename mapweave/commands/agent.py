@@ -49,8 +49,11 @@ def run(arguments: argparse.Namespace) -> int:
     from agent.drivers.remote import RemoteRobot
     from agent.mission import Carried, Explore, Idle, Mission
     from mapweave.agent_process import AgentOptions, run_agent
+    from wire.keys import check_epoch
 
     name = check_name(arguments.name)
+    if arguments.epoch is not None:
+        check_epoch(arguments.epoch)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     stop = stop_on_signals()

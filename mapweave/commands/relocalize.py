@@ -56,6 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.match_picture import draw_matches
     from wire.messages import decode_relocalize_answer, encode_view
 
+    if not arguments.image.exists():
+        raise DeviceError(f"{arguments.image}: no such file")
+    if not 0.0 < arguments.timeout < math.inf:
+        raise DeviceError(f"--timeout {arguments.timeout:g}: give seconds, more than 0")
     places = [arguments.image.parent / "camera.toml", arguments.image.parent.parent / "camera.toml"]
     camera_file = arguments.camera or next((p for p in places if p.exists()), None)
     if camera_file is None:

@@ -129,6 +129,8 @@ def run_one(arguments: argparse.Namespace) -> int:
     settings = settings_of(arguments)
     scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
     seed = scenario.seed if arguments.seed is None else check_seed(arguments.seed)
+    if arguments.view is not None:
+        check_port(arguments.view)
     out = arguments.out or Path("out/sim") / f"{scenario.name}-{seed}"
     trial = run_trial(
         scenario,
@@ -159,7 +161,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
 
     settings = settings_of(arguments)
     scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
-    first = scenario.seed if arguments.first is None else check_seed(arguments.first)
+    first = scenario.seed if arguments.first is None else check_seed(arguments.first, "--first")
     options = BatchOptions(
         first=first,
         seeds=arguments.seeds,
@@ -196,8 +198,8 @@ def run_serve(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def check_seed(seed: int) -> int:
-    """A seed that random generators take.
+def check_seed(seed: int, argument: str = "--seed") -> int:
+    """A seed that random generators take; `argument` is for the error's text.
 
     Raises:
         SettingsError: it is negative.
@@ -205,5 +207,17 @@ def check_seed(seed: int) -> int:
     from hybridmap.errors import SettingsError
 
     if seed < 0:
-        raise SettingsError(f"--seed {seed}: use 0 or more")
+        raise SettingsError(f"{argument} {seed}: use 0 or more")
     return seed
+
+
+def check_port(port: int) -> None:
+    """Before a whole fleet is started for it.
+
+    Raises:
+        SettingsError: there is no such port.
+    """
+    from hybridmap.errors import SettingsError
+
+    if not 0 <= port <= 65535:
+        raise SettingsError(f"--view {port}: a port is 0 to 65535; 0 takes a free one")

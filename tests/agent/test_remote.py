@@ -288,6 +288,15 @@ def test_nobody_there_is_one_clear_line(bus: MemoryBus) -> None:
     assert "\n" not in str(error.value)
 
 
+def test_who_is_stopped_while_it_waits_does_not_say_that_a_simulation_ended(bus: MemoryBus) -> None:
+    robot = RemoteRobot(bus, "test", "r0", patience=20.0)
+    stop = threading.Timer(0.1, robot.close)
+    stop.start()
+    with pytest.raises(DeviceError, match="robot/r0/describe: stopped before its body has answered"):
+        robot.describe()
+    stop.join()
+
+
 def test_two_bodies_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus) -> None:
     second = Body(hub)
     with pytest.raises(DeviceError, match="2 bodies answer"):

@@ -239,8 +239,8 @@ WRONG = {
     "odometry without a turn": (replaced("odometry.csv", "turn_rad", "turn"), "no column 'turn_rad'"),
     "odometry too short": (written("odometry.csv", ODOMETRY[:-6]), "13 rows for 14 images"),
     "odometry too long": (written("odometry.csv", ODOMETRY + "0,0,0\n"), "15 rows for 14 images"),
-    "odometry with text": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0,far", 1)), "odometry.csv"),
-    "odometry with a gap": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0", 1)), "odometry.csv"),
+    "odometry with text": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0,far", 1)), "'far' is no"),
+    "odometry with a gap": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0", 1)), "2: forward_m is"),
     "odometry not finite": (written("odometry.csv", ODOMETRY.replace("0,0,0", "0,0,nan", 1)), "one finite"),
     "odometry is no text": (written("odometry.csv", b"\xff\xfe\x00" * 9), "odometry.csv"),
     "odometry with a huge field": (written("odometry.csv", ODOMETRY + "1" * 200_000), "odometry.csv"),
@@ -285,7 +285,7 @@ WRONG_IMAGES = {
     ),
     "an image that is none": (written("images/frame2.png", "no image"), "not an image that can be read"),
     "an empty image": (written("images/frame2.png", b""), "not an image that can be read"),
-    "an image that vanished": (gone("images/frame2.png"), "not an image that can be read"),
+    "an image that vanished": (gone("images/frame2.png"), "frame2.png: no such file"),
 }
 
 

@@ -123,6 +123,7 @@ def test_a_batch_names_its_failures(capfd, tmp_path):
     found = json.loads(capfd.readouterr().out.strip().splitlines()[-1])
     assert found == json.loads((tmp_path / "out" / "batch.json").read_text())
     assert "seeds" in complaint(capfd, "sim", "batch", path, "--seeds", 0)
+    assert "--first -1: use 0 or more" in complaint(capfd, "sim", "batch", path, "--first", -1)
 
 
 def test_a_trial_prints_one_json_object(capfd, tmp_path):
@@ -148,8 +149,18 @@ def test_a_trial_prints_one_json_object(capfd, tmp_path):
     assert json.loads((tmp_path / "out" / "figures.json").read_text())["figures"] == printed["figures"]
 
 
-def test_an_epoch_out_of_range(capfd, recording, tmp_path):
+def test_a_live_view_at_no_port_starts_no_fleet(capfd, tmp_path):
+    for port in (-1, 65536):
+        said = complaint(capfd, "sim", "run", "office", f"--view={port}", "--out", tmp_path / "out")
+        assert f"--view {port}: a port is 0 to 65535" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_epoch_out_of_range(capfd, recording, tmp_path, nobody):
     for epoch in (-1, 2**60):
+        data = tmp_path / f"agent{epoch}"
+        said = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", data, f"--epoch={epoch}")
+        assert "epoch" in said and not data.exists(), "before any body is waited for"
         data = tmp_path / str(epoch)
         said = complaint(capfd, "replay", recording, "--offline", "--data", data, f"--epoch={epoch}")
         assert "epoch" in said

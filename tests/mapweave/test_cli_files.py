@@ -43,6 +43,8 @@ def test_settings(tmp_path, capfd, recording):
         assert "did you mean 'network'?" in complaint(capfd, *command, "--settings", path)
         path.write_text("[network")
         assert "robot.toml" in complaint(capfd, *command, "--settings", path)
+        said = complaint(capfd, *command, "--settings", tmp_path)
+        assert said.count(str(tmp_path)) == 1 and "Errno" not in said
 
 
 def test_recordings(tmp_path, capfd, recording):
@@ -67,9 +69,11 @@ def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
 def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
     taken = tmp_path / "taken"
     taken.write_text("a file where a folder should be")
-    assert str(taken) in complaint(capfd, "replay", recording, "--offline", "--data", taken)
-    assert str(taken) in complaint(capfd, "server", "--listen", nobody, "--data", taken)
-    assert str(taken) in complaint(capfd, "demo", "--out", taken)
+    for folder in (taken, taken / "in" / "it"):
+        words = "is a file; give a folder"
+        assert words in complaint(capfd, "replay", recording, "--offline", "--data", folder)
+        assert words in complaint(capfd, "server", "--listen", nobody, "--data", folder)
+        assert words in complaint(capfd, "demo", "--out", folder)
     path = tmp_path / "a.mapweave"
     write_map_file(path, MapFile("agent", "r0.1", one_node()))
     assert str(taken) in complaint(capfd, "map", "show", path, "--out", taken / "a.png")

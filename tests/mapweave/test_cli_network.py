@@ -62,7 +62,11 @@ def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
     camera = ["--camera", recording / "camera.toml"]
     assert "no router" in complaint(capfd, "relocalize", lonely, *camera, *rest)
     assert "no such file" in complaint(capfd, "relocalize", lonely, "--camera", tmp_path / "b.toml", *rest)
-    assert "not an image" in complaint(capfd, "relocalize", tmp_path / "b.png", *camera, *rest)
+    for known in (camera, []):
+        assert "b.png: no such file" in complaint(capfd, "relocalize", tmp_path / "b.png", *known)
+    for seconds in ("0", "-1", "nan", "inf"):
+        said = complaint(capfd, "relocalize", lonely, *camera, f"--timeout={seconds}")
+        assert f"--timeout {seconds}: give seconds" in said
     lonely.write_text("no image")
     assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)
     assert "not an image" in complaint(capfd, "relocalize", tmp_path, *camera, *rest)
@@ -81,6 +85,20 @@ def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_p
         process.send_signal(signal.SIGINT)
         _, said = process.communicate()
         watchdog.cancel()
-    assert "Traceback" not in said
-    assert len(said.splitlines()) <= 1
-    assert process.returncode in (0, 1, 130)
+    *before, last = said.splitlines()
+    assert last.endswith("robot/r0/describe: stopped before its body has answered")
+    assert all("waits for its body" in line for line in before)
+    assert process.returncode == 1
+
+
+def test_an_agent_without_a_body_says_what_it_waits_for(nobody, tmp_path):
+    command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", nobody, "--data", str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        watchdog = threading.Timer(40, process.kill)
+        watchdog.start()
+        assert process.stderr is not None
+        said = process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        process.wait()
+        watchdog.cancel()
+    assert said.startswith("r0: waits for its body; no router in reach: start `mapweave server`")

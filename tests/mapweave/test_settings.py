@@ -117,7 +117,7 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[pipeline.navigator.search]\nsure = [0.1, 'x']", "search: sure: 'x' is no float"),
         ("[network", "robot.toml: "),
         ("a = 1\na = 2", "robot.toml: "),
-        (b"\xff\xfe", "robot.toml: "),
+        (b"\xff\xfe", "robot.toml: is not text in UTF-8"),
         ("when = 1979-05-27", "no setting 'when'"),
         ("[pipeline]\nseed = 1979-05-27", "is no int"),
     ],

@@ -201,6 +201,15 @@ def test_what_is_damaged_is_made_anew(
     assert merger.counters.verified > 50
 
 
+@pytest.mark.parametrize("fresh", [False, True])
+def test_nobody_is_told_that_nothing_is_known_of_a_new_store(
+    tmp_path: Path, fresh: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        FindingsKeeper(tmp_path / "store", fresh).restore(Merger())
+    assert len(caplog.records) == (not fresh)
+
+
 def saved_once(logged: Log, tmp_path: Path) -> Path:
     merger = read(logged)
     merger.merged()
