@@ -149,3 +149,56 @@ class MapsExplanation:
     unverified: int
     nearest: tuple[NearMiss, ...] = ()
     rulings: tuple[Ruling, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Hop:
+    """From one node to another on a way, or what keeps robots from driving there.
+
+    Attributes:
+        a: from here.
+        b: to there.
+        kind: of the edge, see hybridmap.node.EdgeKind; `near` if the two stand in one place, `superseded` if
+            one stands for the other.
+        distance: m, between the two.
+        turn: rad, between their headings, signed.
+        cost: what it adds to the cost of a route, m.
+        words: why it can be driven, or why it is not.
+    """
+
+    a: NodeId
+    b: NodeId
+    kind: str
+    distance: float
+    turn: float
+    cost: float
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class RouteExplanation:
+    """Why a route leads the way it does, or why there is none.
+
+    Attributes:
+        start: where it begins.
+        goal: where it shall end.
+        found: whether there is a way.
+        reason: in words.
+        hops: of the way, in order.
+        gaps: what robots cannot, or should not, drive. Of a way that is found: on the cheapest one if all
+            could be driven; of one that is not: on the one that lacks least. Empty if nothing better is
+            known, or if nothing joins the two.
+        apart: of two maps that would have to be one first; of several, those that came nearest to it.
+    """
+
+    start: NodeId
+    goal: NodeId
+    found: bool
+    reason: str
+    hops: tuple[Hop, ...] = ()
+    gaps: tuple[Hop, ...] = ()
+    apart: MapsExplanation | None = None
+
+
+Explanation = PairExplanation | tuple[MapsExplanation, ...] | RouteExplanation
+"""Of two nodes, of some two maps each, or of a route."""

@@ -59,18 +59,26 @@ class Ways:
         blocked: Collection[tuple[NodeId, NodeId]] = (),
         closed: Collection[EdgeId] = (),
         settings: RouteSettings | None = None,
+        toll: float | None = None,
     ) -> None:
-        """Take a map; the arguments are those of `find_route`."""
+        """Take a map; the other arguments are those of `find_route`.
+
+        Args:
+            toll: what it costs besides to pass where it is blocked or nothing can be driven, m: the way then
+                tells what stands in the way. None: nobody passes there.
+        """
         s = settings or RouteSettings()
         self._map = hybrid_map
         self._postures = postures
         self._closed = closed
+        self._toll = toll
         self._places = postures if postures is not None else _own_postures(hybrid_map)
         self._barred = {frozenset(pair) for pair in blocked}
         self._graph: nx.Graph = nx.Graph()
         # In the order of ids, so that among ways of equal cost the same one is found whatever came first.
         for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
-            if edge.a == edge.b or frozenset((edge.a, edge.b)) in self._barred:
+            barred = frozenset((edge.a, edge.b)) in self._barred
+            if edge.a == edge.b or (barred and toll is None):
                 continue
             if edge.a not in self._places or edge.b not in self._places:
                 continue
@@ -78,7 +86,7 @@ class Ways:
                 (penalties or {}).get(edge.id, 0.0), 0.0
             )
             if not self._graph.has_edge(edge.a, edge.b):
-                self._graph.add_edge(edge.a, edge.b, choices=[])
+                self._graph.add_edge(edge.a, edge.b, choices=[], barred=barred)
             self._graph.edges[edge.a, edge.b]["choices"].append((cost, edge.id))
         self._comparable = postures is not None or len({node_id.map for node_id in self._graph}) <= 1
 
@@ -103,7 +111,11 @@ class Ways:
     def _cheapest(self, hop: Mapping[str, Any]) -> tuple[float, EdgeId] | None:
         """The cheapest open edge between two nodes; whether one is closed is asked only on the way."""
         choices = sorted(hop["choices"], key=lambda choice: choice[0])
-        return next((choice for choice in choices if choice[1] not in self._closed), None)
+        free = None if hop["barred"] else next((one for one in choices if one[1] not in self._closed), None)
+        if free is None and self._toll is not None:
+            cost, edge_id = choices[0]
+            return cost + self._toll, edge_id
+        return free
 
     def _weight(self, _: NodeId, __: NodeId, hop: Mapping[str, Any]) -> float | None:
         """What it costs from node to node; None, as networkx wants it, if nothing there can be driven."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -24,7 +25,7 @@ class BlockageSettings:
 
 
 class Blockages:
-    """Pairs of nodes between which some robot did not get through, with when it said so.
+    """Pairs of nodes between which some robot did not get through, with when it said so. For any thread.
 
     A robot says it in the question for its next route. That robot bars the pair for itself; for all others
     it is only dear: what stood in one robot's way may have gone, and need not be in another's.
@@ -34,6 +35,7 @@ class Blockages:
         """Nothing is blocked."""
         self._settings = settings or BlockageSettings()
         self._said: dict[Pair, float] = {}
+        self._turn = threading.Lock()
 
     def report(self, pairs: Collection[Pair], now: float) -> None:
         """A robot could not get through here.
@@ -42,15 +44,17 @@ class Blockages:
             pairs: of nodes, in either order.
             now: of the server's clock, s.
         """
-        for a, b in pairs:
-            pair = (a, b) if a <= b else (b, a)
-            self._said.pop(pair, None)
-            self._said[pair] = now
-        while len(self._said) > self._settings.most:
-            del self._said[next(iter(self._said))]
+        with self._turn:
+            for a, b in pairs:
+                pair = (a, b) if a <= b else (b, a)
+                self._said.pop(pair, None)
+                self._said[pair] = now
+            while len(self._said) > self._settings.most:
+                del self._said[next(iter(self._said))]
 
     def known(self, now: float) -> list[Pair]:
         """What still counts at a time of the server's clock, s."""
         forget = self._settings.forget
-        self._said = {pair: said for pair, said in self._said.items() if now - said < forget}
-        return list(self._said)
+        with self._turn:
+            self._said = {pair: said for pair, said in self._said.items() if now - said < forget}
+            return list(self._said)

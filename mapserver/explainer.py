@@ -1,20 +1,21 @@
-"""People's questions why maps are one, and people's rulings that they shall not be."""
+"""People's questions why maps are one and why routes lead so, and their rulings that maps shall not be one."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TypeVar
 
 from hybridmap.errors import InvalidFile, InvalidMessage
-from hybridmap.explanation import MapsExplanation, PairExplanation
+from hybridmap.explanation import Explanation, MapsExplanation, PairExplanation, RouteExplanation
 from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import Ends, Ruling, Rulings
+from hybridmap.ruling import Ruling, Rulings
 from mapserver.answers import Answers
 from mapserver.desk import Desk
 from mapserver.log.store import Store
+from mapserver.route_explaining import explain_route
 from mapserver.services import guarded
 from merge.belief.consistency import ConsistencySettings
 from merge.explaining.explanation import explain_nodes
@@ -23,6 +24,7 @@ from merge.undoing import check_ruling, reason_of
 from wire.bus import Bus, Closing, Request
 from wire.explanation_messages import (
     MAX_MAPS_TOLD,
+    ExplainRequest,
     decode_explain_request,
     decode_ruling,
     encode_maps,
@@ -30,13 +32,14 @@ from wire.explanation_messages import (
 )
 from wire.keys import Keys
 from wire.log_messages import encode_record
+from wire.route_explanation import encode_route_explanation
 from wire.ruling_codec import decode_rulings, encode_rulings
 
 log = logging.getLogger(__name__)
 
 NAME = "rulings"
 """In the store."""
-Told = TypeVar("Told", PairExplanation, MapsExplanation)
+Told = TypeVar("Told", PairExplanation, MapsExplanation, RouteExplanation)
 
 
 class RulingBook:
@@ -85,6 +88,7 @@ class Explainer:
         rule: Callable[[Rulings], None],
         settled: Callable[[], bool],
         consistency: ConsistencySettings,
+        wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
     ) -> None:
         """Begin to answer.
 
@@ -98,6 +102,7 @@ class Explainer:
             rule: told all rulings whenever there is a new one.
             settled: whether the newest answers know all that has come.
             consistency: as in the merge.
+            wary: pairs of nodes between which robots of late did not get through.
         """
         self._answers = answers
         self._desk = desk
@@ -105,6 +110,7 @@ class Explainer:
         self._rule = rule
         self._settled = settled
         self._consistency = consistency
+        self._wary = wary
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
@@ -121,22 +127,28 @@ class Explainer:
         done.add_done_callback(lambda done: guarded(lambda _: done.result())(request))
 
     def _explain(self, payload: bytes) -> bytes:
-        told = self.explain(decode_explain_request(payload).ends)
+        told = self.explain(decode_explain_request(payload))
+        if isinstance(told, RouteExplanation):
+            return encode_route_explanation(told)
         return encode_pair(told) if isinstance(told, PairExplanation) else encode_maps(told)
 
-    def explain(self, ends: Ends | None) -> PairExplanation | tuple[MapsExplanation, ...]:
-        """Why two nodes or two maps are linked, or are not; without ends, each two maps. Takes its time.
+    def explain(self, request: ExplainRequest) -> Explanation:
+        """Why nodes or maps are linked, or are not, or why a route leads this way. Takes its time.
 
         Raises:
             InvalidValue: they are not there.
         """
         # Asked first: what comes meanwhile may be missing in the answers.
         settled = self._settled()
-        merged = self._answers().merged
-        if ends is None:
+        answers = self._answers()
+        merged = answers.merged
+        if request.ends is None:
             return tuple(_still(one, settled) for one in explain_fleet(merged, MAX_MAPS_TOLD))
-        first, second = ends
+        first, second = request.ends
         if isinstance(first, NodeId) and isinstance(second, NodeId):
+            if request.route:
+                told = explain_route(answers.router, first, second, request.blocked, self._wary())
+                return _still(told, settled)
             return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
         return (_still(explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])), settled),)
 

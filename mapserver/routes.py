@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,17 +60,18 @@ class Router:
             settings: how routes are chosen.
             reaches: what is known of edges from maps before; it is written to.
         """
-        self._merged = merged
-        self._settings = settings or RouterSettings()
+        self.merged = merged
+        self.settings = settings or RouterSettings()
         self._reaches = reaches or ReachBook()
         self._turn = threading.Lock()
         self._made: Roadmap | None = None
 
     @property
-    def _roads(self) -> Roadmap:
+    def roads(self) -> Roadmap:
+        """What routes may use; made when it is asked for first."""
         with self._turn:
             if self._made is None:
-                self._made = Roadmap(self._merged, self._settings.near, self._reaches)
+                self._made = Roadmap(self.merged, self.settings.near, self._reaches)
             return self._made
 
     def route(
@@ -96,22 +97,46 @@ class Router:
             The legs. Their relative postures are those of the optimised graph: each is the best estimate
             from all edges together. That of the first is relative to `start`.
         """
-        placed = self._merged.postures
-        for name, node in (("start", start), ("goal", goal)):
-            if node not in placed:
-                retired = self._merged.rulings.retired.get(node.map)
-                why = f": {reason_of(retired)}" if retired is not None else ""
-                return RouteAnswer((), f"{name} {node} is not in the merged map{why}")
-        if self._merged.component_of(start) != self._merged.component_of(goal):
-            return RouteAnswer((), f"{start} and {goal} are in parts of the map that nothing joins yet")
-        roads = self._roads
-        ends = {node: roads.postures[node] for node in (start, goal)}
-        # Nodes that others stand for are passed only where it must be.
-        for postures in (roads.living | ends, roads.postures):
+        if missing := self.missing(start, goal):
+            return RouteAnswer((), missing)
+        reason = ""
+        for postures in self.choices(start, goal):
             best, reason = self._cheapest(start, goal, postures, blocked, wary, start_from_robot)
             if best is not None:
                 return self._answer(start, best)
         return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
+
+    def missing(self, start: NodeId, goal: NodeId) -> str:
+        """Why there is no way whatever can be driven, in words; empty if there may be one."""
+        for name, node in (("start", start), ("goal", goal)):
+            if node not in self.merged.postures:
+                retired = self.merged.rulings.retired.get(node.map)
+                why = f": {reason_of(retired)}" if retired is not None else ""
+                return f"{name} {node} is not in the merged map{why}"
+        if self.merged.component_of(start) != self.merged.component_of(goal):
+            return f"{start} and {goal} are in parts of the map that nothing joins yet"
+        return ""
+
+    def choices(self, start: NodeId, goal: NodeId) -> Iterator[Mapping[NodeId, Pose2]]:
+        """Postures of nodes over which a way is looked for, one after the other.
+
+        Nodes that others stand for are passed only where it must be.
+        """
+        yield self.roads.living | {node: self.roads.postures[node] for node in (start, goal)}
+        yield self.roads.postures
+
+    def ways(
+        self,
+        postures: Mapping[NodeId, Pose2],
+        blocked: Collection[tuple[NodeId, NodeId]] = (),
+        wary: Collection[tuple[NodeId, NodeId]] = (),
+        toll: float | None = None,
+    ) -> Ways:
+        """The ways over nodes with these postures; see `route` and hybridmap.route.Ways."""
+        return Ways(
+            self.roads.union, postures=postures, penalties=self._penalties(wary), blocked=blocked,
+            closed=self.roads.closed, settings=self.settings.route, toll=toll,
+        )  # fmt: skip
 
     def _cheapest(
         self,
@@ -123,11 +148,7 @@ class Router:
         start_from_robot: Pose2 | None,
     ) -> tuple[Route | None, str]:
         """The cheapest way over nodes with these postures, or why the nearest entry has none."""
-        roads = self._roads
-        ways = Ways(
-            roads.union, postures=postures, penalties=self._penalties(wary), blocked=blocked,
-            closed=roads.closed, settings=self._settings.route,
-        )  # fmt: skip
+        ways = self.ways(postures, blocked, wary)
         best: Route | None = None
         reason, best_cost = "", math.inf
         for entry, cost in self._entries(start, postures, start_from_robot, blocked):
@@ -140,8 +161,8 @@ class Router:
         return best, reason
 
     def _answer(self, start: NodeId, best: Route) -> RouteAnswer:
-        union = self._roads.union
-        nodes = {node: without_faded(union.nodes[node], self._merged) for node in best.nodes}
+        union = self.roads.union
+        nodes = {node: without_faded(union.nodes[node], self.merged) for node in best.nodes}
         legs = [RouteLeg(nodes[best.nodes[0]], self._relative(start, best.nodes[0]), None)]
         for before, node, edge_id in zip(best.nodes, best.nodes[1:], best.edges, strict=False):
             kind = union.edges[edge_id].kind
@@ -158,11 +179,11 @@ class Router:
         """Nodes where the route may begin with what it costs to get there, cheapest first."""
         if start_from_robot is None:
             return [(start, 0.0)]
-        s = self._settings
+        s = self.settings
         here = postures[start] @ start_from_robot
-        component = self._merged.component_of(start)
+        component = self.merged.component_of(start)
         barred = {frozenset(pair) for pair in blocked}
-        members = self._merged.components[component or 0]
+        members = self.merged.components[component or 0]
         near = sorted((here.distance(postures[n]), n) for n in members if n in postures)
         entries = [
             (node, s.entry_cost * distance - self._saved(here, node, distance, barred))
@@ -173,7 +194,7 @@ class Router:
 
     def _saved(self, here: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
         """By how much it is cheaper to get to a node for a robot that stands on an edge to it, m."""
-        s, roads = self._settings, self._roads
+        s, roads = self.settings, self.roads
         target = roads.postures[node]
         goal = np.array([target.x, target.y])
         at = np.array([here.x, here.y])
@@ -193,14 +214,14 @@ class Router:
     def _penalties(self, wary: Collection[tuple[NodeId, NodeId]]) -> Mapping[EdgeId, float]:
         if not wary:
             return {}
-        pairs, cost = {frozenset(pair) for pair in wary}, self._settings.wary_cost
+        pairs, cost = {frozenset(pair) for pair in wary}, self.settings.wary_cost
         return {
-            edge.id: cost for edge in self._roads.union.edges.values() if frozenset((edge.a, edge.b)) in pairs
+            edge.id: cost for edge in self.roads.union.edges.values() if frozenset((edge.a, edge.b)) in pairs
         }
 
     def _relative(self, a: NodeId, b: NodeId) -> PoseGaussian:
         if a == b:
             return PoseGaussian(Pose2(), np.zeros((3, 3)))
-        relative = self._merged.relative(a, b)
+        relative = self.merged.relative(a, b)
         assert relative is not None, "nodes of one component"
         return relative

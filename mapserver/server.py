@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -16,9 +17,8 @@ from pathlib import Path
 from types import TracebackType
 
 from hybridmap.errors import NotConnected
-from hybridmap.explanation import MapsExplanation, PairExplanation
+from hybridmap.explanation import Explanation
 from hybridmap.query import RelocalizeAnswer, View
-from hybridmap.ruling import Ends
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.desk import Desk, DeskSettings
@@ -32,6 +32,7 @@ from mapserver.services import Services
 from mapserver.upkeep import Upkeep
 from merge.merging import MergeSettings
 from wire.bus import Bus
+from wire.explanation_messages import ExplainRequest
 from wire.keys import Keys
 from wire.log_messages import Scalar, encode_record
 
@@ -114,6 +115,7 @@ class MapServer:
             self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule,
             # In lock-step whoever asks waits until all is merged.
             lambda: self._settings.lockstep or self._upkeep.settled, self._settings.merge.consistency,
+            lambda: self._blockages.known(time.monotonic()),
         )  # fmt: skip
         # Wall time again: what is told now and then would not repeat itself.
         self._herald = None if self._settings.lockstep else Herald(self._bus, self._keys, self._name)
@@ -181,13 +183,13 @@ class MapServer:
         """
         return self._desk.submit(lambda: self._in_step().relocalizer.answer(look()), ticket)
 
-    def explain(self, ends: Ends | None) -> Future[PairExplanation | tuple[MapsExplanation, ...]]:
-        """Ask why two nodes or two maps are linked or are not, or each two maps, from any thread.
+    def explain(self, request: ExplainRequest) -> Future[Explanation]:
+        """Ask why nodes or maps are linked or are not, or why a route leads so, from any thread.
 
         Raises:
             Busy: too many ask.
         """
-        return self._desk.submit(lambda: self._explainer.explain(ends), usual=False)
+        return self._desk.submit(lambda: self._explainer.explain(request), usual=False)
 
     def _in_step(self) -> Answers:
         if self._settings.lockstep and not self.settle(SETTLE_PATIENCE):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 
@@ -58,7 +57,6 @@ class Services:
         self._desk = desk
         self._blockages = blockages
         self._status = status
-        self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.relocalize(name), self._relocalize_later),
             bus.serve(keys.route(name), guarded(self._route)),
@@ -84,9 +82,8 @@ class Services:
     def _route(self, payload: bytes) -> bytes:
         request = decode_route_request(payload)
         answers = self._answers()
-        with self._turn:
-            self._blockages.report(request.blocked, time.monotonic())
-            wary = self._blockages.known(time.monotonic())
+        self._blockages.report(request.blocked, time.monotonic())
+        wary = self._blockages.known(time.monotonic())
         answer = answers.router.route(
             request.start, request.goal, request.blocked, wary, request.start_from_robot
         )

@@ -7,7 +7,14 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from hybridmap.explanation import MapsExplanation, NearMiss, PairExplanation, Standing
+from hybridmap.explanation import (
+    Hop,
+    MapsExplanation,
+    NearMiss,
+    PairExplanation,
+    RouteExplanation,
+    Standing,
+)
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.ruling import Ruling
 from merge.graph.links import DOUBLES
@@ -78,6 +85,24 @@ def maps_words(told: MapsExplanation) -> list[str]:
     lines += [f"    {_near(near, told.reason)}" for near in told.nearest]
     lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
     return lines
+
+
+def route_words(told: RouteExplanation) -> list[str]:
+    """The explanation of a route, line by line."""
+    way = "the way leads so" if told.found else "there is no way"
+    lines = [f"{told.start} to {told.goal}: {way}: {told.reason}"]
+    lines += [f"  {_hop(hop)}" for hop in told.hops]
+    if told.gaps:
+        lines.append("  not driven, and so not taken:" if told.found else "  what is missing:")
+    lines += [f"    {_hop(hop)}" for hop in told.gaps[:MOST_WITNESSES]]
+    if len(told.gaps) > MOST_WITNESSES:
+        lines.append(f"    and {len(told.gaps) - MOST_WITNESSES} more; --json tells all")
+    return lines + [f"  {line}" for line in (maps_words(told.apart) if told.apart else ())]
+
+
+def _hop(hop: Hop) -> str:
+    where = f"{hop.distance:5.2f} m, {math.degrees(hop.turn):+4.0f} deg, cost {hop.cost:5.2f}"
+    return f"{hop.a!s:>9} - {hop.b!s:<9} {where}  {hop.kind}: {hop.words}"
 
 
 def _posture(posture: PoseGaussian) -> str:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from hybridmap.change import NodePut
 from hybridmap.errors import InvalidMessage, InvalidValue
 from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplanation, Standing, Witness
-from hybridmap.node import Node
+from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Ends, Ruling
 from wire.codec import MAX_BODY_BYTES, MAX_EVIDENCE, decode_body, encode_body
 from wire.landmark_codec import MAX_LANDMARKS
+from wire.messages import MAX_BLOCKED, read_blocked
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import MAX_POSITION, pack_posture, unpack_posture
 from wire.ruling_codec import pack_ruling, read_ends, read_ruling
@@ -34,30 +35,50 @@ INFINITE = 1e300
 
 @dataclass(frozen=True, slots=True)
 class ExplainRequest:
-    """Why are these linked, or are not?
+    """Why are these linked, or are not? Or why does a route lead this way, and why is there none?
 
     Attributes:
-        ends: two nodes or two maps; None for each two maps of the fleet.
+        ends: two nodes or two maps, for a route start and goal; None for each two maps of the fleet.
+        route: whether it is about the route between two nodes.
+        blocked: for a route, pairs of nodes between which the robot cannot drive.
     """
 
     ends: Ends | None = None
+    route: bool = False
+    blocked: tuple[tuple[NodeId, NodeId], ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse routes from what is no node (InvalidValue)."""
+        if self.route and (self.ends is None or not all(isinstance(end, NodeId) for end in self.ends)):
+            raise InvalidValue("a route leads from node to node: r0.1.17 r1.1.5")
 
 
 def encode_explain_request(request: ExplainRequest) -> bytes:
     """Encode a question; raises InvalidValue if it would not decode."""
-    fields = {} if request.ends is None else {"e": [list(end) for end in request.ends]}
+    fields: dict[str, object] = {}
+    if request.ends is not None:
+        fields["e"] = [list(end) for end in request.ends]
+    if request.route:
+        fields |= {"w": 1, "n": [[list(a), list(b)] for a, b in request.blocked]}
     return _checked(pack(fields), decode_explain_request)
 
 
 def decode_explain_request(data: bytes) -> ExplainRequest:
     """Decode a question; raises InvalidMessage."""
-    reader = Reader(data, "explain request", 1024)
+    reader = Reader(data, "explain request", MAX_BLOCKED * 128 + 1024)
     if not reader.has("e"):
         return ExplainRequest()
     ends = reader.array("e", 2)
     if len(ends) != 2:
         raise reader.error("two nodes or two maps are needed")
-    return ExplainRequest(read_ends(reader, ends[0], ends[1]))
+    both = read_ends(reader, ends[0], ends[1])
+    if not reader.has("w"):
+        return ExplainRequest(both)
+    reader.integer("w", 1, 1)
+    try:
+        return ExplainRequest(both, True, read_blocked(reader))
+    except InvalidValue as error:
+        raise reader.error(str(error)) from None
 
 
 def encode_ruling(ruling: Ruling) -> bytes:
@@ -132,28 +153,30 @@ def decode_pair(data: bytes) -> PairExplanation:
 
 def encode_maps(told: tuple[MapsExplanation, ...]) -> bytes:
     """Encode explanations of maps; raises InvalidValue if they would not decode."""
-    rows = [
-        [
-            list(one.first),
-            list(one.second),
-            one.joined,
-            one.reason,
-            [one.links, one.landmarks, one.refused, one.unverified],
-            [[list(n.a), list(n.b), n.matches, n.inliers, n.lacks] for n in one.nearest],
-            [pack_ruling(ruling) for ruling in one.rulings],
-        ]
-        for one in told
-    ]
-    return _checked(pack({"m": rows}), decode_maps)
+    return _checked(pack({"m": [pack_maps(one) for one in told]}), decode_maps)
 
 
 def decode_maps(data: bytes) -> tuple[MapsExplanation, ...]:
     """Decode explanations of maps; raises InvalidMessage."""
     reader = Reader(data, "explanation", MAX_MAPS_BYTES)
-    return tuple(_maps(reader, value) for value in reader.array("m", MAX_MAPS_TOLD))
+    return tuple(read_maps(reader, value) for value in reader.array("m", MAX_MAPS_TOLD))
 
 
-def _maps(reader: Reader, value: Any) -> MapsExplanation:
+def pack_maps(told: MapsExplanation) -> list[object]:
+    """The explanation of two maps as a list."""
+    return [
+        list(told.first),
+        list(told.second),
+        told.joined,
+        told.reason,
+        [told.links, told.landmarks, told.refused, told.unverified],
+        [[list(n.a), list(n.b), n.matches, n.inliers, n.lacks] for n in told.nearest],
+        [pack_ruling(ruling) for ruling in told.rulings],
+    ]
+
+
+def read_maps(reader: Reader, value: Any) -> MapsExplanation:
+    """A list as the explanation of two maps; raises InvalidMessage."""
     parts = reader.as_array(value, "explanation of two maps", 32)
     if len(parts) < 7:
         raise reader.error(f"an explanation of two maps has {len(parts)} parts instead of 7")

@@ -114,19 +114,24 @@ def encode_route_request(request: RouteRequest) -> bytes:
 def decode_route_request(data: bytes) -> RouteRequest:
     """Decode a wish for a way; raises InvalidMessage."""
     reader = Reader(data, "route request", MAX_BLOCKED * 128 + 1024)
-    blocked = []
-    for value in reader.array("n", MAX_BLOCKED) if reader.has("n") else []:
-        pair = reader.as_array(value, "blocked pair", 2)
-        if len(pair) != 2:
-            raise reader.error("a blocked pair must be two nodes")
-        blocked.append((reader.as_node_id(pair[0], "node"), reader.as_node_id(pair[1], "node")))
     here = reader.array("s", 3) if reader.has("s") else [0.0, 0.0, 0.0]
     if len(here) != 3:
         raise reader.error("start_from_robot must be three numbers")
     x, y, heading = (
         reader.as_number(number, "start_from_robot", -MAX_POSITION, MAX_POSITION) for number in here
     )
-    return RouteRequest(reader.node_id("a"), reader.node_id("b"), tuple(blocked), Pose2(x, y, heading))
+    return RouteRequest(reader.node_id("a"), reader.node_id("b"), read_blocked(reader), Pose2(x, y, heading))
+
+
+def read_blocked(reader: Reader) -> tuple[tuple[NodeId, NodeId], ...]:
+    """Pairs of nodes between which a robot cannot drive, if any are told; raises InvalidMessage."""
+    blocked = []
+    for value in reader.array("n", MAX_BLOCKED) if reader.has("n") else []:
+        pair = reader.as_array(value, "blocked pair", 2)
+        if len(pair) != 2:
+            raise reader.error("a blocked pair must be two nodes")
+        blocked.append((reader.as_node_id(pair[0], "node"), reader.as_node_id(pair[1], "node")))
+    return tuple(blocked)
 
 
 def encode_route_answer(answer: RouteAnswer) -> bytes:

@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.explanation import MapsExplanation, PairExplanation
+from hybridmap.explanation import Explanation, Hop, MapsExplanation, PairExplanation, RouteExplanation
 from hybridmap.pose import PoseGaussian
 from hybridmap.ruling import Ruling
 
 
-def explanation_record(told: PairExplanation | tuple[MapsExplanation, ...]) -> dict[str, Any]:
-    """Of two nodes, or of each two maps as `maps`."""
-    return (
-        pair_values(told)
-        if isinstance(told, PairExplanation)
-        else {"maps": [maps_values(one) for one in told]}
-    )
+def explanation_record(told: Explanation) -> dict[str, Any]:
+    """Of two nodes, of a route, or of each two maps as `maps`."""
+    if isinstance(told, PairExplanation):
+        return pair_values(told)
+    if isinstance(told, RouteExplanation):
+        return route_values(told)
+    return {"maps": [maps_values(one) for one in told]}
 
 
 def pair_values(told: PairExplanation) -> dict[str, Any]:
@@ -75,6 +75,31 @@ def maps_values(told: MapsExplanation) -> dict[str, Any]:
             for n in told.nearest
         ],
         "rulings": [_ruling_values(ruling) for ruling in told.rulings],
+    }
+
+
+def route_values(told: RouteExplanation) -> dict[str, Any]:
+    """The explanation of a route for `json.dumps`: the fields of RouteExplanation by name."""
+    return {
+        "start": str(told.start),
+        "goal": str(told.goal),
+        "found": told.found,
+        "reason": told.reason,
+        "hops": [_hop(hop) for hop in told.hops],
+        "gaps": [_hop(hop) for hop in told.gaps],
+        "apart": None if told.apart is None else maps_values(told.apart),
+    }
+
+
+def _hop(hop: Hop) -> dict[str, Any]:
+    return {
+        "a": str(hop.a),
+        "b": str(hop.b),
+        "kind": hop.kind,
+        "distance": hop.distance,
+        "turn": hop.turn,
+        "cost": hop.cost,
+        "words": hop.words,
     }
 
 

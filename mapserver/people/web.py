@@ -1,9 +1,10 @@
-"""The map server for people: a photograph in, JSON out, why maps are one, and pages for phones.
+"""The map server for people: a photograph in, JSON out, why maps are one, why routes lead so, and pages.
 
     GET /             the page for photographs
     GET /why          the page that says why maps are one, or are not
     GET /status       what the server holds, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
+    GET /route        why a route leads as it does: ?a=r0.1.17&b=r1.1.5 from the one to the other, JSON
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
 
 Whatever goes wrong comes back as one JSON object with `error`. A server that is busy answers 503 with
@@ -28,14 +29,15 @@ from typing import Any, cast
 from urllib.parse import parse_qsl, urlsplit
 
 from hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
-from hybridmap.explanation import MapsExplanation, PairExplanation
+from hybridmap.explanation import Explanation
 from hybridmap.query import RelocalizeAnswer, View
-from hybridmap.ruling import EXAMPLE, Ends, read_ends
+from hybridmap.ruling import EXAMPLE, read_ends
 from mapserver.people.answer_json import answer_record
 from mapserver.people.explanation_json import explanation_record
 from mapserver.people.form import read_photo
 from mapserver.people.page import PAGE
 from mapserver.people.why_page import WHY_PAGE
+from wire.explanation_messages import ExplainRequest
 from wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
@@ -51,8 +53,9 @@ POLL = 0.05
 """How soon the server notices that it is closed, s."""
 
 Locate = Callable[[Callable[[], View], int], "Future[RelocalizeAnswer]"]
-Explain = Callable[[Ends | None], "Future[PairExplanation | tuple[MapsExplanation, ...]]"]
-PATHS = {"/": "GET", "/why": "GET", "/status": "GET", "/explain": "GET", "/relocalize": "POST"}
+Explain = Callable[[ExplainRequest], "Future[Explanation]"]
+QUESTIONS = ("/explain", "/route")
+PATHS = dict.fromkeys(("/", "/why", "/status", *QUESTIONS), "GET") | {"/relocalize": "POST"}
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -152,14 +155,15 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection = True
 
     def do_GET(self) -> None:
-        """The pages, the status, and why maps are one."""
+        """The pages, the status, why maps are one, and why routes lead so."""
         address = urlsplit(self.path)
         if address.path in PAGES:
             self._send(HTTPStatus.OK, PAGES[address.path].encode(), "text/html; charset=utf-8")
         elif address.path == "/status":
             self._tell(HTTPStatus.OK, dict(self._web.status()))
-        elif address.path == "/explain":
-            self._answer(lambda: self._explain(dict(parse_qsl(address.query, keep_blank_values=True))))
+        elif address.path in QUESTIONS:
+            query = dict(parse_qsl(address.query, keep_blank_values=True))
+            self._answer(lambda: self._explain(address.path, query))
         else:
             self._no_such(address.path)
 
@@ -182,13 +186,13 @@ class _Handler(BaseHTTPRequestHandler):
         photo.check()
         return answer_record(self._web.locate(photo.view, hash(photo.data)).result(PATIENCE))
 
-    def _explain(self, query: dict[str, str]) -> Mapping[str, Any]:
-        ends = None
-        if query:
+    def _explain(self, path: str, query: dict[str, str]) -> Mapping[str, Any]:
+        ends, route = None, path == "/route"
+        if query or route:
             if query.keys() != {"a", "b"}:
-                raise InvalidValue(f"write /explain?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
-            ends = read_ends(query["a"], query["b"])
-        return explanation_record(self._web.explain(ends).result(PATIENCE))
+                raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
+            ends = read_ends(query["a"].strip(), query["b"].strip())
+        return explanation_record(self._web.explain(ExplainRequest(ends, route)).result(PATIENCE))
 
     def _answer(self, answer: Callable[[], Mapping[str, Any]]) -> None:
         """Tell what comes of a question that takes long, or why nothing does."""

@@ -1,4 +1,7 @@
-"""The page on which people ask why maps are one, or are not, and see what two nodes have in common."""
+"""The page on which people ask why maps are one, or are not, and why routes lead as they do.
+
+What it tells is in its address: ?a=MAP&b=MAP, ?a=NODE&b=NODE, or with &route=1 the way from the one to the other.
+"""
 
 WHY_PAGE = """<!doctype html>
 <html lang="en">
@@ -19,9 +22,9 @@ WHY_PAGE = """<!doctype html>
 </style>
 <h1>Why is that one map, or why not?</h1>
 <form id="form">
-  <input id="a" placeholder="r0.1.17" aria-label="node or map" autocapitalize="off">
-  and <input id="b" placeholder="r1.1.5" aria-label="another one" autocapitalize="off">
-  <button>Explain</button> <a href="#" id="all">all maps</a>
+  <input id="a" name="a" placeholder="r0.1.17" aria-label="node or map" autocapitalize="off">
+  and <input id="b" name="b" placeholder="r1.1.5" aria-label="another one" autocapitalize="off">
+  <button>Explain</button> <button name="route" value="1">The way</button> <a href="why" id="all">all maps</a>
 </form>
 <div id="told" role="status">Asking ...</div>
 <p><small>To part two maps for good, or two nodes: <code>mapweave map unmerge A B --because TEXT</code>.
@@ -78,7 +81,7 @@ function posture(gaussian) {
 }
 function to(parent, a, b, words) {
   const link = add(parent, "a", words);
-  link.href = "#" + a + "," + b;
+  link.href = "why?" + new URLSearchParams({ a, b });
 }
 function showPair(pair) {
   const box = add(told, "section", "", pair.standing === "linked" || pair.standing === "own" ? "good" : "");
@@ -116,31 +119,54 @@ function ruled(r) {
 }
 function showMaps(maps) {
   if (!maps.length) add(told, "section", "There are no two maps.");
-  for (const one of maps) {
-    const box = add(told, "section", "", one.joined ? "good" : "");
-    add(box, "p", one.reason);
-    if (!one.joined)
-      add(box, "p", `${one.refused} links refused, ${one.unverified} alike pairs without a common posture.`);
-    if (one.nearest.length) add(box, "p", one.joined ? "Weakest links:" : "Nearest to a link:");
-    const list = add(box, "ul");
-    for (const n of one.nearest) {
-      const item = add(list, "li");
-      to(item, n.a, n.b, `${n.a} - ${n.b}`);
-      const lacks = n.lacks.split("; ").filter(words => !one.reason.includes(words));
-      item.append(": " + [`${n.matches} look alike, ${n.inliers} agree`, ...lacks].join("; "));
-    }
-    for (const words of one.rulings.map(ruled)) add(box, "p", words);
+  maps.forEach(showTwo);
+}
+function showTwo(one) {
+  const box = add(told, "section", "", one.joined ? "good" : "");
+  add(box, "p", one.reason);
+  if (!one.joined)
+    add(box, "p", `${one.refused} links refused, ${one.unverified} alike pairs without a common posture.`);
+  if (one.nearest.length) add(box, "p", one.joined ? "Weakest links:" : "Nearest to a link:");
+  const list = add(box, "ul");
+  for (const n of one.nearest) {
+    const item = add(list, "li");
+    to(item, n.a, n.b, `${n.a} - ${n.b}`);
+    const lacks = n.lacks.split("; ").filter(words => !one.reason.includes(words));
+    item.append(": " + [`${n.matches} look alike, ${n.inliers} agree`, ...lacks].join("; "));
+  }
+  for (const words of one.rulings.map(ruled)) add(box, "p", words);
+}
+function showHops(box, hops) {
+  const list = add(box, "ol");
+  for (const hop of hops) {
+    const item = add(list, "li");
+    to(item, hop.a, hop.b, `${hop.a} - ${hop.b}`);
+    item.append(`: ${hop.distance.toFixed(2)} m, ${(hop.turn * 180 / Math.PI).toFixed(0)}\u00b0, ` +
+      `cost ${hop.cost.toFixed(2)}; ${hop.kind}: ${hop.words}`);
   }
 }
+function showRoute(route) {
+  const box = add(told, "section", "", route.found ? "good" : "failed");
+  add(box, "p", `${route.start} to ${route.goal}: ` +
+    `${route.found ? "the way leads so" : "there is no way"}: ${route.reason}.`);
+  if (route.hops.length) showHops(box, route.hops);
+  if (route.gaps.length) {
+    add(box, "p", route.found ? "Not driven, and so not taken:" : "What is missing:");
+    showHops(box, route.gaps);
+  }
+  if (route.apart) showTwo(route.apart);
+}
 async function explain() {
-  const ends = decodeURIComponent(location.hash.slice(1)).split(",").filter(Boolean);
-  [byId("a").value, byId("b").value] = [ends[0] || "", ends[1] || ""];
-  const query = ends.length ? "?" + new URLSearchParams({ a: ends[0], b: ends[1] || "" }) : "";
+  const asked = new URLSearchParams(location.search);
+  const [a, b] = ["a", "b"].map(name => byId(name).value = (asked.get(name) || "").trim());
+  const path = asked.get("route") ? "route" : "explain";
+  const query = a || b ? "?" + new URLSearchParams({ a, b }) : "";
+  if (query) document.title = `${a} ${path === "route" ? "to" : "and"} ${b} - Mapweave`;
   told.textContent = "Asking ...";
   for (let tries = 0; tries < 5; tries++) {
     let reply, answer;
     try {
-      reply = await fetch("explain" + query);
+      reply = await fetch(path + query);
       answer = await reply.json();
     } catch (error) { answer = { error: "The map server does not answer: " + error.message }; }
     if (reply && reply.status === 503) {
@@ -150,22 +176,13 @@ async function explain() {
     told.textContent = "";
     if (answer.error) add(told, "section", answer.error, "failed");
     else if (answer.maps) showMaps(answer.maps);
+    else if (answer.hops) showRoute(answer);
     else showPair(answer);
     return;
   }
   told.textContent = "";
   add(told, "section", "The map server is too busy; try again in a minute.", "failed");
 }
-byId("form").addEventListener("submit", event => {
-  event.preventDefault();
-  const hash = "#" + byId("a").value.trim() + "," + byId("b").value.trim();
-  if (location.hash === hash) explain(); else location.hash = hash;
-});
-byId("all").addEventListener("click", event => {
-  event.preventDefault();
-  if (location.hash) location.hash = ""; else explain();
-});
-addEventListener("hashchange", explain);
 explain();
 </script>
 </html>

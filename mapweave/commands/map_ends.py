@@ -49,6 +49,18 @@ def map_of(word: str) -> MapId:
     return found
 
 
+def node_of(word: str) -> NodeId:
+    """Read a node.
+
+    Raises:
+        InvalidValue: it is none.
+    """
+    found = read_end(word)
+    if isinstance(found, MapId):
+        raise InvalidValue(f"{word} is a map: give one of its nodes, {word}.1 for example")
+    return found
+
+
 def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: bytes) -> list[Reply]:
     """Ask every map server of the fleet.
 

@@ -11,6 +11,7 @@ from mapweave.commands import (
     map_import,
     map_merge,
     map_retire,
+    map_route,
     map_show,
     map_unmerge,
 )
@@ -22,5 +23,7 @@ def add_to(commands: Any) -> None:
         "map", help="look into maps, ask why they are one, merge, export"
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    for action in (map_show, map_explain, map_unmerge, map_retire, map_merge, map_export, map_import):
+    for action in (
+        map_show, map_explain, map_route, map_unmerge, map_retire, map_merge, map_export, map_import
+    ):  # fmt: skip
         action.add_to(actions)

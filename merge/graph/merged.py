@@ -21,6 +21,8 @@ from merge.graph.posegraph import PoseGraph
 
 MOST_NAMES = 20
 """Maps that are named where one is mistyped."""
+NEAREST = 4
+"""Nodes that are named where one is mistyped: their numbers have gaps."""
 
 
 class Placement(NamedTuple):
@@ -154,7 +156,9 @@ class MergedMap:
             raise InvalidValue(f"there is no map {which}; known are: {some}{more}")
         if isinstance(end, NodeId) and end not in one.nodes:
             numbers = sorted(node.number for node in one.nodes)
-            span = f"its {len(numbers)} nodes are {numbers[0]} to {numbers[-1]}" if numbers else "it has none"
+            nearest = sorted(sorted(numbers, key=lambda number: abs(number - end.number))[:NEAREST])
+            some = f"of its {len(numbers)} nodes the nearest are {', '.join(map(str, nearest))}"
+            span = some if numbers else "it has none"
             raise InvalidValue(f"map {which} has no node {end.number}; {span}")
 
     def joined(self, first: MapId, second: MapId) -> bool:

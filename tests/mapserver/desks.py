@@ -12,15 +12,17 @@ import numpy as np
 from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import Busy
-from hybridmap.explanation import MapsExplanation, PairExplanation
+from hybridmap.explanation import Explanation
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
-from hybridmap.ruling import Ends
 from mapserver.merging.merger import Merger
+from mapserver.route_explaining import explain_route
+from mapserver.routes import Router
 from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
 from merge.graph.merged import MergedMap
+from wire.explanation_messages import ExplainRequest
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.1), 0.02, 0.01)
 ANSWER = RelocalizeAnswer(
@@ -57,23 +59,25 @@ class Desk:
             done.set_exception(error)
         return done
 
-    def explain(self, ends: Ends | None) -> Future[PairExplanation | tuple[MapsExplanation, ...]]:
-        done: Future[PairExplanation | tuple[MapsExplanation, ...]] = Future()
+    def explain(self, request: ExplainRequest) -> Future[Explanation]:
+        done: Future[Explanation] = Future()
         if isinstance(self.refusal, Busy):
             raise self.refusal
         try:
-            done.set_result(_explained(ends))
+            done.set_result(_explained(request))
         except Exception as error:  # noqa: BLE001 - as a worker would
             done.set_exception(error)
         return done
 
 
-def _explained(ends: Ends | None) -> PairExplanation | tuple[MapsExplanation, ...]:
+def _explained(request: ExplainRequest) -> Explanation:
     merged = two_maps()
-    if ends is None:
+    if request.ends is None:
         return explain_fleet(merged, 10)
-    first, second = ends
+    first, second = request.ends
     if isinstance(first, NodeId) and isinstance(second, NodeId):
+        if request.route:
+            return explain_route(Router(merged), first, second)
         return explain_nodes(merged, first, second)
     return (explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),)
 

@@ -15,7 +15,7 @@ import pytest
 from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidFile, InvalidValue
-from hybridmap.explanation import MapsExplanation, PairExplanation, Standing
+from hybridmap.explanation import MapsExplanation, Standing
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ends, Ruling
@@ -25,6 +25,7 @@ from mapserver.log.entry import Entry
 from mapserver.log.store import Store
 from mapserver.mapfiles import map_file_of, maps_of, merged_of
 from mapserver.merging.merger import Merger
+from mapserver.routes import Router
 from mapserver.server import MapServer, ServerSettings
 from merge.belief.consistency import ConsistencySettings
 from merge.graph.merged import MergedMap
@@ -249,19 +250,19 @@ def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
     with serving(path) as asker:
         merged = merged_of(asker.merged())
     store, desk, settled = Store(path), Desk(DeskSettings(workers=0)), False
-    answers = SimpleNamespace(merged=merged)
+    answers = SimpleNamespace(merged=merged, router=Router(merged))
     explainer = Explainer(
         bus, KEYS, "s0", lambda: answers, desk, RulingBook(store), lambda rulings: None, lambda: settled,
-        ConsistencySettings(),
+        ConsistencySettings(), tuple,
     )  # fmt: skip
     pair = merged.links[0].pair
-    for ends in ((A, B), pair, None):
+    for request in (*map(ExplainRequest, ((A, B), pair, None)), ExplainRequest(pair, route=True)):
         settled = False
-        told = explainer.explain(ends)
-        early = told if isinstance(told, PairExplanation) else told[0]
+        told = explainer.explain(request)
+        early = told[0] if isinstance(told, tuple) else told
         settled = True
-        told = explainer.explain(ends)
-        late = told if isinstance(told, PairExplanation) else told[0]
+        told = explainer.explain(request)
+        late = told[0] if isinstance(told, tuple) else told
         assert early.reason == f"{late.reason} (still merging: ask again)"
     explainer.close()
     desk.close()

@@ -124,6 +124,23 @@ def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path: 
     assert np.shape(told["a_from_b"]["covariance"]) == (3, 3)
 
 
+def test_a_route_is_explained(files: list[Path], said: Said, capfd: pytest.CaptureFixture[str]) -> None:
+    start, goal = links(files[3])[0]
+    told = json.loads(said("map", "route", start, goal, "--json", "--map", files[3]))
+    assert told["found"] and told["hops"][0]["a"] == str(start) and told["hops"][-1]["b"] == str(goal)
+    out = said("map", "route", start, goal, "--map", files[3])
+    assert out.startswith(f"{start} to {goal}: the way leads so: {told['reason']}")
+    assert len(out.splitlines()) == 1 + len(told["hops"])
+    barred = [word for one in links(files[3]) for word in ("--blocked", *map(str, one))]
+    others = json.loads(said("map", "route", start, goal, *barred, "--json", "--map", files[3]))
+    assert others["gaps"] and "said to be blocked" in others["gaps"][0]["words"]
+    assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3])]) == 2
+    out = capfd.readouterr().out
+    assert "there is no way: " in out and "r0.1 and r2.1 are not one map" in out
+    assert main(["map", "route", "r0.1", "r2.1.1", "--map", str(files[3])]) == 1
+    assert "r0.1 is a map: give one of its nodes" in capfd.readouterr().err
+
+
 def test_maps_are_explained(files: list[Path], said: Said) -> None:
     told = json.loads(said("map", "explain", "--map", files[3], "--json"))["maps"]
     assert [(one["first"], one["second"], one["joined"]) for one in told] == [
@@ -180,13 +197,19 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
         (["explain", "r0.1.1", "r1.1"], "are a node and a map"),
         (["explain", "here", "there"], "'here' is neither a node nor a map"),
         (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
-        (["explain", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; its 4 nodes are 1 to 7"),
+        (
+            ["explain", "r0.1.1", "r1.1.2"],
+            "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
+        ),
         (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes"),
         (["explain", "--draw", "x.png"], "--draw needs two nodes"),
         (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo"),
         (["unmerge", "r0.1.3", "r0.1.1"], "joined by their robot's way (edge r0.1.2, "),
         (["unmerge", "r0.1", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
-        (["unmerge", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; its 4 nodes are 1 to 7"),
+        (
+            ["unmerge", "r0.1.1", "r1.1.2"],
+            "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
+        ),
         (["unmerge", "r0.1", "r0.1"], "two different maps"),
         (["retire", "r0.1.1"], "r0.1.1 is a node: give its map, r0.1"),
         (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
@@ -292,6 +315,10 @@ def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_
         while told(served := json.loads(said("map", "explain", *pair, "--json", *at))) != told(offline):
             assert time.monotonic() < end, "the server explains otherwise"
         assert served["probability"] == pytest.approx(offline["probability"], rel=1e-4)
+        ways = [
+            json.loads(said("map", "route", *pair, "--json", *where)) for where in (("--map", files[3]), at)
+        ]
+        assert ways[0]["found"] and [hop["b"] for hop in ways[0]["hops"]] == [h["b"] for h in ways[1]["hops"]]
         out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", *at)
         assert "r0.1 and r1.1 are not one map: undone with all links" in out
     logged = (tmp_path / "logs" / "server.log").read_text()

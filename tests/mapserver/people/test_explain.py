@@ -12,7 +12,10 @@ import pytest
 
 from hybridmap.errors import Busy
 from hybridmap.node import NodeId
+from mapserver.people.explanation_json import route_values
 from mapserver.people.web import Web
+from mapserver.route_explaining import explain_route
+from mapserver.routes import Router
 from merge.explaining.explanation import explain_nodes
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.desks import Desk, two_maps
@@ -37,9 +40,9 @@ def served(desk: Desk) -> Iterator[Web]:
         yield served
 
 
-def ask(served: Web, query: str) -> tuple[int, dict]:
+def ask(served: Web, query: str, of: str = "explain") -> tuple[int, dict]:
     try:
-        with urlopen(f"http://127.0.0.1:{served.port}/explain{query}", timeout=20) as reply:
+        with urlopen(f"http://127.0.0.1:{served.port}/{of}{query}", timeout=20) as reply:
             return reply.status, json.load(reply)
     except HTTPError as error:
         return error.code, json.load(error)
@@ -97,8 +100,46 @@ def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: py
         assert page.run(count(".alike")) == len(told.matches) - len(told.shared)
         assert page.run(count("circle")) == len(told.a.landmarks) + len(told.b.landmarks)
         assert f"{told.a_from_b.mean.x:.3f} m ahead" in page.run(TOLD)
+        # Whoever is given the address sees the same at once, and the way back leads back.
+        address = page.run("return location.href")
+        assert address.endswith(f"/why?a={a}&b={b}")
         page.run("document.getElementById('all').click()")
         eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
-        page.open(f"http://127.0.0.1:{served.port}/why#r0.1,<b>x")
+        page.open(address)
+        eventually(lambda: f"{a} and {b}: linked: " in page.run(TOLD))
+        page.open(f"http://127.0.0.1:{served.port}/why?a=r1.1&b=%20r0.1%20")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        assert page.run("return [a, b].map(one => one.value)") == ["r1.1", "r0.1"]
+        page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=%3Cb%3Ex")
         eventually(lambda: "neither a node nor a map" in page.run(TOLD))
         assert page.run("return document.querySelector('#told b')") is None
+        assert page.run("return document.querySelectorAll('b').length") == 0
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_the_page_tells_the_way_from_its_form_and_from_its_address(
+    served: Web, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
+    told = explain_route(Router(two_maps()), start, goal)
+    assert told.found and ask(served, f"?a={start}&b={goal}", "route") == (200, route_values(told))
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        page.type("#a", str(start))
+        page.type("#b", str(goal))
+        page.run("document.querySelector('[name=route]').click()")
+        eventually(lambda: f"{start} to {goal}: the way leads so: {told.reason}" in page.run(TOLD))
+        assert page.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in told.hops]
+        address = page.run("return location.href")
+        assert address.endswith(f"/why?a={start}&b={goal}&route=1")
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        page.open(address)
+        eventually(lambda: f"{start} to {goal}: the way leads so" in page.run(TOLD))
+        page.run("document.querySelector('#told a').click()")
+        eventually(lambda: f"{told.hops[0].a} and {told.hops[0].b}: " in page.run(TOLD))
+
+
+def test_a_way_leads_from_node_to_node(served: Web) -> None:
+    for query, words in (("", "write /route?a="), ("?a=r0.1&b=r1.1", "from node to node")):
+        status, told = ask(served, query, "route")
+        assert status == 400 and words in told["error"]

@@ -330,7 +330,11 @@ def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
     [
         (NodeId("a", 1, 1), NodeId("a", 1, 1), "give two nodes"),
         (NodeId("z", 1, 1), NodeId("a", 1, 1), "there is no map z.1; known are: a.1, b.1, c.1"),
-        (NodeId("a", 1, 99), NodeId("a", 1, 1), "map a.1 has no node 99; its 12 nodes are 1 to 23"),
+        (
+            NodeId("a", 1, 99),
+            NodeId("a", 1, 1),
+            "map a.1 has no node 99; of its 12 nodes the nearest are 17, 19, 21, 23",
+        ),
     ],
 )
 def test_what_is_not_there_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str) -> None:

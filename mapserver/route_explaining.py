@@ -1,0 +1,178 @@
+"""Why a route leads the way it does, and what is missing where there is none."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from hybridmap.explanation import Hop, MapsExplanation, RouteExplanation
+from hybridmap.node import Edge, MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.reach import RECOGNISED
+from hybridmap.route import Route, edge_cost
+from mapserver.roadmap import IMPLIED
+from mapserver.routes import Router
+from merge.explaining.maps import explain_maps
+from merge.explaining.own import reach_words
+from merge.explaining.parting import joined_maps
+from merge.graph.merged import MergedMap
+
+TOLL = 1e4
+"""What a gap costs where as few as possible are looked for, m: more than any way through a building."""
+CLEARLY = 0.1
+"""A way that is not driven is told of if it is cheaper by more than this, m."""
+WORDS = {
+    "mapped": "its robot drove here while it mapped",
+    "turned": "its robot turned here on the spot",
+    "driven": "a robot has driven here",
+    "near": "both stand in one place",
+    "superseded": "the one stands for the other",
+}
+Pairs = Collection[tuple[NodeId, NodeId]]
+
+
+@dataclass(frozen=True)
+class _Hindrances:
+    """Pairs between which somebody could not drive."""
+
+    blocked: frozenset[frozenset[NodeId]]
+    wary: frozenset[frozenset[NodeId]]
+    wary_cost: float
+
+    def words(self, pair: frozenset[NodeId]) -> str:
+        """Of a pair; empty if it is none."""
+        if pair in self.blocked:
+            return "said to be blocked"
+        if pair in self.wary:
+            return f"a robot did not get through of late: {self.wary_cost:g} m dearer"
+        return ""
+
+
+def explain_route(
+    router: Router, start: NodeId, goal: NodeId, blocked: Pairs = (), wary: Pairs = ()
+) -> RouteExplanation:
+    """Explain a route from node to node, or why there is none: the very route that robots are given there.
+
+    Args:
+        router: of the merged map.
+        start: where it begins.
+        goal: where it shall end.
+        blocked: as in Router.route.
+        wary: as in Router.route.
+
+    Raises:
+        InvalidValue: a node that was never there.
+    """
+    merged = router.merged
+    for end in (start, goal):
+        merged.check(end)
+    if missing := router.missing(start, goal):
+        return _apart(merged, start, goal, missing)
+    if start == goal:
+        return RouteExplanation(start, goal, True, "start and goal are one node")
+    known = _Hindrances(
+        frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), router.settings.wary_cost
+    )
+    found, why_not = Route((), (), 0.0, ""), ""
+    postures: Mapping[NodeId, Pose2] = {}
+    for postures in router.choices(start, goal):
+        found = router.ways(postures, blocked, wary).find(start, goal)
+        if found.nodes:
+            break
+        why_not = found.reason
+    if not found.nodes:
+        least = router.ways(postures, blocked, wary, TOLL).find(start, goal)
+        gaps = _gaps(router, least, postures, known)
+        many = "1 gap is" if len(gaps) == 1 else f"{len(gaps)} gaps are"
+        more = f"; {many} on the way that lacks least" if gaps else ""
+        return RouteExplanation(start, goal, False, f"{why_not}{more}", gaps=gaps)
+    best = router.ways(postures, toll=0.0).find(start, goal)
+    gaps = _gaps(router, best, postures, known) if best.cost < found.cost - CLEARLY else ()
+    hops = tuple(_hops(router, found, postures, known))
+    return RouteExplanation(start, goal, True, _why(router, found, best, hops, gaps), hops, gaps)
+
+
+def _why(router: Router, found: Route, best: Route, hops: tuple[Hop, ...], gaps: tuple[Hop, ...]) -> str:
+    """Of a way that was found."""
+    steps = "1 step" if len(hops) == 1 else f"{len(hops)} steps"
+    length = sum(hop.distance for hop in hops)
+    reason = f"{steps} over {length:.1f} m, cost {found.cost:.1f} m"
+    if gaps:
+        many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        reason += f"; a way for {best.cost:.1f} m has {many} that robots do not drive"
+    else:
+        reason += "; no cheaper one is known, not even over what nobody drives"
+    older = sum(node in router.merged.superseded for node in found.nodes[1:-1])
+    if older:
+        reason += f"; {older} of its nodes are passed although others stand for them: nothing else joins it"
+    return reason
+
+
+def _hops(router: Router, way: Route, postures: Mapping[NodeId, Pose2], known: _Hindrances) -> Iterator[Hop]:
+    edges = router.roads.union.edges
+    for (a, b), edge_id in zip(pairwise(way.nodes), way.edges, strict=True):
+        edge, words = edges[edge_id], known.words(frozenset((a, b)))
+        more = router.settings.wary_cost if words else 0.0
+        told = _hop(router, edge, a, b, postures, more)
+        yield told if not words else replace(told, words=f"{told.words}; {words}")
+
+
+def _gaps(
+    router: Router, way: Route, postures: Mapping[NodeId, Pose2], known: _Hindrances
+) -> tuple[Hop, ...]:
+    """Those hops of a way that robots do not drive, or had better not."""
+    roads, out = router.roads, []
+    for a, b in pairwise(way.nodes):
+        between = [roads.union.edges[key] for key in roads.union.graph.get_edge_data(a, b)]
+        best = min(between, key=lambda e: (edge_cost(e, postures, True, router.settings.route), e.id))
+        words = known.words(frozenset((a, b)))
+        if words or all(edge.id in roads.closed for edge in between):
+            told = _hop(router, best, a, b, postures, 0.0)
+            out.append(replace(told, words=words) if words else told)
+    return tuple(out)
+
+
+def _hop(
+    router: Router, edge: Edge, a: NodeId, b: NodeId, postures: Mapping[NodeId, Pose2], more: float
+) -> Hop:
+    between = postures[a].inverse() @ postures[b]
+    implied = edge.id.agent in IMPLIED
+    kind = edge.id.agent if implied else str(edge.kind)
+    words = WORDS[kind] if implied or edge.kind not in RECOGNISED else reach_words(router.merged, edge)
+    cost = edge_cost(edge, postures, True, router.settings.route) + more
+    return Hop(a, b, kind, between.distance(Pose2()), between.heading, cost, words)
+
+
+def _apart(merged: MergedMap, start: NodeId, goal: NodeId, missing: str) -> RouteExplanation:
+    """Of two nodes that nothing joins, or of which one takes no part."""
+    first, second = merged.component_of(start), merged.component_of(goal)
+    if first is None or second is None:
+        return RouteExplanation(start, goal, False, missing)
+    apart = _nearest_maps(merged, start, goal, first, second)
+    if apart is None:
+        torn = [str(one) for one in sorted({start.map, goal.map}) if _pieces(merged, one) > 1]
+        missing += f"; {' and '.join(torn)} {'is' if len(torn) == 1 else 'are'} in pieces"
+    return RouteExplanation(start, goal, False, missing, apart=apart)
+
+
+def _pieces(merged: MergedMap, one: MapId) -> int:
+    return sum(any(node.map == one for node in component) for component in merged.components)
+
+
+def _nearest_maps(
+    merged: MergedMap, start: NodeId, goal: NodeId, first: int, second: int
+) -> MapsExplanation | None:
+    """Two maps, one of each part, between which most was found; None if one map lies in both parts."""
+    sides = [merged.components[number] for number in (first, second)]
+    part_of = {one: part for part in joined_maps(merged) for one in part}
+    if part_of[start.map] == part_of[goal.map]:
+        return None
+    between: Counter[tuple[MapId, MapId]] = Counter({(start.map, goal.map): 0})
+    for r in merged.refused:
+        for a, b in ((r.a, r.b), (r.b, r.a)):
+            if r.edge is None and a in sides[0] and b in sides[1]:
+                between[a.map, b.map] += 1000 if r.link is not None else 1
+    most = max(between, key=lambda pair: (between[pair], pair == (start.map, goal.map), pair))
+    return explain_maps(merged, *most)

@@ -1,0 +1,74 @@
+"""`mapweave map route`: the way from node to node, and why it leads so or why there is none."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.network import add_network
+
+if TYPE_CHECKING:
+    from hybridmap.explanation import RouteExplanation
+    from hybridmap.node import NodeId
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "route",
+        help="the way from node to node, and why it leads so, or why there is none",
+        description="Say which way robots are led from one node to another (r0.1.17 r1.1.5), step by step; "
+        "why not a shorter one; or why there is no way at all: what of it nobody could drive, what is "
+        "blocked, or which maps would have to be one. A running server is asked, or a map file. "
+        "Exit status 0: there is a way; 2: there is none; 1: could not ask.",
+    )
+    parser.add_argument("start", metavar="START", help="a node")
+    parser.add_argument("goal", metavar="GOAL", help="another one")
+    parser.add_argument(
+        "--blocked", nargs=2, action="append", default=[], metavar="NODE",
+        help="as if a robot could not get through between these two; may be given again",
+    )  # fmt: skip
+    parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Ask and print."""
+    from mapserver.people.explanation_json import route_values
+    from mapweave.commands.map_ends import node_of
+    from mapweave.explained import route_words
+
+    start, goal = node_of(arguments.start), node_of(arguments.goal)
+    blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
+    told = explained_route(arguments, start, goal, blocked)
+    print(json.dumps(route_values(told)) if arguments.json else "\n".join(route_words(told)))
+    return 0 if told.found else 2
+
+
+def explained_route(
+    arguments: argparse.Namespace, start: NodeId, goal: NodeId, blocked: tuple[tuple[NodeId, NodeId], ...]
+) -> RouteExplanation:
+    """A route through a map file, or through what a server has."""
+    from mapserver.mapfiles import merged_of
+    from mapserver.route_explaining import explain_route
+    from mapserver.routes import Router
+    from mapweave.commands.map_ends import ask
+    from mapweave.commands.network import settings_of
+    from mapweave.settings import merge_settings
+    from wire.explanation_messages import ExplainRequest, encode_explain_request
+    from wire.keys import Keys
+    from wire.mapfile import read_map_file
+    from wire.route_explanation import decode_route_explanation
+
+    if arguments.map is None:
+        request = ExplainRequest((start, goal), True, blocked)
+        replies = ask(arguments, Keys.any_explain, encode_explain_request(request))
+        return decode_route_explanation(replies[0].payload)
+    settings = merge_settings(settings_of(arguments), arguments.settings)
+    router = Router(merged_of(read_map_file(arguments.map), settings))
+    return explain_route(router, start, goal, blocked)

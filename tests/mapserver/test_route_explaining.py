@@ -1,0 +1,177 @@
+"""Why a route leads so, and what is missing where there is none, against every way there could be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from benchmarks.synthetic import Sensing, room, take_map
+from hybridmap.change import Change, EdgePut, NodePut
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.explanation import RouteExplanation
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
+from hybridmap.reach import RECOGNISED, reach_of
+from hybridmap.ruling import Ruling, Rulings
+from mapserver.merging.merger import Merger
+from mapserver.people.explanation_json import route_values
+from mapserver.route_explaining import explain_route
+from mapserver.routes import Router
+from mapweave.explained import route_words
+from wire.explanation_messages import ExplainRequest, decode_explain_request, encode_explain_request
+from wire.packing import pack
+from wire.route_explanation import decode_route_explanation, encode_route_explanation
+
+ME, OTHER, FAR = MapId("a", 1), MapId("b", 1), MapId("c", 1)
+SHARP = Sensing(most=150, clutter=5, unknown_depth=0.0, reach=9.0)
+
+
+def fleet() -> Merger:
+    """Two robots see one wall from three metres apart, and a third one another room."""
+    rng = np.random.default_rng(1)
+    world, elsewhere = room(0, 0, 9, 4, 1400, rng), room(0, 0, 5, 4, 700, np.random.default_rng(9))
+    merger = Merger()
+    for map_id, there, x in ((ME, world, 1.6), (OTHER, world, 5.0), (FAR, elsewhere, 2.0)):
+        nodes, edges = take_map(there, map_id, [Pose2(x + 0.3 * k, 2.0) for k in range(3)], rng, SHARP)
+        for number, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
+            merger.on_change(Change(map_id, number, 0, body))
+    return merger
+
+
+@pytest.fixture(scope="module")
+def router() -> Router:
+    return Router(fleet().merged())
+
+
+def nodes_of(map_id: MapId) -> list[NodeId]:
+    return [NodeId(*map_id, k) for k in (1, 3, 5)]
+
+
+@pytest.fixture(params=["as it is", "over the wire"])
+def sent(request: pytest.FixtureRequest) -> bool:
+    return bool(request.param == "over the wire")
+
+
+def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
+    """Fewest pairs on any way between which nobody could drive, by trying all ways of up to five steps."""
+    merged = router.merged
+    whole = merged.union()
+    graph: nx.Graph = nx.Graph()
+    for edge in whole.edges.values():
+        a, b = whole.nodes[edge.a], whole.nodes[edge.b]
+        open_ = edge.kind not in RECOGNISED or reach_of(edge, a, b).drivable
+        known = graph.get_edge_data(edge.a, edge.b, {"gap": 1})
+        graph.add_edge(edge.a, edge.b, gap=min(known["gap"], int(not open_)))
+    for a in merged.postures:
+        for b in merged.postures:
+            if a < b and merged.component_of(a) == merged.component_of(b):
+                if merged.pose(a).distance(merged.pose(b)) <= router.settings.near:
+                    graph.add_edge(a, b, gap=0)
+    return min(
+        sum(graph.edges[hop]["gap"] for hop in pairwise(way))
+        for way in nx.all_simple_paths(graph, start, goal, cutoff=5)
+    )
+
+
+def test_what_only_ties_postures_is_named_with_what_it_lacks(router: Router) -> None:
+    start, goal = nodes_of(ME)[0], nodes_of(OTHER)[2]
+    told = explain_route(router, start, goal)
+    assert not told.found and not told.hops and told.apart is None
+    assert told.reason.startswith(router.route(start, goal).reason) and "ties postures" in told.reason
+    assert len(told.gaps) == least_gaps(router, start, goal) == 1
+    (gap,) = told.gaps
+    assert (gap.a.map, gap.b.map) == (ME, OTHER) and gap.kind == "merged"
+    assert gap.words.startswith("ties postures, not driven: ")
+    assert gap.distance == pytest.approx(router.merged.pose(gap.a).distance(router.merged.pose(gap.b)))
+    words = route_words(told)
+    assert "there is no way" in words[0] and "what is missing" in words[1] and gap.words in words[2]
+
+
+def test_the_way_is_the_one_that_robots_are_given(router: Router) -> None:
+    start, goal = nodes_of(ME)[0], nodes_of(ME)[2]
+    told = explain_route(router, start, goal)
+    legs = router.route(start, goal).legs
+    assert told.found and [hop.b for hop in told.hops] == [leg.node.id for leg in legs[1:]]
+    for hop, leg in zip(told.hops, legs[1:], strict=True):
+        assert hop.distance == pytest.approx(leg.previous_from_node.mean.distance(Pose2()))
+        assert hop.turn == pytest.approx(leg.previous_from_node.mean.heading, abs=1e-9)
+    assert not told.gaps and "no cheaper one is known" in told.reason
+    assert f"cost {sum(hop.cost for hop in told.hops):.1f} m" in told.reason
+
+
+def test_what_is_blocked_is_told_whether_there_is_another_way_or_none(router: Router) -> None:
+    one, two, three = nodes_of(ME)
+    told = explain_route(router, one, three, blocked=[(two, one)])
+    legs = router.route(one, three, blocked=[(two, one)]).legs
+    assert told.found is bool(legs)
+    assert all("said to be blocked" in gap.words for gap in told.gaps)
+    whole = [(one, other) for other in router.merged.postures if other != one]
+    told = explain_route(router, one, three, blocked=whole)
+    assert not told.found and not router.route(one, three, blocked=whole).legs
+    assert "is blocked" in told.reason and "said to be blocked" in told.gaps[0].words
+
+
+def test_where_a_robot_did_not_get_through_of_late_is_told(router: Router) -> None:
+    one, two, _ = nodes_of(ME)
+    free, wary = explain_route(router, one, two), explain_route(router, one, two, wary=[(one, two)])
+    if [hop.b for hop in wary.hops] == [two]:
+        assert wary.hops[0].cost == pytest.approx(free.hops[0].cost + router.settings.wary_cost)
+        assert "did not get through of late" in wary.hops[0].words
+    else:
+        assert "did not get through of late" in wary.gaps[0].words
+    assert wary.gaps, "the way that would be cheaper is told"
+
+
+def test_maps_that_are_not_one_are_explained_in_place_of_a_way(router: Router, sent: bool) -> None:
+    told = explain_route(router, nodes_of(ME)[0], nodes_of(FAR)[0])
+    if sent:
+        told = decode_route_explanation(encode_route_explanation(told))
+    assert not told.found and "in parts of the map that nothing joins yet" in told.reason
+    assert told.apart is not None and not told.apart.joined
+    assert told.apart.second == FAR and "are not one map" in told.apart.reason
+    assert any("are not one map" in line for line in route_words(told))
+    assert route_values(told)["apart"]["second"] == "c.1"
+
+
+def test_pieces_of_one_map_are_no_maps_to_be_joined() -> None:
+    merger = fleet()
+    for edge in list(merger.maps[FAR].edges.values()):
+        merger.apply(FAR, EdgePut(replace(edge, b=NodeId("z", 1, 1))))
+    merged = merger.merged()
+    told = explain_route(Router(merged), nodes_of(FAR)[0], nodes_of(FAR)[2])
+    if merged.component_of(nodes_of(FAR)[0]) != merged.component_of(nodes_of(FAR)[2]):
+        assert told.apart is None and told.reason.endswith("; c.1 is in pieces")
+
+
+def test_a_retired_map_says_who_retired_it() -> None:
+    merger = fleet()
+    merger.rule(Rulings([Ruling((OTHER, OTHER), True, "anna", 10**18, "burnt down")]))
+    told = explain_route(Router(merger.merged()), nodes_of(ME)[0], nodes_of(OTHER)[0])
+    assert not told.found and "anna" in told.reason and "burnt down" in told.reason
+
+
+def test_what_never_was_is_refused_with_what_there_is(router: Router) -> None:
+    with pytest.raises(InvalidValue, match="map a.1 has no node 9; of its 3 nodes the nearest are 1, 3, 5"):
+        explain_route(router, nodes_of(ME)[0], NodeId(*ME, 9))
+    with pytest.raises(InvalidValue, match="there is no map z.1"):
+        explain_route(router, NodeId("z", 1, 1), nodes_of(ME)[0])
+    assert explain_route(router, *nodes_of(ME)[:1] * 2).found
+
+
+def test_questions_and_answers_come_through_the_wire(router: Router) -> None:
+    one, two, three = nodes_of(ME)
+    request = ExplainRequest((one, three), True, ((one, two), (two, three)))
+    assert decode_explain_request(encode_explain_request(request)) == request
+    told = explain_route(router, one, three, blocked=[(one, two)])
+    again = decode_route_explanation(encode_route_explanation(told))
+    assert isinstance(again, RouteExplanation) and again == told
+    with pytest.raises(InvalidValue, match="from node to node"):
+        ExplainRequest((ME, OTHER), True)
+    with pytest.raises(InvalidMessage, match="from node to node"):
+        decode_explain_request(pack({"e": [list(ME), list(OTHER)], "w": 1}))
+    with pytest.raises(InvalidMessage):
+        decode_route_explanation(pack({"a": list(one), "b": list(two), "f": 1, "r": "", "h": [[1]], "g": []}))
