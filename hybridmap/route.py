@@ -61,11 +61,10 @@ class Ways:
         settings: RouteSettings | None = None,
         toll: float | None = None,
     ) -> None:
-        """Take a map; the other arguments are those of `find_route`.
+        """Take a map; the arguments are those of `find_route`.
 
-        Args:
-            toll: what it costs besides to pass where it is blocked or nothing can be driven, m: the way then
-                tells what stands in the way. None: nobody passes there.
+        With a toll also the pairs are passed that are blocked, or that nobody could drive; it is what each
+        costs besides, m. The cheapest way then tells what stands in the way.
         """
         s = settings or RouteSettings()
         self._map = hybrid_map

@@ -1,4 +1,4 @@
-"""People's questions why maps are one and why routes lead so, and their rulings that maps shall not be one."""
+"""People's questions why maps are one and why routes lead so, and rulings that maps shall not be one."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The page on which people ask why maps are one, or are not, and why routes lead as they do.
 
-What it tells is in its address: ?a=MAP&b=MAP, ?a=NODE&b=NODE, or with &route=1 the way from the one to the other.
+What it tells is in its address: ?a=MAP&b=MAP, ?a=NODE&b=NODE, or with &route=1 the way from node to node.
 """
 
 WHY_PAGE = """<!doctype html>

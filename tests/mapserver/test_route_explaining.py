@@ -68,9 +68,9 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
         graph.add_edge(edge.a, edge.b, gap=min(known["gap"], int(not open_)))
     for a in merged.postures:
         for b in merged.postures:
-            if a < b and merged.component_of(a) == merged.component_of(b):
-                if merged.pose(a).distance(merged.pose(b)) <= router.settings.near:
-                    graph.add_edge(a, b, gap=0)
+            one = a < b and merged.component_of(a) == merged.component_of(b)
+            if one and merged.pose(a).distance(merged.pose(b)) <= router.settings.near:
+                graph.add_edge(a, b, gap=0)
     return min(
         sum(graph.edges[hop]["gap"] for hop in pairwise(way))
         for way in nx.all_simple_paths(graph, start, goal, cutoff=5)
@@ -155,9 +155,9 @@ def test_a_retired_map_says_who_retired_it() -> None:
 
 
 def test_what_never_was_is_refused_with_what_there_is(router: Router) -> None:
-    with pytest.raises(InvalidValue, match="map a.1 has no node 9; of its 3 nodes the nearest are 1, 3, 5"):
+    with pytest.raises(InvalidValue, match=r"map a\.1 has no node 9; of its 3 nodes the nearest are 1, 3, 5"):
         explain_route(router, nodes_of(ME)[0], NodeId(*ME, 9))
-    with pytest.raises(InvalidValue, match="there is no map z.1"):
+    with pytest.raises(InvalidValue, match=r"there is no map z\.1"):
         explain_route(router, NodeId("z", 1, 1), nodes_of(ME)[0])
     assert explain_route(router, *nodes_of(ME)[:1] * 2).found
 

@@ -333,7 +333,7 @@ def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
         (
             NodeId("a", 1, 99),
             NodeId("a", 1, 1),
-            "map a.1 has no node 99; of its 12 nodes the nearest are 17, 19, 21, 23",
+            "of its 12 nodes the nearest are 17, 19, 21, 23",
         ),
     ],
 )
