@@ -221,7 +221,7 @@ def run_agent(
     cv2.setNumThreads(1)
     console = Console(stderr=True)
     show = _progress(console, options)
-    describe = partial(_describe, robot, bus, console, options.name)
+    describe = partial(_describe, robot, console.print, options.name)
     agent = Agent(describe, bus, keys, settings, options, show, console.print)
     with show:
         try:
@@ -236,14 +236,9 @@ def run_agent(
             agent.close()
 
 
-def _describe(robot: Robot, bus: ZenohBus, console: Console, name: str) -> RobotDescription:
+def _describe(robot: Robot, say: Callable[[str], None], name: str) -> RobotDescription:
     """What the body says of itself; whoever has to wait for that is told what for."""
-
-    def say() -> None:
-        there = "" if bus.connected() else "; no router in reach: start `mapweave server` or give --connect"
-        console.print(f"{name}: waits for its body{there}", soft_wrap=True)
-
-    patience = threading.Timer(SILENCE, say)
+    patience = threading.Timer(SILENCE, say, [f"{name}: waits for its body"])
     patience.daemon = True
     patience.start()
     try:

@@ -10,7 +10,7 @@ from sim.simulation import Simulation
 from wire.bus import Bus
 
 PATIENCE = 60.0
-"""How long the other robots wait for one that does not ask, s."""
+"""How long the other robots wait for one that does not ask, s; they must not give up their body before."""
 
 
 def run_sim(

@@ -16,6 +16,9 @@ from wire.bus import Request
 
 log = logging.getLogger(__name__)
 
+SOON = 3.0
+"""After what time those who wait for the beginning are told for whom, s."""
+
 
 @dataclass(slots=True, eq=False)
 class Seat:
@@ -64,7 +67,7 @@ class Lockstep:
         self._seats = {name: Seat(name) for name in sorted(robots)}
         self._patience = patience
         self._expected = len(self._seats) if expected is None else expected
-        self._begun = False
+        self._begun = self._told = False
         if len(self._seats) != len(robots) or not 0 <= self._expected <= len(robots):
             raise InvalidValue(f"lock-step: {expected} of the robots {', '.join(robots)} cannot be expected")
 
@@ -153,6 +156,10 @@ class Lockstep:
         if len(self._seats) - len(missing) >= self._expected:
             return True
         if waited < self._patience:
+            if waited >= SOON and not self._told:
+                self._told = True
+                names = ", ".join(missing)
+                log.info("time waits for the agents of %s, %g s at the longest", names, self._patience)
             return False
         for name in missing:
             log.warning("robot %s has not asked for %g s: time begins without it", name, self._patience)

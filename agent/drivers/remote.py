@@ -25,6 +25,9 @@ from wire.keys import Keys
 ASK_TIMEOUT = 3.0
 """After what silence a question is asked again, s. A lost question costs no more than this."""
 
+PATIENCE = 90.0
+"""How long a body may be silent, s. A simulated one is as long as it waits for other robots' agents."""
+
 PAUSE = 0.05
 """Between two questions when nobody is there, s."""
 
@@ -52,7 +55,7 @@ class RemoteRobot:
     Each `sense` carries the last command there and the observation back: one question a tick.
     """
 
-    def __init__(self, bus: Bus, fleet: str, name: str, patience: float = 30.0) -> None:
+    def __init__(self, bus: Bus, fleet: str, name: str, patience: float = PATIENCE) -> None:
         """Nothing is asked yet.
 
         Args:

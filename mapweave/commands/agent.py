@@ -10,7 +10,14 @@ from typing import Any
 
 from agent.drivers.robot import Robot
 from hybridmap.node import check_name
-from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+from mapweave.commands.network import (
+    add_network,
+    connect,
+    network_of,
+    settings_of,
+    stop_on_signals,
+    tell_if_alone,
+)
 
 
 def add_to(commands: Any) -> None:
@@ -60,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     bus, keys = connect(network)
     body = bus
     try:
+        tell_if_alone(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
         robot = RemoteRobot(body, network.fleet, name)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import argparse
 import signal
+import sys
 import threading
+import time
 from pathlib import Path
 
 from mapweave.settings import NetworkSettings, Settings, load_settings
 from wire.bus_settings import BusSettings
 from wire.keys import Keys
 from wire.zenoh_bus import ZenohBus
+
+SOON = 2.0
+"""s; a router that is there is found sooner."""
 
 
 def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
@@ -45,6 +50,19 @@ def network_of(arguments: argparse.Namespace, settings: Settings) -> NetworkSett
 def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
     """A client connection; it opens in the background and survives a router that comes and goes."""
     return ZenohBus(BusSettings(mode="client", endpoints=network.endpoints)), Keys(network.fleet)
+
+
+def tell_if_alone(bus: ZenohBus, who: str) -> None:
+    """Say so on stderr if there is no router to be reached soon; nobody waits for that."""
+    began = time.monotonic()
+
+    def look() -> None:
+        # Who leaves before the time is over has not looked for long enough.
+        if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
+            advice = "start `mapweave server` or give --connect"
+            print(f"{who} finds no router: {advice}; it goes on looking", file=sys.stderr, flush=True)
+
+    threading.Thread(target=look, name="router", daemon=True).start()
 
 
 def stop_on_signals() -> threading.Event:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals, tell_if_alone
 
 
 def add_to(commands: Any) -> None:
@@ -182,6 +183,9 @@ def run_serve(arguments: argparse.Namespace) -> int:
     from wire.bus_settings import BusSettings
     from wire.zenoh_bus import ZenohBus
 
+    # Whom time waits for, and whose agent is gone.
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("sim").setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
@@ -191,6 +195,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
         bus = ZenohBus(BusSettings(mode="router", listen=(arguments.listen,)))
     else:
         bus = ZenohBus(BusSettings(mode="client", endpoints=network.endpoints))
+        tell_if_alone(bus, "the simulator")
     try:
         run_sim(bus, network.fleet, scenario, seed, stop, arguments.held)
     finally:

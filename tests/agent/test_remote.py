@@ -25,10 +25,11 @@ from agent.drivers.messages import (
     encode_observation,
     encode_step,
 )
-from agent.drivers.remote import RemoteRobot
+from agent.drivers.remote import ASK_TIMEOUT, PATIENCE, RemoteRobot
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
+from mapweave import sim_process
 from wire.bus import Request
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
@@ -295,6 +296,10 @@ def test_who_is_stopped_while_it_waits_does_not_say_that_a_simulation_ended(bus:
     with pytest.raises(DeviceError, match="robot/r0/describe: stopped before its body has answered"):
         robot.describe()
     stop.join()
+
+
+def test_nobody_gives_up_a_simulated_body_that_waits_for_another_robot() -> None:
+    assert sim_process.PATIENCE + ASK_TIMEOUT < PATIENCE
 
 
 def test_two_bodies_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus) -> None:

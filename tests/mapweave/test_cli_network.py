@@ -87,18 +87,29 @@ def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_p
         watchdog.cancel()
     *before, last = said.splitlines()
     assert last.endswith("robot/r0/describe: stopped before its body has answered")
-    assert all("waits for its body" in line for line in before)
+    assert all("waits for its body" in line or "finds no router" in line for line in before)
     assert process.returncode == 1
 
 
-def test_an_agent_without_a_body_says_what_it_waits_for(nobody, tmp_path):
-    command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", nobody, "--data", str(tmp_path)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+@pytest.mark.parametrize(
+    ("command", "hints"),
+    [
+        (["agent", "r0"], {"r0: waits for its body", "r0 finds no router: start `mapweave server`"}),
+        (["sim", "serve", "office"], {"the simulator finds no router: start `mapweave server`"}),
+    ],
+)
+def test_who_waits_says_what_for(command, hints, nobody, tmp_path):
+    data = ["--data", str(tmp_path)] if command[0] == "agent" else []
+    whole = [sys.executable, "-m", "mapweave", *command, "--connect", nobody, *data]
+    with subprocess.Popen(whole, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
         watchdog = threading.Timer(40, process.kill)
         watchdog.start()
         assert process.stderr is not None
-        said = process.stderr.readline()
+        for line in process.stderr:
+            hints = {hint for hint in hints if not line.startswith(hint)}
+            if not hints:
+                break
         process.send_signal(signal.SIGINT)
-        process.wait()
+        process.communicate()
         watchdog.cancel()
-    assert said.startswith("r0: waits for its body; no router in reach: start `mapweave server`")
+    assert not hints

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 
 import pytest
@@ -73,6 +74,15 @@ def test_those_who_never_come_are_given_up(caplog: pytest.LogCaptureFixture) -> 
     assert table.due(24.9) == []
     assert table.tick(25.0) == ["a"]
     assert [r.message for r in caplog.records] == ["robot b has not asked for 20 s: time begins without it"]
+
+
+def test_those_who_wait_for_the_beginning_are_told_for_whom(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "sim")
+    table = Table(["a", "b", "c"])
+    table.ask("b", 1, now=5.0)
+    for now in (5.1, 9.0, 12.0):
+        assert table.due(now) == []
+    assert [r.message for r in caplog.records] == ["time waits for the agents of a, c, 20 s at the longest"]
 
 
 def test_the_silent_one_stands_still_until_it_asks_again(caplog: pytest.LogCaptureFixture) -> None:
