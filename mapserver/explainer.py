@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
 from hybridmap.errors import InvalidFile, InvalidMessage
 from hybridmap.explanation import Explanation, MapsExplanation, PairExplanation, RouteExplanation
+from hybridmap.history import Happening, Kind
 from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.answers import Answers
@@ -30,6 +31,7 @@ from wire.explanation_messages import (
     encode_maps,
     encode_pair,
 )
+from wire.history_codec import encode_history
 from wire.keys import Keys
 from wire.log_messages import encode_record
 from wire.route_explanation import encode_route_explanation
@@ -89,6 +91,7 @@ class Explainer:
         settled: Callable[[], bool],
         consistency: ConsistencySettings,
         wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
+        happenings: Callable[[], Iterable[Happening]],
     ) -> None:
         """Begin to answer.
 
@@ -103,6 +106,7 @@ class Explainer:
             settled: whether the newest answers know all that has come.
             consistency: as in the merge.
             wary: pairs of nodes between which robots of late did not get through.
+            happenings: what has become of the maps.
         """
         self._answers = answers
         self._desk = desk
@@ -111,10 +115,12 @@ class Explainer:
         self._settled = settled
         self._consistency = consistency
         self._wary = wary
+        self._happenings = happenings
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
             bus.serve(keys.explain(name), self._explain_later),
             bus.serve(keys.rule(name), guarded(self._decree)),
+            bus.serve(keys.history(name), guarded(lambda _: encode_history(self.history()))),
         ]
 
     def close(self) -> None:
@@ -152,6 +158,10 @@ class Explainer:
             return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
         return (_still(explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])), settled),)
 
+    def history(self) -> tuple[Happening, ...]:
+        """What has become of the maps, and what people have ruled, in order."""
+        return with_rulings(self._happenings(), self._book.rulings)
+
     def _decree(self, payload: bytes) -> bytes:
         ruling = decode_ruling(payload)
         with self._turn:
@@ -166,6 +176,12 @@ class Explainer:
 def _still(told: Told, settled: bool) -> Told:
     """What was not found yet is not said to be missing."""
     return told if settled else replace(told, reason=f"{told.reason} (still merging: ask again)")
+
+
+def with_rulings(happenings: Iterable[Happening], rulings: Rulings) -> tuple[Happening, ...]:
+    """What has happened by itself and what people have ruled, in order."""
+    ruled = [Happening(ruling.stamp_ns, Kind.RULED, said_of(ruling)) for ruling in rulings.made]
+    return tuple(sorted([*ruled, *happenings], key=lambda one: one.stamp_ns))
 
 
 def said_of(ruling: Ruling) -> str:

@@ -18,9 +18,11 @@ from types import TracebackType
 
 from hybridmap.errors import NotConnected
 from hybridmap.explanation import Explanation
+from hybridmap.history import Happening
 from hybridmap.query import RelocalizeAnswer, View
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages, BlockageSettings
+from mapserver.chronicle import Chronicle
 from mapserver.desk import Desk, DeskSettings
 from mapserver.explainer import Explainer, RulingBook
 from mapserver.herald import Herald
@@ -91,9 +93,11 @@ class MapServer:
         self._keeper = None if s.lockstep else PlaceKeeper(self._store, path)
         index = self._keeper.index if self._keeper else None
         findings = None if s.lockstep else FindingsKeeper(path, fresh=not self._store.positions())
+        self._chronicle = Chronicle(self._store)
         self._upkeep = Upkeep(
-            s.merge_share, by_itself=not s.lockstep, index=index, merge=s.merge, keeper=findings
-        )
+            s.merge_share, by_itself=not s.lockstep, index=index, merge=s.merge, keeper=findings,
+            chronicle=self._chronicle,
+        )  # fmt: skip
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
         self._desk = Desk(replace(s.desk, workers=0) if s.lockstep else s.desk)
@@ -115,7 +119,7 @@ class MapServer:
             self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule,
             # In lock-step whoever asks waits until all is merged.
             lambda: self._settings.lockstep or self._upkeep.settled, self._settings.merge.consistency,
-            lambda: self._blockages.known(time.monotonic()),
+            lambda: self._blockages.known(time.monotonic()), lambda: self._chronicle.happenings,
         )  # fmt: skip
         # Wall time again: what is told now and then would not repeat itself.
         self._herald = None if self._settings.lockstep else Herald(self._bus, self._keys, self._name)
@@ -190,6 +194,10 @@ class MapServer:
             Busy: too many ask.
         """
         return self._desk.submit(lambda: self._explainer.explain(request), usual=False)
+
+    def history(self) -> tuple[Happening, ...]:
+        """What has become of the maps and what people have ruled, in order."""
+        return self._explainer.history()
 
     def _in_step(self) -> Answers:
         if self._settings.lockstep and not self.settle(SETTLE_PATIENCE):

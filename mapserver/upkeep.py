@@ -15,11 +15,11 @@ from hybridmap.errors import MapweaveError
 from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
+from mapserver.chronicle import Chronicle
 from mapserver.merging.deciding import Deciding
 from mapserver.merging.findingskeeper import FindingsKeeper
 from mapserver.merging.merger import Merger, MergerSettings
 from mapserver.places.placeindex import PlaceIndex
-from merge.explaining.parting import joinings, partings
 from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings
 
@@ -62,6 +62,7 @@ class Upkeep:
         index: PlaceIndex | None = None,
         merge: MergeSettings | None = None,
         keeper: FindingsKeeper | None = None,
+        chronicle: Chronicle | None = None,
     ) -> None:
         """Begin with nothing.
 
@@ -71,8 +72,10 @@ class Upkeep:
             index: is filled with the nodes that come; may have them already.
             merge: how maps are merged.
             keeper: of what comparing nodes has found.
+            chronicle: of what becomes of the maps.
         """
         self._keeper = keeper
+        self._chronicle = chronicle or Chronicle()
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
@@ -82,9 +85,8 @@ class Upkeep:
         )
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
-        self._compared = self._answers.merged
         self._dirty = self._reading = self._curious = False
-        self._event = self._plight = ""
+        self._plight = ""
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
         self._thread = threading.Thread(target=self._work, name="merge", daemon=True)
@@ -97,7 +99,7 @@ class Upkeep:
     @property
     def event(self) -> str:
         """What holds up merging; else the newest of what has become one map, or is no longer one, and why."""
-        return (self._plight or self._event)[:MOST_WORDS]
+        return (self._plight or self._chronicle.newest)[:MOST_WORDS]
 
     @property
     def settled(self) -> bool:
@@ -280,21 +282,18 @@ class Upkeep:
 
     def _merge(self) -> None:
         self._dirty = False
-        before = self._compared
         try:
             merged = self._merger.merged()
-            self._answers, self._compared = self._answers_from(merged), merged
+            self._answers = self._answers_from(merged)
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("the merged map could not be made anew")
             self._plight = "the merged map could not be made anew: see the server's log"
+            self._chronicle.failed(self._plight)
             return
         finally:
             self._done = self._applied
         self._curious, self._plight = True, ""
-        joined, parted = joinings(before, merged), partings(before, merged)
-        for words in joined:
-            log.info("%s", words)
-        for words in parted:
-            log.warning("%s", words)
-        # Of what happens at once, that something came apart is what people must know.
-        self._event = "; ".join(parted or joined) or self._event
+        try:
+            self._chronicle.follow(merged)
+        except Exception:  # a defect here must not end all merging
+            log.exception("what has become of the maps could not be told")

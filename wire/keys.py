@@ -8,7 +8,7 @@
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk
     mapweave/1/<fleet>/server/<server>/postures/<agent>  where its nodes lie in the merged map; question: all
-    mapweave/1/<fleet>/server/<server>/relocalize     question; likewise route, known, map, explain, rule
+    mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, rule, history
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of whoever drives that body
@@ -165,6 +165,14 @@ class Keys:
     def any_rule(self) -> str:
         """Pattern: every server of the fleet."""
         return f"{self.root}/server/*/rule"
+
+    def history(self, server: str) -> str:
+        """Where a server says what has become of the maps, and what people have ruled."""
+        return self._of_server("history", server)
+
+    def any_history(self) -> str:
+        """Pattern: every server of the fleet."""
+        return f"{self.root}/server/*/history"
 
     def server_status(self, server: str) -> str:
         """Where a server publishes what it is doing."""

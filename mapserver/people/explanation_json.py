@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 from hybridmap.explanation import Explanation, Hop, MapsExplanation, PairExplanation, RouteExplanation
+from hybridmap.history import Happening
 from hybridmap.pose import PoseGaussian
 from hybridmap.ruling import Ruling
 
@@ -89,6 +92,26 @@ def route_values(told: RouteExplanation) -> dict[str, Any]:
         "gaps": [_hop(hop) for hop in told.gaps],
         "apart": None if told.apart is None else maps_values(told.apart),
     }
+
+
+def history_record(happenings: Iterable[Happening]) -> dict[str, Any]:
+    """What has happened, for `json.dumps`: `history`, each with `stamp_ns`, `time` (UTC), `kind`, `words`."""
+    return {
+        "history": [
+            {
+                "stamp_ns": one.stamp_ns,
+                "time": time_of(one.stamp_ns),
+                "kind": str(one.kind),
+                "words": one.words,
+            }
+            for one in happenings
+        ]
+    }
+
+
+def time_of(stamp_ns: int) -> str:
+    """Wall time since 1970 as `2026-03-01 12:00:07`, UTC."""
+    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
 def _hop(hop: Hop) -> dict[str, Any]:

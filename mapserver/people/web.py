@@ -3,6 +3,7 @@
     GET /             the page for photographs
     GET /why          the page that says why maps are one, or are not
     GET /status       what the server holds, JSON
+    GET /history      what has joined, come apart and been ruled, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
     GET /route        why a route leads as it does: ?a=r0.1.17&b=r1.1.5 from the one to the other, JSON
     POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
@@ -25,15 +26,16 @@ from concurrent.futures import Future
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
-from typing import Any, cast
+from typing import Any, Protocol, cast
 from urllib.parse import parse_qsl, urlsplit
 
 from hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from hybridmap.explanation import Explanation
+from hybridmap.history import Happening
 from hybridmap.query import RelocalizeAnswer, View
 from hybridmap.ruling import EXAMPLE, read_ends
 from mapserver.people.answer_json import answer_record
-from mapserver.people.explanation_json import explanation_record
+from mapserver.people.explanation_json import explanation_record, history_record
 from mapserver.people.form import read_photo
 from mapserver.people.page import PAGE
 from mapserver.people.why_page import WHY_PAGE
@@ -52,10 +54,24 @@ MOST_AT_ONCE = 32
 POLL = 0.05
 """How soon the server notices that it is closed, s."""
 
-Locate = Callable[[Callable[[], View], int], "Future[RelocalizeAnswer]"]
-Explain = Callable[[ExplainRequest], "Future[Explanation]"]
 QUESTIONS = ("/explain", "/route")
-PATHS = dict.fromkeys(("/", "/why", "/status", *QUESTIONS), "GET") | {"/relocalize": "POST"}
+PATHS = dict.fromkeys(("/", "/why", "/status", "/history", *QUESTIONS), "GET") | {"/relocalize": "POST"}
+
+
+class Answering(Protocol):
+    """What is asked, as of a MapServer: from any thread; what cannot be answered raises a MapweaveError."""
+
+    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
+        """Where a view was taken."""
+
+    def explain(self, request: ExplainRequest) -> Future[Explanation]:
+        """Why maps are one, or a route leads so."""
+
+    def status(self) -> dict[str, Scalar]:
+        """What the server holds and does."""
+
+    def history(self) -> tuple[Happening, ...]:
+        """What has happened."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -74,26 +90,18 @@ def parse_address(text: str) -> tuple[str, int]:
 class Web:
     """Listens from the start until closed. A context manager."""
 
-    def __init__(
-        self,
-        address: tuple[str, int],
-        locate: Locate,
-        status: Callable[[], Mapping[str, Scalar]],
-        explain: Explain,
-    ) -> None:
+    def __init__(self, address: tuple[str, int], server: Answering) -> None:
         """Open the port and serve on threads of its own.
 
         Args:
             address: host and port; port 0 takes any.
-            locate: as MapServer.locate.
-            status: as MapServer.status.
-            explain: as MapServer.explain.
+            server: answers.
 
         Raises:
             NotConnected: nobody can listen there, for example since the port is taken.
         """
         try:
-            self._server = _Server(address, locate, status, explain)
+            self._server = _Server(address, server)
         except OSError as error:
             reason = "the port is taken" if error.errno == errno.EADDRINUSE else error.strerror or str(error)
             raise NotConnected(f"cannot listen at http {address[0]}:{address[1]}: {reason}") from None
@@ -125,19 +133,11 @@ class _Server(ThreadingHTTPServer):
     block_on_close = False
     request_queue_size = 128
 
-    def __init__(
-        self,
-        address: tuple[str, int],
-        locate: Locate,
-        status: Callable[[], Mapping[str, Scalar]],
-        explain: Explain,
-    ) -> None:
+    def __init__(self, address: tuple[str, int], server: Answering) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         super().__init__(address, _Handler)
-        self.locate = locate
-        self.status = status
-        self.explain = explain
+        self.server = server
         self.places = threading.BoundedSemaphore(MOST_AT_ONCE)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -160,7 +160,9 @@ class _Handler(BaseHTTPRequestHandler):
         if address.path in PAGES:
             self._send(HTTPStatus.OK, PAGES[address.path].encode(), "text/html; charset=utf-8")
         elif address.path == "/status":
-            self._tell(HTTPStatus.OK, dict(self._web.status()))
+            self._tell(HTTPStatus.OK, self._web.server.status())
+        elif address.path == "/history":
+            self._tell(HTTPStatus.OK, history_record(self._web.server.history()))
         elif address.path in QUESTIONS:
             query = dict(parse_qsl(address.query, keep_blank_values=True))
             self._answer(lambda: self._explain(address.path, query))
@@ -184,7 +186,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise InvalidValue(f"only {len(body)} of {length} bytes came")
         photo = read_photo(self.headers.get("Content-Type", ""), body, query)
         photo.check()
-        return answer_record(self._web.locate(photo.view, hash(photo.data)).result(PATIENCE))
+        return answer_record(self._web.server.locate(photo.view, hash(photo.data)).result(PATIENCE))
 
     def _explain(self, path: str, query: dict[str, str]) -> Mapping[str, Any]:
         ends, route = None, path == "/route"
@@ -192,7 +194,7 @@ class _Handler(BaseHTTPRequestHandler):
             if query.keys() != {"a", "b"}:
                 raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
             ends = read_ends(query["a"].strip(), query["b"].strip())
-        return explanation_record(self._web.explain(ExplainRequest(ends, route)).result(PATIENCE))
+        return explanation_record(self._web.server.explain(ExplainRequest(ends, route)).result(PATIENCE))
 
     def _answer(self, answer: Callable[[], Mapping[str, Any]]) -> None:
         """Tell what comes of a question that takes long, or why nothing does."""

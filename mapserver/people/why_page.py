@@ -18,7 +18,7 @@ WHY_PAGE = """<!doctype html>
   section.good { border-color: #2a8f5b } section.failed { border-color: #c0392b }
   a { color: #1f5fa8 } ul { margin: .3rem 0; padding-left: 1.2rem } p { margin: .3rem 0 }
   svg { width: 100%; height: auto; margin-top: .6rem }
-  small { color: #5b6875 }
+  small { color: #5b6875 } details { margin-top: 1rem } summary { cursor: pointer }
 </style>
 <h1>Why is that one map, or why not?</h1>
 <form id="form">
@@ -27,6 +27,7 @@ WHY_PAGE = """<!doctype html>
   <button>Explain</button> <button name="route" value="1">The way</button> <a href="why" id="all">all maps</a>
 </form>
 <div id="told" role="status">Asking ...</div>
+<details id="past" hidden><summary>What has happened</summary><ul></ul></details>
 <p><small>To part two maps for good, or two nodes: <code>mapweave map unmerge A B --because TEXT</code>.
   <a href="./">Where was a picture taken?</a></small></p>
 <script>
@@ -156,6 +157,14 @@ function showRoute(route) {
   }
   if (route.apart) showTwo(route.apart);
 }
+async function past() {
+  let answer;
+  try { answer = await (await fetch("history")).json(); } catch (error) { return; }
+  const newest = (answer.history || []).slice(-30).reverse();
+  byId("past").hidden = !newest.length;
+  for (const one of newest)
+    add(byId("past").lastElementChild, "li", `${one.time} UTC: ${one.kind}: ${one.words}`);
+}
 async function explain() {
   const asked = new URLSearchParams(location.search);
   const [a, b] = ["a", "b"].map(name => byId(name).value = (asked.get(name) || "").trim());
@@ -184,6 +193,7 @@ async function explain() {
   add(told, "section", "The map server is too busy; try again in a minute.", "failed");
 }
 explain();
+past();
 </script>
 </html>
 """

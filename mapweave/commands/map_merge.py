@@ -41,7 +41,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.settings import merge_settings
     from merge.explaining.maps import explain_fleet
     from merge.explaining.parting import joinings
-    from merge.graph.merged import MergedMap
     from wire.mapfile import read_map_file, write_map_file
     from wire.whole_file import check_place
 
@@ -50,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     parts = parts_of({path: read_map_file(path) for path in arguments.files})
     merged = merged_with_progress(parts.maps, parts.rulings, settings)
     write_map_file(arguments.out, map_file_of(merged))
-    joined = joinings(MergedMap.empty(), merged)
+    joined = joinings((), merged)
     apart = [one.reason for one in explain_fleet(merged, 20) if not one.joined]
     if arguments.json:
         outcome = {

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)
             if address is not None:
-                stack.enter_context(Web(address, server.locate, server.status, server.explain))
+                stack.enter_context(Web(address, server))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
             said = ""
             while not stop.wait(1.0):

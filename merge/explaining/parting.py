@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import networkx as nx
 
@@ -26,40 +26,42 @@ def joined_maps(merged: MergedMap) -> list[frozenset[MapId]]:
     return sorted((frozenset(part) for part in nx.connected_components(graph)), key=min)
 
 
-def partings(before: MergedMap, after: MergedMap) -> tuple[str, ...]:
+def partings(
+    before: Iterable[frozenset[MapId]], links: Collection[Link] | None, after: MergedMap
+) -> tuple[str, ...]:
     """What is no longer one map, with the reason.
 
     Args:
-        before: an earlier merge.
-        after: a later one.
+        before: sets of maps that were one.
+        links: that joined them; None if these are not known any more.
+        after: the merge now.
 
     Returns:
         For example `r1.1 and r3.1 are no longer one map: 8 links refused (r1 would have seen ...)`.
     """
     part_of = {one: part for part in joined_maps(after) for one in part}
     out: list[str] = []
-    for whole in joined_maps(before):
+    for whole in before:
         parts = sorted(
             {part_of[one] & whole for one in whole if one in part_of}, key=lambda p: (-len(p), min(p))
         )
-        out += [
-            f"{_named(parts[0])} and {_named(part)} are no longer one map: {_lost(part, before, after)}"
-            for part in parts[1:]
-        ]
+        for part in parts[1:]:
+            lost = _refused_now(part, whole, after) if links is None else _lost(part, links, after)
+            out.append(f"{_named(parts[0])} and {_named(part)} are no longer one map: {lost}")
     return tuple(out)
 
 
-def joinings(before: MergedMap, after: MergedMap) -> tuple[str, ...]:
+def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str, ...]:
     """What has become one map.
 
     Args:
-        before: an earlier merge.
-        after: a later one.
+        before: sets of maps that were one.
+        after: the merge now.
 
     Returns:
         For example `r1.1 and r3.1 are one map now, by 8 links`.
     """
-    part_of = {one: part for part in joined_maps(before) for one in part}
+    part_of = {one: part for part in before for one in part}
     wholes = []
     for whole in joined_maps(after):
         known = {part_of[one] & whole for one in whole if one in part_of}
@@ -94,17 +96,20 @@ def _named(maps: Iterable[MapId]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} with {names[-1]}"
 
 
-def _across(links: Iterable[Link], part: frozenset[MapId], rest: frozenset[MapId]) -> list[Link]:
-    return [
-        link
-        for link in links
-        if (link.a.map in part and link.b.map in rest) or (link.b.map in part and link.a.map in rest)
-    ]
+def _refused_now(part: frozenset[MapId], whole: frozenset[MapId], after: MergedMap) -> str:
+    """What stands between a part and the rest, where nobody knows any more which links held it."""
+    reasons: Counter[str] = Counter()
+    for r in after.refused:
+        ends = {r.a.map in part, r.b.map in part}
+        if r.link is not None and r.edge is None and len(ends) == 2 and {r.a.map, r.b.map} <= whole:
+            reasons[r.reason] += 1
+    told = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    return "; ".join(told) or "no link joins them any more"
 
 
-def _lost(part: frozenset[MapId], before: MergedMap, after: MergedMap) -> str:
+def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> str:
     """What has become of the links that held a part."""
-    held = _across(before.links, part, frozenset(before.maps) - part)
+    held = [link for link in links if (link.a.map in part) != (link.b.map in part)]
     pairs = {link.pair for link in held}
     reasons = Counter(r.reason for r in after.refused if r.pair in pairs and r.edge is None)
     retired = after.rulings.retired

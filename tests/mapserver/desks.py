@@ -13,6 +13,7 @@ from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import Busy
 from hybridmap.explanation import Explanation
+from hybridmap.history import Happening
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
@@ -23,6 +24,7 @@ from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
 from merge.graph.merged import MergedMap
 from wire.explanation_messages import ExplainRequest
+from wire.log_messages import Scalar
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.1), 0.02, 0.01)
 ANSWER = RelocalizeAnswer(
@@ -45,6 +47,14 @@ class Desk:
         self.views: list[View] = []
         self.refusal: Exception | None = None
         self.answer = ANSWER
+        self.holds: dict[str, Scalar] = {"nodes": 12, "summary": "12 nodes"}
+        self.happenings: tuple[Happening, ...] = ()
+
+    def status(self) -> dict[str, Scalar]:
+        return self.holds
+
+    def history(self) -> tuple[Happening, ...]:
+        return self.happenings
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         done: Future[RelocalizeAnswer] = Future()

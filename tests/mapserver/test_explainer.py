@@ -253,7 +253,7 @@ def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
     answers = SimpleNamespace(merged=merged, router=Router(merged))
     explainer = Explainer(
         bus, KEYS, "s0", lambda: answers, desk, RulingBook(store), lambda rulings: None, lambda: settled,
-        ConsistencySettings(), tuple,
+        ConsistencySettings(), tuple, tuple,
     )  # fmt: skip
     pair = merged.links[0].pair
     for request in (*map(ExplainRequest, ((A, B), pair, None)), ExplainRequest(pair, route=True)):

@@ -164,6 +164,9 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     assert "are one map" in out and links(path) == links(files[3])
     out = said("map", "explain", "r0.1", "r1.1", "--map", path)
     assert "anna ruled that they shall not" in out and "bob ruled that they may be linked again" in out
+    first, second = said("map", "history", "--map", path).splitlines()
+    assert "anna" in first and "two kitchens" in first and "bob" in second and " UTC  ruled " in first
+    assert said("map", "history", "--map", files[3]).startswith("nothing has joined")
     pair = links(path)[0]
     said("map", "unmerge", *pair, "--map", path, "-o", tmp_path / "one.mapweave")
     assert links(tmp_path / "one.mapweave") == [other for other in links(path) if other != pair]
@@ -332,6 +335,13 @@ def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_
         assert "two kitchens" in out
         out = said("map", "unmerge", "r0.1", "r1.1", "--undo", *at)
         assert "r0.1 and r1.1 are one map: " in out
+        history = json.loads(said("map", "history", "--json", *at))["history"]
+        # What the first server saw, too; what was one is not told again by one that starts again.
+        assert [one["kind"] for one in history] == ["joined", "ruled", "parted", "ruled", "joined"]
+        assert "two kitchens" in history[1]["words"] and "two kitchens" in history[2]["words"]
+        assert [one["stamp_ns"] for one in history] == sorted(one["stamp_ns"] for one in history)
+        lines = said("map", "history", "--most", "2", *at).splitlines()
+        assert len(lines) == 3 and lines[0] == "(3 older ones: --most)" and history[-1]["words"] in lines[2]
     log = "".join(path.read_text() for path in (tmp_path / "logs").iterdir())
     assert "r0.1 and r1.1 are no longer one map: " in log
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hybridmap.errors import Busy
+from hybridmap.history import Happening, Kind
 from hybridmap.node import NodeId
 from mapserver.people.explanation_json import route_values
 from mapserver.people.web import Web
@@ -36,7 +37,7 @@ def desk() -> Desk:
 
 @pytest.fixture
 def served(desk: Desk) -> Iterator[Web]:
-    with Web(("127.0.0.1", 0), desk.locate, lambda: {"summary": "8 nodes"}, desk.explain) as served:
+    with Web(("127.0.0.1", 0), desk) as served:
         yield served
 
 
@@ -137,6 +138,35 @@ def test_the_page_tells_the_way_from_its_form_and_from_its_address(
         eventually(lambda: f"{start} to {goal}: the way leads so" in page.run(TOLD))
         page.run("document.querySelector('#told a').click()")
         eventually(lambda: f"{told.hops[0].a} and {told.hops[0].b}: " in page.run(TOLD))
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_what_has_happened_is_told_newest_first(
+    served: Web, desk: Desk, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    shown = "return [...document.querySelectorAll('#past li')].map(one => one.textContent)"
+    hidden = "return document.getElementById('past').hidden"
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        assert page.run(hidden) and page.run(shown) == []
+        desk.happenings = (
+            Happening(10**18, Kind.JOINED, "r0.1 and r1.1 are one map now"),
+            Happening(10**18 + 7 * 10**9, Kind.PARTED, "<b>x"),
+        )
+        page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=r1.1")
+        eventually(lambda: not page.run(hidden))
+        assert page.run(shown) == [
+            "2001-09-09 01:46:47 UTC: parted: <b>x",
+            "2001-09-09 01:46:40 UTC: joined: r0.1 and r1.1 are one map now",
+        ]
+
+
+def test_what_has_happened_is_told_with_its_time(served: Web, desk: Desk) -> None:
+    desk.happenings = (Happening(10**18, Kind.RULED, "no"),)
+    with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
+        (one,) = json.load(reply)["history"]
+    assert one == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "ruled", "words": "no"}
 
 
 def test_a_way_leads_from_node_to_node(served: Web) -> None:

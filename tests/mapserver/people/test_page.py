@@ -33,9 +33,7 @@ def desk() -> Desk:
 
 @pytest.fixture
 def page(browser: Browser, desk: Desk) -> Iterator[Browser]:
-    with Web(
-        ("127.0.0.1", 0), desk.locate, lambda: {"nodes": 12, "summary": "12 nodes"}, desk.explain
-    ) as served:
+    with Web(("127.0.0.1", 0), desk) as served:
         browser.open(f"http://127.0.0.1:{served.port}/")
         yield browser
 

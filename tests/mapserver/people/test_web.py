@@ -27,9 +27,7 @@ def desk() -> Desk:
 
 @pytest.fixture
 def served(desk: Desk) -> Iterator[Web]:
-    with Web(
-        ("127.0.0.1", 0), desk.locate, lambda: {"nodes": 12, "summary": "12 nodes"}, desk.explain
-    ) as served:
+    with Web(("127.0.0.1", 0), desk) as served:
         yield served
 
 
@@ -312,6 +310,6 @@ def test_addresses_that_are_none(text: str) -> None:
 
 def test_a_port_that_is_taken(served: Web, desk: Desk) -> None:
     with pytest.raises(NotConnected, match=r"cannot listen at http 127.0.0.1:\d+: the port is taken"):
-        Web(("127.0.0.1", served.port), desk.locate, dict, desk.explain)
+        Web(("127.0.0.1", served.port), desk)
     with pytest.raises(NotConnected, match=r"cannot listen at http 192.0.2.1:8080: "):
-        Web(("192.0.2.1", 8080), desk.locate, dict, desk.explain)
+        Web(("192.0.2.1", 8080), desk)

@@ -24,7 +24,7 @@ from merge.belief.cutting import fragments_of
 from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
 from merge.explaining.own import reach_words
-from merge.explaining.parting import joinings, partings
+from merge.explaining.parting import joined_maps, joinings, partings
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import LEAST_SIGMAS, Measurement, solve_graph
@@ -277,16 +277,18 @@ def test_a_merge_that_loses_its_support_says_so() -> None:
     merger = fleet()
     alone = MergedMap.empty()
     before = merger.merged()
-    assert partings(before, before) == () == joinings(before, before)
-    (joined,) = [one for one in joinings(alone, before) if "a.1 and b.1" in one]
+    parts = joined_maps(before)
+    assert partings(parts, before.links, before) == () == joinings(parts, before)
+    (joined,) = [one for one in joinings(joined_maps(alone), before) if "a.1 and b.1" in one]
     assert joined == f"a.1 and b.1 are one map now, by {len(between(before))} links"
     merger.rule(Rulings([Ruling((A, B), True, "anna", 0, "no")]))
-    (words,) = partings(before, merger.merged())
-    assert words.startswith("a.1 and b.1 are no longer one map: ") and "refused (undone" in words
+    for links in (before.links, None):
+        (words,) = partings(parts, links, merger.merged())
+        assert words.startswith("a.1 and b.1 are no longer one map: ") and "refused (undone" in words
     merger.rule(Rulings())
     for node in before.maps[B].nodes:
         merger.apply(B, NodeRetired(node))
-    assert partings(before, merger.merged()) == ()  # a map without nodes is part of nothing
+    assert partings(parts, before.links, merger.merged()) == ()  # a map without nodes is part of nothing
 
 
 def test_what_joins_at_once_is_told_map_by_map_and_each_link_once() -> None:
@@ -300,7 +302,7 @@ def test_what_joins_at_once_is_told_map_by_map_and_each_link_once() -> None:
             merger.apply(map_id, body)
     merged = merger.merged()
     assert len(merged.components) == 1
-    told = joinings(MergedMap.empty(), merged)
+    told = joinings((), merged)
     assert told[0].startswith("a.1 and ") and told[-1].startswith("5 maps with a.1 and ") and len(told) == 5
     count = sum(int(words.rsplit(" by ", 1)[1].split()[0]) for words in told)
     assert count == sum(not link.within for link in merged.links)
@@ -320,7 +322,7 @@ def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
     assert before.joined(A, C)
     ruling = Ruling((B, B), True, "anna", 0, "moved house")
     merger.rule(Rulings([ruling]))
-    (words,) = partings(before, merger.merged())
+    (words,) = partings(joined_maps(before), before.links, merger.merged())
     assert words.startswith("a.1 and c.1 are no longer one map: ")
     assert words.endswith(f" gone, since {reason_of(ruling)}") and "moved house" in words
 

@@ -1,0 +1,34 @@
+"""What has happened to a merged map, with dates: plain values, no transport."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Kind(StrEnum):
+    """What sort of thing has happened."""
+
+    JOINED = "joined"
+    PARTED = "parted"
+    """What was one map is no longer; the words say what took its links away."""
+    KEPT_APART = "kept apart"
+    """Links between two maps were found, and refused: two robots cannot have been where they say."""
+    RULED = "ruled"
+    """A person has decided."""
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Happening:
+    """Something that happened.
+
+    Attributes:
+        stamp_ns: when it was noticed, wall time since 1970.
+        kind: what sort of thing.
+        words: what, and why; one printable line.
+    """
+
+    stamp_ns: int
+    kind: Kind
+    words: str

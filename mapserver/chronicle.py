@@ -1,0 +1,153 @@
+"""The server's record of what has become of the maps: what joined, what came apart and why, with dates."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+
+from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from hybridmap.history import Happening, Kind
+from hybridmap.node import MapId
+from mapserver.log.store import Store
+from merge.explaining.parting import joined_maps, joinings, partings
+from merge.graph.links import Link
+from merge.graph.merged import MergedMap
+from wire.history_codec import MAX_WORDS, KeptHistory, decode_kept_history, encode_kept_history
+
+log = logging.getLogger(__name__)
+
+NAME = "history"
+"""In the store."""
+MOST = 500
+"""Happenings that are kept: the newest."""
+MOST_APART = 2000
+"""Pairs of maps that are remembered as kept apart, so that it is told once."""
+MOST_AT_ONCE = 50
+"""Happenings of one sort that one merge adds one by one: a thousand maps may join at once."""
+Pair = tuple[MapId, MapId]
+BODIES = ("would have seen", "would have been at the same place")
+"""What a refusal says where two robots cannot have been where the links put them."""
+
+
+class Chronicle:
+    """Compares each merge with the one before, also across restarts. Written by the merging thread alone."""
+
+    def __init__(
+        self, store: Store | None = None, most: int = MOST, clock: Callable[[], int] = time.time_ns
+    ) -> None:
+        """Read what was kept; a record that is damaged is begun anew, and that is said.
+
+        Args:
+            store: where it is kept; None: it ends with the process.
+            most: happenings that are kept.
+            clock: wall time, ns.
+        """
+        self._store, self._most, self._clock = store, most, clock
+        self._lock = threading.Lock()
+        self._kept = KeptHistory()
+        self._links: Collection[Link] | None = None
+        found = None if store is None else store.result(NAME)
+        if found is not None:
+            try:
+                self._kept = decode_kept_history(found)
+            except InvalidMessage as error:
+                self.failed(f"the record of what happened before was damaged ({error}); a new one begins")
+
+    @property
+    def happenings(self) -> tuple[Happening, ...]:
+        """In order; for any thread."""
+        with self._lock:
+            return self._kept.happenings
+
+    @property
+    def newest(self) -> str:
+        """Words of what happened last; empty if nothing has."""
+        happenings = self.happenings
+        return happenings[-1].words if happenings else ""
+
+    def follow(self, merged: MergedMap) -> None:
+        """Take note of what has changed with a merge, and keep it."""
+        if not merged.maps:
+            return  # Nothing is read yet: what was one is no less so.
+        before, now = self._kept.parts, tuple(joined_maps(merged))
+        joined, parted = joinings(before, merged), partings(before, self._links, merged)
+        apart = _kept_apart(merged, now)
+        # Of what has just parted it is told already what stands between.
+        held = [
+            words
+            for pair, words in apart.items()
+            if pair not in self._kept.apart and not any(part.issuperset(pair) for part in before)
+        ]
+        for words in joined:
+            log.info("%s", words)
+        for words in (*parted, *held):
+            log.warning("%s", words)
+        # Of what happens at once, that something came apart is what people must see last.
+        fresh = [
+            *_briefly(Kind.JOINED, joined),
+            *_briefly(Kind.KEPT_APART, held),
+            *_briefly(Kind.PARTED, parted),
+        ]
+        # Until the two are one nothing new is told of them.
+        still = {pair for pair in self._kept.apart if not any(part.issuperset(pair) for part in now)}
+        known = frozenset(sorted(still | apart.keys())[:MOST_APART])
+        self._links = merged.links
+        if fresh or now != before or known != self._kept.apart:
+            self._keep(fresh, now, known)
+
+    def failed(self, words: str) -> None:
+        """Take note that something could not be done; the same twice is told once."""
+        if self.newest != words:
+            self._keep([(Kind.FAILED, words)], self._kept.parts, self._kept.apart)
+
+    def _keep(
+        self, fresh: list[tuple[Kind, str]], parts: tuple[frozenset[MapId], ...], apart: frozenset[Pair]
+    ) -> None:
+        """Add to the record; it is on the disk when this returns, unless the disk does not take it."""
+        now = self._clock()
+        more = [Happening(now, kind, _one_line(words)) for kind, words in fresh]
+        kept = KeptHistory((*self._kept.happenings, *more)[-self._most :], parts, apart)
+        with self._lock:
+            self._kept = kept
+        if self._store is None:
+            return
+        try:
+            self._store.put_result(NAME, encode_kept_history(kept))
+        except (InvalidFile, InvalidValue) as error:
+            log.warning("what has happened to the maps is not kept: %s", error)
+
+
+def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pair, str]:
+    """Two maps that are not one, since two robots cannot have been where the links between them say."""
+    part_of = {one: number for number, part in enumerate(parts) for one in part}
+    reasons: dict[Pair, Counter[str]] = {}
+    speaks_of_bodies: dict[str, bool] = {}
+    for r in merged.refused:
+        if r.link is None or r.edge is not None:
+            continue
+        if r.reason not in speaks_of_bodies:
+            speaks_of_bodies[r.reason] = any(words in r.reason for words in BODIES)
+        first, second = sorted((r.a.map, r.b.map))
+        if speaks_of_bodies[r.reason] and part_of.get(first) != part_of.get(second):
+            reasons.setdefault((first, second), Counter())[r.reason] += 1
+    out = {}
+    for (first, second), found in sorted(reasons.items()):
+        count = sum(found.values())
+        links = "1 link" if count == 1 else f"{count} links"
+        out[first, second] = (
+            f"{first} and {second} are kept apart: {links} refused ({found.most_common(1)[0][0]})"
+        )
+    return out
+
+
+def _briefly(kind: Kind, told: Sequence[str]) -> list[tuple[Kind, str]]:
+    """Of very much at once the number."""
+    more = [f"and {len(told) - MOST_AT_ONCE} more at once"] if len(told) > MOST_AT_ONCE else []
+    return [(kind, words) for words in (*told[:MOST_AT_ONCE], *more)]
+
+
+def _one_line(words: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in words)[:MAX_WORDS]

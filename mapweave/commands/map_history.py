@@ -1,0 +1,62 @@
+"""`mapweave map history`: what has become of the maps, and what people have ruled, with dates."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapweave.commands.network import add_network
+
+if TYPE_CHECKING:
+    from hybridmap.history import Happening
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "history",
+        help="what has joined, come apart and been ruled, with dates",
+        description="Say what has become of the maps that a running server keeps, oldest first: which became "
+        "one, which came apart and what took their links away, which are kept apart since two robots cannot "
+        "have been where their links say, and what people have ruled. The server keeps the newest 500 on its "
+        "disk, and every ruling. A map file (--map) holds what people have ruled.",
+    )
+    parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
+    parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, with all")
+    parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Ask and print."""
+    from hybridmap.errors import InvalidValue
+    from mapserver.people.explanation_json import history_record, time_of
+
+    if arguments.most < 1:
+        raise InvalidValue(f"--most {arguments.most}: give 1 or more")
+    happenings = _history(arguments)
+    if arguments.json:
+        print(json.dumps(history_record(happenings)))
+        return 0
+    left_out = len(happenings) - arguments.most
+    lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
+    lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:10}  {h.words}" for h in happenings[-arguments.most :]]
+    print("\n".join(lines) if lines else "nothing has joined, come apart or been ruled yet")
+    return 0
+
+
+def _history(arguments: argparse.Namespace) -> tuple[Happening, ...]:
+    from hybridmap.ruling import Rulings
+    from mapserver.explainer import with_rulings
+    from mapweave.commands.map_ends import ask
+    from wire.history_codec import decode_history
+    from wire.keys import Keys
+    from wire.mapfile import read_map_file
+
+    if arguments.map is None:
+        return decode_history(ask(arguments, Keys.any_history, b"")[0].payload)
+    return with_rulings((), Rulings(read_map_file(arguments.map).rulings))

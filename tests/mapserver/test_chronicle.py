@@ -1,0 +1,203 @@
+"""What has become of the maps: told once, with its date, and kept on the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic import room, take_map
+from hybridmap.change import EdgePut, NodePut, NodeRetired
+from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from hybridmap.history import Happening, Kind
+from hybridmap.node import MapId
+from hybridmap.pose import Pose2
+from hybridmap.ruling import Ruling, Rulings
+from mapserver.chronicle import BODIES, MOST_AT_ONCE, Chronicle
+from mapserver.explainer import with_rulings
+from mapserver.log.store import Store
+from mapserver.merging.merger import Merger
+from merge.bodies.clash import Clash
+from merge.graph.links import refuse
+from merge.graph.merged import MergedMap
+from wire.history_codec import (
+    KeptHistory,
+    decode_history,
+    decode_kept_history,
+    encode_history,
+    encode_kept_history,
+)
+from wire.packing import pack
+
+A, B = MapId("a", 1), MapId("b", 1)
+APART = Rulings([Ruling((A, B), True, "anna", 10**18, "two kitchens")])
+
+
+@pytest.fixture(scope="module")
+def merger() -> Merger:
+    """Two robots have looked around in one room."""
+    rng = np.random.default_rng(6)
+    world = room(0, 0, 5, 4, 700, rng)
+    merger = Merger()
+    for map_id in (A, B):
+        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    return merger
+
+
+@pytest.fixture(scope="module")
+def one(merger: Merger) -> MergedMap:
+    merger.rule(Rulings())
+    return merger.merged()
+
+
+@pytest.fixture(scope="module")
+def two(merger: Merger) -> MergedMap:
+    merger.rule(APART)
+    return merger.merged()
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    store = Store(tmp_path / "s0.sqlite")
+    yield store
+    store.close()
+
+
+def told(chronicle: Chronicle) -> list[tuple[Kind, str]]:
+    return [(one.kind, one.words.split(":")[0].split(", by")[0]) for one in chronicle.happenings]
+
+
+JOINED = (Kind.JOINED, "a.1 and b.1 are one map now")
+PARTED = (Kind.PARTED, "a.1 and b.1 are no longer one map")
+
+
+def test_each_thing_is_told_once_with_its_time(one: MergedMap, two: MergedMap) -> None:
+    times = iter(range(10**18, 10**19, 10**9))
+    chronicle = Chronicle(clock=lambda: next(times))
+    for merged in (MergedMap.empty(), one, one, two, two, one):
+        chronicle.follow(merged)
+    assert told(chronicle) == [JOINED, PARTED, JOINED]
+    assert "two kitchens" in chronicle.happenings[1].words and chronicle.newest.startswith("a.1 and b.1")
+    stamps = [happening.stamp_ns for happening in chronicle.happenings]
+    assert stamps == sorted(stamps) and stamps[0] >= 10**18
+
+
+def test_a_server_that_starts_again_tells_only_what_is_new(
+    store: Store, one: MergedMap, two: MergedMap
+) -> None:
+    Chronicle(store).follow(one)
+    again = Chronicle(store)
+    # It merges before it has read its store if people's rulings come first.
+    again.follow(MergedMap.empty())
+    again.follow(one)
+    assert told(again) == [JOINED]
+    third = Chronicle(store)
+    third.follow(two)
+    assert told(third) == [JOINED, PARTED]
+    assert "refused (undone with all links between a.1 and b.1 by anna" in third.newest
+    assert Chronicle(store).happenings == third.happenings
+
+
+def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap) -> None:
+    chronicle = Chronicle(store, most=5)
+    for k in range(12):
+        chronicle.follow(two if k % 2 else one)
+    assert told(chronicle) == [PARTED, JOINED, PARTED, JOINED, PARTED] == told(Chronicle(store))
+
+
+def test_very_much_at_once_is_told_as_a_number(one: MergedMap) -> None:
+    many = {MapId(f"r{k}", 1): one.maps[A] for k in range(200)}
+    nodes = frozenset(next(iter(one.maps[A].nodes))._replace(agent=name.agent) for name in many)
+    chronicle = Chronicle()
+    chronicle.follow(replace(one, maps=many, links=(), components=(nodes,)))
+    assert len(chronicle.happenings) == MOST_AT_ONCE + 1
+    assert chronicle.newest == f"and {199 - MOST_AT_ONCE} more at once"
+
+
+def test_who_cannot_have_been_there_is_told_until_the_maps_are_one(
+    store: Store, one: MergedMap, two: MergedMap
+) -> None:
+    clash = Clash("a", "b", "hall", 40, 0.1, 12.0, 99.0)
+    seen = replace(clash, where="ahead")
+    assert all(any(words in one.reason for words in BODIES) for one in (clash, seen))
+    links = [link for link in one.links if {link.a.map, link.b.map} == {A, B}]
+    held = replace(two, refused=tuple(refuse(link, clash.reason) for link in links))
+    chronicle = Chronicle(store)
+    chronicle.follow(held)
+    chronicle.follow(replace(two, refused=tuple(refuse(link, seen.reason) for link in links)))
+    ((kind, _),) = told(chronicle)
+    assert kind is Kind.KEPT_APART
+    assert chronicle.newest == (f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason})")
+    again = Chronicle(store)
+    again.follow(held)
+    assert again.happenings == chronicle.happenings, "told already"
+    again.follow(one)
+    again.follow(held)
+    # What came apart by it tells the reason itself.
+    assert [kind for kind, _ in told(again)] == [Kind.KEPT_APART, Kind.JOINED, Kind.PARTED]
+    assert "same place at the same time" in again.newest
+
+
+def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> None:
+    other = Merger()
+    for map_id in (A, B):
+        for body in one.maps[map_id].contents():
+            other.apply(map_id, body)
+    chronicle = Chronicle()
+    chronicle.follow(other.merged())
+    for node in list(one.maps[B].nodes):
+        other.apply(B, NodeRetired(node))
+    chronicle.follow(other.merged())
+    assert told(chronicle) == [JOINED]
+
+
+def test_a_damaged_record_is_begun_anew_and_says_so(store: Store, one: MergedMap) -> None:
+    store.put_result("history", b"rubbish")
+    chronicle = Chronicle(store)
+    assert [one.kind for one in chronicle.happenings] == [Kind.FAILED] and "damaged" in chronicle.newest
+    chronicle.follow(one)
+    assert Chronicle(store).happenings == chronicle.happenings
+
+
+def test_a_disk_that_does_not_take_it_ends_nothing(
+    tmp_path: Path, one: MergedMap, two: MergedMap, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = Store(tmp_path / "s0.sqlite")
+    chronicle = Chronicle(store)
+    chronicle.follow(one)
+
+    def full(name: str, value: bytes) -> None:
+        raise InvalidFile("the disk is full")
+
+    store.put_result = full  # type: ignore[method-assign]
+    chronicle.follow(two)
+    assert told(chronicle) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
+    store.close()
+    store = Store(tmp_path / "s0.sqlite")
+    assert told(Chronicle(store)) == [JOINED], "the record of before is whole"
+    store.close()
+
+
+def test_rulings_stand_among_what_happened() -> None:
+    happenings = [Happening(10**18 + k, Kind.JOINED, "x") for k in (-1, 1)]
+    kinds = [one.kind for one in with_rulings(happenings, APART)]
+    assert kinds == [Kind.JOINED, Kind.RULED, Kind.JOINED]
+    assert "two kitchens" in with_rulings((), APART)[0].words
+
+
+def test_it_comes_through_bytes() -> None:
+    happenings = (Happening(5, Kind.PARTED, "a and b"), Happening(6, Kind.FAILED, "no"))
+    assert decode_history(encode_history(happenings)) == happenings
+    kept = KeptHistory(happenings, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
+    assert decode_kept_history(encode_kept_history(kept)) == kept
+    with pytest.raises(InvalidValue, match="printable"):
+        encode_history([Happening(5, Kind.PARTED, "two\nlines")])
+    for fields in ({"h": [[1, "danced", "x"]]}, {"h": [[1, "joined"]]}, {"h": 5}, {}):
+        with pytest.raises(InvalidMessage):
+            decode_history(pack(fields))

@@ -1,0 +1,99 @@
+"""What has happened to a merged map, as lists of plain values: [stamp, kind, words]."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.history import Happening, Kind
+from hybridmap.node import MapId
+from wire.packing import MAX_STAMP_NS, Reader, pack
+
+MAX_WORDS = 4096
+MAX_HAPPENINGS = 100_000
+MAX_MAPS = 100_000
+MAX_BYTES = 2**26
+
+
+@dataclass(frozen=True)
+class KeptHistory:
+    """What a server keeps on its disk of what has happened.
+
+    Attributes:
+        happenings: in order.
+        parts: maps that were one when it was written, each in one set.
+        apart: two maps each of which it was told that they are kept apart.
+    """
+
+    happenings: tuple[Happening, ...] = ()
+    parts: tuple[frozenset[MapId], ...] = ()
+    apart: frozenset[tuple[MapId, MapId]] = frozenset()
+
+
+def encode_history(happenings: Sequence[Happening]) -> bytes:
+    """What has happened, in order; raises InvalidValue if it would not decode."""
+    data = pack({"h": [_pack(one) for one in happenings]})
+    return _checked(data)
+
+
+def decode_history(data: bytes) -> tuple[Happening, ...]:
+    """The same back; raises InvalidMessage."""
+    return _happenings(Reader(data, "history", MAX_BYTES))
+
+
+def encode_kept_history(kept: KeptHistory) -> bytes:
+    """For a server's disk; raises InvalidValue if it would not decode."""
+    data = pack(
+        {
+            "h": [_pack(one) for one in kept.happenings],
+            "p": [[list(one) for one in sorted(part)] for part in kept.parts],
+            "a": [[list(one), list(two)] for one, two in sorted(kept.apart)],
+        }
+    )
+    return _checked(data)
+
+
+def decode_kept_history(data: bytes) -> KeptHistory:
+    """The same back; raises InvalidMessage."""
+    reader = Reader(data, "history", MAX_BYTES)
+    parts = (_maps(reader, value) for value in reader.array("p", MAX_MAPS))
+    apart = (_maps(reader, value) for value in reader.array("a", MAX_MAPS))
+    return KeptHistory(
+        _happenings(reader),
+        tuple(frozenset(part) for part in parts),
+        frozenset((pair[0], pair[1]) for pair in apart if len(pair) == 2),
+    )
+
+
+def _happenings(reader: Reader) -> tuple[Happening, ...]:
+    return tuple(_read(reader, value) for value in reader.array("h", MAX_HAPPENINGS))
+
+
+def _pack(one: Happening) -> list[object]:
+    return [one.stamp_ns, one.kind.value, one.words]
+
+
+def _read(reader: Reader, value: Any) -> Happening:
+    parts = reader.as_array(value, "happening", 32)
+    # More parts than are known here are a newer program's.
+    if len(parts) < 3:
+        raise reader.error(f"a happening has {len(parts)} parts instead of 3")
+    kind = reader.as_text(parts[1], "kind", 16)
+    if kind not in set(Kind):
+        raise reader.error(f"kind {kind!r} is unknown")
+    stamp_ns = reader.as_integer(parts[0], "stamp", 0, MAX_STAMP_NS)
+    return Happening(stamp_ns, Kind(kind), reader.as_text(parts[2], "words", MAX_WORDS))
+
+
+def _maps(reader: Reader, value: Any) -> list[MapId]:
+    return [reader.as_map_id(one, "map") for one in reader.as_array(value, "maps", MAX_MAPS)]
+
+
+def _checked(data: bytes) -> bytes:
+    try:
+        decode_history(data)
+    except InvalidMessage as error:
+        raise InvalidValue(str(error)) from None
+    return data
