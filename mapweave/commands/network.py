@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 
+from mapweave import lifeline
 from mapweave.settings import NetworkSettings, Settings, load_settings
 from wire.bus_settings import BusSettings
 from wire.keys import Keys
@@ -66,8 +67,9 @@ def tell_if_alone(bus: ZenohBus, who: str) -> None:
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM and Ctrl-C set, so that a process can end in order."""
+    """An event that SIGTERM, Ctrl-C and a parent's end set, so that a process can end in order."""
     stop = threading.Event()
+    lifeline.hold(stop)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     return stop

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 
 from hybridmap.errors import MapweaveError
+from mapweave import lifeline
 
 
 class ChildFailed(MapweaveError):
@@ -24,7 +25,10 @@ def free_port() -> int:
 
 
 class Children:
-    """Runs `mapweave` commands as processes. Their output goes to files; leaving ends them all."""
+    """Runs `mapweave` commands as processes. Their output goes to files; leaving ends them all.
+
+    Should this process be killed, they end by themselves.
+    """
 
     def __init__(self, logs: Path) -> None:
         """Choose the folder for their output."""
@@ -47,7 +51,11 @@ class Children:
         """Run `mapweave` with arguments."""
         with self._log(name).open("ab") as output:
             self._running[name] = subprocess.Popen(
-                [sys.executable, "-m", "mapweave", *arguments], stdout=output, stderr=subprocess.STDOUT
+                [sys.executable, "-m", "mapweave", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=lifeline.environment(),
             )
 
     def pid(self, name: str) -> int:
@@ -67,21 +75,21 @@ class Children:
     def end(self, name: str, patience: float = 20.0) -> None:
         """Ask one to end, wait, and kill it if it does not."""
         process = self._running.pop(name, None)
-        if process is None or process.poll() is not None:
+        if process is None:
             return
-        process.terminate()
-        try:
-            process.wait(patience)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        with process:
+            process.terminate()
+            try:
+                process.wait(patience)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
     def kill(self, name: str) -> None:
         """End one at once, without a word (SIGKILL)."""
         process = self._running.pop(name, None)
         if process is not None:
-            process.kill()
-            process.wait()
+            with process:
+                process.kill()
 
     def _log(self, name: str) -> Path:
         return self._logs / f"{name}.log"

@@ -1,0 +1,32 @@
+"""A child process that stops when its parent is gone, however that ended.
+
+The parent holds the writing end of a pipe that is the child's stdin, and never writes. When the parent ends,
+killed or not, the system closes it, and the child reads the end of its stdin.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Mapping
+
+NAME = "MAPWEAVE_LIFELINE"
+"""Set in the environment of who has such a stdin; the stdin of all others means nothing."""
+
+
+def environment() -> Mapping[str, str]:
+    """Of a child that is started with a pipe as its stdin."""
+    return {**os.environ, NAME: "1"}
+
+
+def hold(stop: threading.Event) -> None:
+    """Set `stop` when the parent is gone; does nothing in a process that was not started as such a child."""
+    if os.environ.get(NAME):
+        threading.Thread(target=_wait, args=(stop,), name="lifeline", daemon=True).start()
+
+
+def _wait(stop: threading.Event) -> None:
+    # Not sys.stdin: Python cannot end while a thread waits in it.
+    while os.read(0, 1024):
+        pass
+    stop.set()
