@@ -64,9 +64,8 @@ class Chronicle:
 
     @property
     def newest(self) -> str:
-        """Words of what happened last; empty if nothing has."""
-        happenings = self.happenings
-        return happenings[-1].words if happenings else ""
+        """Words of what last became of the maps; empty if nothing has."""
+        return next((one.words for one in reversed(self.happenings) if one.kind is not Kind.FAILED), "")
 
     def follow(self, merged: MergedMap) -> None:
         """Take note of what has changed with a merge, and keep it."""
@@ -100,7 +99,7 @@ class Chronicle:
 
     def failed(self, words: str) -> None:
         """Take note that something could not be done; the same twice is told once."""
-        if self.newest != words:
+        if not self._kept.happenings or self._kept.happenings[-1].words != words:
             self._keep([(Kind.FAILED, words)], self._kept.parts, self._kept.apart)
 
     def _keep(

@@ -160,7 +160,10 @@ def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> N
 def test_a_damaged_record_is_begun_anew_and_says_so(store: Store, one: MergedMap) -> None:
     store.put_result("history", b"rubbish")
     chronicle = Chronicle(store)
-    assert [one.kind for one in chronicle.happenings] == [Kind.FAILED] and "damaged" in chronicle.newest
+    (failed,) = chronicle.happenings
+    assert failed.kind is Kind.FAILED and "damaged" in failed.words and chronicle.newest == ""
+    chronicle.failed(failed.words)
+    assert chronicle.happenings == (failed,), "told once"
     chronicle.follow(one)
     assert Chronicle(store).happenings == chronicle.happenings
 
