@@ -88,8 +88,12 @@ class Tracking:
     @property
     def health(self) -> tuple[Health, str]:
         """What holds the posture up, and in words what is wrong; empty if nothing is."""
-        if self._unused is None or self.missing or self.strange or self.blank:
-            return self._filter.health
+        told = self._filter.health
+        if self.missing or self.strange or self.blank:
+            return told
+        if self._unused is None:
+            # Images came, but showed nothing to go by; a new view's landmarks are seen in the next.
+            return (Health.GOOD, "") if told[0] is Health.NO_IMAGE else told
         if not self._unused:
             return Health.BLIND, "no landmark in view"
         return Health.FEW, f"{self._unused} landmarks in view are too few or too near to each other to go by"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -96,3 +97,18 @@ def test_a_covered_lens_and_lost_encoders_are_named(walls, description):
     assert not any(told[:18])
     assert sum("refute" in health for health in told[19:26]) >= 4
     assert told[-1] == "no image for 10 steps"
+
+
+def test_a_camera_that_looked_away_from_all_landmarks_is_not_told_to_have_failed(walls, description):
+    mapper = Mapper(MapId("r", 1), description)
+    poses = [Pose2(0.02 * k, 0.0, 0.0) for k in range(20)] + [Pose2(0.4, 0.0, 0.1 * k) for k in range(62)]
+    told = []
+    for tick, (before, pose) in enumerate(pairwise([poses[0], *poses])):
+        seen = walls.observe(before, pose, tick)
+        mapper.step(seen)
+        if not mapper.started:
+            mapper.begin(seen)
+        told.append(mapper.health)
+    assert "landmark" in told[-1], "it has turned away from what it mapped"
+    mapper.finish(seen)
+    assert mapper.anchor_features > 0 and mapper.health == ""
