@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2
+from hybridmap.ranges import Ranges
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,3 +103,9 @@ class RobotDescription:
     tick: float = 0.1
     clock: str = ""
     ranges_see_robots: bool = False
+
+    def ranges(self, proximity: NDArray[np.float64]) -> Ranges:
+        """What goes with a node of what the rangers read; empty if they are no help to see other robots."""
+        if not self.ranges_see_robots:
+            return Ranges()
+        return Ranges.around(proximity, self.ranger_bearings, self.ranger_reach, self.radius)

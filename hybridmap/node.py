@@ -14,6 +14,7 @@ from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.ranges import Ranges
+from hybridmap.wake import Wake
 
 CODE_BYTES = 32
 """Length of a compact descriptor in memory, a byte for each coordinate (hybridmap.descriptor)."""
@@ -158,6 +159,7 @@ class Node:
         radius: of the robot's footprint, m: two robots are never nearer to each other than both of theirs. 0
             if nobody knows.
         ranges: what the proximity sensors saw from there at that time; empty if it has none.
+        wake: where the robot was before and after, and what the same sensors saw there.
     """
 
     id: NodeId
@@ -168,6 +170,21 @@ class Node:
     clock: str = ""
     radius: float = 0.0
     ranges: Ranges = field(default_factory=Ranges)
+    wake: Wake = field(default_factory=Wake)
+
+    def __post_init__(self) -> None:
+        """Refuse a wake of other sensors.
+
+        Raises:
+            InvalidValue: the wake has readings of more or fewer sensors, or beyond their reach.
+        """
+        if not len(self.wake):
+            return
+        distances = self.wake.distances
+        if distances.shape[1] != len(self.ranges):
+            raise InvalidValue(f"wake: {distances.shape[1]} sensors, where the node has {len(self.ranges)}")
+        if not ((distances >= 0.0) & (distances <= self.ranges.reach + 1e-9)).all():
+            raise InvalidValue(f"wake: a distance is not within 0 to {self.ranges.reach:g} m")
 
     @property
     def points_in_robot(self) -> Array:

@@ -20,18 +20,21 @@ from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, 
 from hybridmap.errors import InvalidMessage, InvalidValue
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId, check_name
 from hybridmap.ranges import Ranges
+from hybridmap.wake import Wake
 from wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
 from wire.landmarks_v1 import unpack_landmarks_v1
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 from wire.posture_codec import pack_camera, pack_posture, unpack_camera, unpack_posture
 from wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
+from wire.wake_codec import MAX_WAKE_BYTES, pack_wake, unpack_wake
 
 MAX_RADIUS_MM = 100_000
-MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + 2048
+MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + MAX_WAKE_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 MAX_SHARED = MAX_LANDMARKS
 SINGLE = struct.Struct("<f")
 NO_RANGES = Ranges()
+NO_WAKE = Wake()
 MAX_EVIDENCE = 64
 
 NODE_PUT, NODE_RETIRED, EDGE_PUT, EDGE_RETIRED = 1, 2, 3, 4
@@ -155,6 +158,8 @@ def _node_fields(node: Node) -> dict[str, object]:
         fields["r"] = _millimetres(node.radius)
     if len(node.ranges):
         fields["g"] = pack_ranges(node.ranges)
+    if len(node.wake):
+        fields["u"] = pack_wake(node.wake, node.ranges.reach)
     return fields
 
 
@@ -166,6 +171,7 @@ def _millimetres(radius: float) -> int:
 
 def _read_node(reader: Reader, element: NodeId) -> Node:
     camera = unpack_camera(reader.binary("c", MAX_BODY_BYTES))
+    ranges = unpack_ranges(reader.binary("g", MAX_RANGE_BYTES)) if reader.has("g") else NO_RANGES
     return Node(
         id=element,
         stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
@@ -174,7 +180,8 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
         landmarks=_read_landmarks(reader, camera),
         clock=reader.name("z") if reader.has("z") else "",
         radius=reader.integer("r", 0, MAX_RADIUS_MM) / 1000.0 if reader.has("r") else 0.0,
-        ranges=unpack_ranges(reader.binary("g", MAX_RANGE_BYTES)) if reader.has("g") else NO_RANGES,
+        ranges=ranges,
+        wake=unpack_wake(reader.binary("u", MAX_WAKE_BYTES), ranges) if reader.has("u") else NO_WAKE,
     )
 
 

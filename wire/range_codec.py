@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.pose import Array
 from hybridmap.ranges import MOST, Ranges
 
 MAX_RANGE_BYTES = 2 + 3 * MOST
@@ -27,14 +28,9 @@ JUST_SEEN = 1.0 - 1e-5
 
 def pack_ranges(ranges: Ranges) -> bytes:
     """Encode."""
-    reach_mm = round(ranges.reach * 1000)
-    bearings = np.remainder(np.asarray(ranges.bearings) + math.pi, math.tau) - math.pi
-    share = np.asarray(ranges.distances) / max(ranges.reach, 1e-9)
-    steps = np.where(share >= 1.0 - 1e-6, 255, np.minimum(np.rint(share * 254), 254))
+    reach_mm = np.uint16(round(ranges.reach * 1000))
     return (
-        np.uint16(reach_mm).tobytes()
-        + np.clip(np.rint(bearings / BEARING_STEP), -MOST_STEPS, MOST_STEPS).astype("<i2").tobytes()
-        + steps.astype(np.uint8).tobytes()
+        reach_mm.tobytes() + pack_bearings(ranges.bearings) + pack_distances(ranges.distances, ranges.reach)
     )
 
 
@@ -48,10 +44,34 @@ def unpack_ranges(data: bytes) -> Ranges:
         raise InvalidMessage(f"ranges: {len(data)} bytes are none")
     count = (len(data) - 2) // 3
     reach = int(np.frombuffer(data, "<u2", 1)[0]) / 1000.0
-    bearings = np.frombuffer(data, "<i2", count, 2).astype(np.float64) * BEARING_STEP
-    steps = np.frombuffer(data, np.uint8, count, 2 + 2 * count).astype(np.float64)
-    shares = np.where(steps == 255, 1.0, np.minimum(steps / 254, JUST_SEEN))
+    bearings = unpack_bearings(data[2 : 2 + 2 * count])
     try:
-        return Ranges(bearings, shares * reach, reach)
+        return Ranges(bearings, unpack_distances(data[2 + 2 * count :], reach), reach)
     except InvalidValue as error:
         raise InvalidMessage(str(error)) from None
+
+
+def pack_bearings(bearings: Array) -> bytes:
+    """Encode (K,) rad: 2 bytes each, within half a turn."""
+    turned = np.remainder(np.asarray(bearings) + math.pi, math.tau) - math.pi
+    return np.clip(np.rint(turned / BEARING_STEP), -MOST_STEPS, MOST_STEPS).astype("<i2").tobytes()
+
+
+def unpack_bearings(data: bytes) -> Array:
+    """(K,) rad, of 2 K bytes."""
+    out: Array = np.frombuffer(data, "<i2").astype(np.float64) * BEARING_STEP
+    return out
+
+
+def pack_distances(distances: Array, reach: float) -> bytes:
+    """Encode (K,) m, of sensors that reach so far, m: a byte each."""
+    share = np.asarray(distances) / max(reach, 1e-9)
+    steps = np.where(share >= 1.0 - 1e-6, 255, np.minimum(np.rint(share * 254), 254))
+    return steps.astype(np.uint8).tobytes()
+
+
+def unpack_distances(data: bytes, reach: float) -> Array:
+    """(K,) m, of K bytes."""
+    steps = np.frombuffer(data, np.uint8).astype(np.float64)
+    out: Array = np.where(steps == 255, 1.0, np.minimum(steps / 254, JUST_SEEN)) * reach
+    return out

@@ -12,6 +12,7 @@ from agent.ekf.triangulation import triangulate
 from agent.mapping.placed import HERE, Placed
 from agent.mapping.tracking import Tracking
 from agent.mapping.view import View
+from agent.mapping.wayside import Wayside
 from agent.observation import RobotDescription
 from agent.surveying.driven import driven_edge
 from agent.surveying.surveyor import Traverse
@@ -20,9 +21,9 @@ from hybridmap.grid import settle
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import PoseGaussian
-from hybridmap.ranges import Ranges
 from hybridmap.recognising.recognition import Recognition, register
 from hybridmap.recognising.selection import SelectionSettings, choose, worth
+from hybridmap.wake import Wake
 
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
@@ -102,19 +103,22 @@ class Cartographer:
         self._next_number = next_number
         self._rng = np.random.default_rng(0)
 
-    def place(self, anchor: View, leaves: list[View], tracking: Tracking) -> list[ChangeBody]:
+    def place(
+        self, anchor: View, leaves: list[View], tracking: Tracking, wayside: Wayside
+    ) -> list[ChangeBody]:
         """Make nodes of an episode's views, edges between them and to the episode before, and loop closures.
 
         Args:
             anchor: the view where the episode began.
             leaves: views beside it.
             tracking: what is known of the landmarks.
+            wayside: where the robot was since the last node: it is the anchor's wake, if that becomes a node.
 
         Returns:
             The changes, already applied to `map`; none if the anchor shows too little.
         """
         changes: list[ChangeBody] = []
-        placed = self._node(anchor, tracking, changes)
+        placed = self._node(anchor, tracking, changes, wayside)
         if placed is not None:
             loops = self._close_loops(placed.node)
             if self._last is not None and self._last.evidence and loops:
@@ -175,16 +179,19 @@ class Cartographer:
         self._next_number += 1
         return number
 
-    def _node(self, view: View, tracking: Tracking, changes: list[ChangeBody]) -> Placed | None:
+    def _node(
+        self, view: View, tracking: Tracking, changes: list[ChangeBody], wayside: Wayside | None = None
+    ) -> Placed | None:
         landmarks, tracks = self._landmarks(view, tracking)
         if len(landmarks) < self._settings.least_landmarks:
             return None
         posture = self.map_from_anchor @ view.anchor_from_view
         d = self._description
-        ranges = Ranges()
-        if d.ranges_see_robots:
-            ranges = Ranges.around(view.proximity, d.ranger_bearings, d.ranger_reach, d.radius)
-        node = Node(self._number(), view.stamp_ns, posture, d.camera, landmarks, d.clock, d.radius, ranges)
+        ranges = d.ranges(view.proximity)
+        wake = Wake() if wayside is None else wayside.wake(view.stamp_ns, ranges)
+        node = Node(
+            self._number(), view.stamp_ns, posture, d.camera, landmarks, d.clock, d.radius, ranges, wake
+        )
         changes.append(NodePut(node))
         return Placed(node, tracks)
 

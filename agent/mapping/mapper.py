@@ -13,6 +13,7 @@ from agent.mapping.placed import HERE
 from agent.mapping.track_settings import TrackingSettings
 from agent.mapping.tracking import Tracking
 from agent.mapping.view import View
+from agent.mapping.wayside import Wayside, WaysideSettings
 from agent.observation import Observation, RobotDescription
 from agent.surveying.surveyor import Traverse
 from agent.vision.lens import Lens
@@ -33,6 +34,7 @@ class MapperSettings:
         sift: features of a view.
         tracking: of landmarks between views.
         cartographer: nodes and edges.
+        wayside: what is kept of the way between nodes.
         depths_per_height: assumed depth of an unknown feature before there is any node, as a multiple of
             the camera's height (the paper's "assumed common height").
     """
@@ -40,6 +42,7 @@ class MapperSettings:
     sift: SiftSettings = field(default_factory=SiftSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     cartographer: CartographerSettings = field(default_factory=CartographerSettings)
+    wayside: WaysideSettings = field(default_factory=WaysideSettings)
     depths_per_height: float = 8.0
 
 
@@ -70,6 +73,7 @@ class Mapper:
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings.tracking)
         self._cartographer = Cartographer(map_id, description, settings.cartographer, contents, next_number)
+        self._wayside = Wayside(description, settings.wayside)
         self._anchor: View | None = None
         self._leaves: list[View] = []
 
@@ -165,6 +169,8 @@ class Mapper:
         if self._tracking.carried_off or self._tracking.disputed:
             self.lose()
             self._tracking.step(observation)
+        elif self._anchor is not None and not self.doubtful:
+            self._wayside.step(observation, self._tracking.pose.mean)
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
@@ -202,6 +208,7 @@ class Mapper:
     def _begin_at(self, anchor: View) -> None:
         self._tracking.reanchor()
         self._anchor = anchor
+        self._wayside.clear(anchor.stamp_ns)
         self._tracking.follow(anchor, self.typical_depth)
 
     def leaf(self, observation: Observation) -> None:
@@ -221,11 +228,16 @@ class Mapper:
         if next_anchor is None or self._anchor is None:
             return []
         self._tracking.remember(force=True)
-        changes = self._cartographer.place(self._anchor, self._leaves, self._tracking)
+        changes = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
         for change in changes[:1]:
             if isinstance(change, NodePut):
                 self.typical_depth = float(np.median(change.node.landmarks.depths))
-        self._cartographer.move_anchor(self._tracking.reanchor())
+        moved = self._tracking.reanchor()
+        self._cartographer.move_anchor(moved)
+        if changes:
+            self._wayside.clear(next_anchor.stamp_ns)
+        else:
+            self._wayside.move_anchor(moved.mean)
         self._anchor, self._leaves = next_anchor, []
         self._tracking.follow(next_anchor, self.typical_depth)
         return changes

@@ -134,7 +134,7 @@ def absence(graph: PoseGraph, first: Trail, second: Trail, settings: AbsenceSett
     s = settings or AbsenceSettings()
     rows: list[tuple[Array, int, int]] = []
     for looking, mapped in ((first, second), (second, first)):
-        chosen = np.unique(np.linspace(0, len(looking.nodes) - 1, s.most_views).round().astype(np.int64))
+        chosen = np.unique(np.linspace(0, len(looking.views) - 1, s.most_views).round().astype(np.int64))
         pairs = _near(graph, looking, mapped, chosen, s)
         for k in np.unique(pairs[:, 0]):
             one = [_look(graph, mapped.views[j], looking.views[k], s) for j in pairs[pairs[:, 0] == k, 1]]
@@ -152,20 +152,18 @@ def _near(
     graph: PoseGraph, looking: Trail, mapped: Trail, chosen: NDArray[np.int64], s: AbsenceSettings
 ) -> NDArray[np.int64]:
     """(P, 2) views, and nodes of the other robot that might show the same, the nearest ones of each view."""
-    here = graph.means[graph.index([looking.nodes[k] for k in chosen])]
-    there = graph.means[graph.index(mapped.nodes)]
+    lookers, mappers = ([view.id for view in trail.views] for trail in (looking, mapped))
+    here, there = graph.means[graph.index([lookers[k] for k in chosen])], graph.means[graph.index(mappers)]
     ways = np.hypot(*(here[:, None, :2] - there[None, :, :2]).transpose(2, 0, 1))
     turns = np.abs(np.angle(np.exp(1j * (here[:, None, 2] - there[None, :, 2]))))
-    gaps = np.abs(looking.times[chosen][:, None] - mapped.times[None])
+    gaps = np.abs(looking.view_times[chosen][:, None] - mapped.view_times[None])
     ways[(turns > s.turn) | (gaps > s.lasting)] = np.inf
     nearest = np.argsort(ways, axis=1, kind="stable")[:, : s.most_nodes]
     i, j = np.nonzero(np.take_along_axis(ways, nearest, axis=1) < s.near)
     pairs = np.stack([chosen[i], nearest[i, j]], axis=1)
     if not len(pairs):
         return pairs
-    between = graph.relative(
-        [looking.nodes[k] for k in pairs[:, 0]], [mapped.nodes[k] for k in pairs[:, 1]]
-    ).covariances
+    between = graph.relative([lookers[k] for k in pairs[:, 0]], [mappers[k] for k in pairs[:, 1]]).covariances
     known = np.linalg.eigvalsh(between[:, :2, :2])[:, -1] < s.sigma_xy**2
     out: NDArray[np.int64] = pairs[known & (between[:, 2, 2] < s.sigma_heading**2)]
     return out

@@ -86,9 +86,7 @@ def clash_of(
     grid = np.arange(math.ceil(start / s.step), math.floor(end / s.step) + 1) * s.step
     times = np.unique(np.concatenate([first.times, second.times, grid]))
     times = times[(times >= start) & (times <= end)]
-    one, two = (
-        stay(trail, graph.means[graph.index(trail.nodes), :2], times, s.trail) for trail in (first, second)
-    )
+    one, two = (stay(trail, trail.postures(graph)[:, :2], times, s.trail) for trail in (first, second))
     told = first.radius > 0.0 and second.radius > 0.0
     least_apart = first.radius + second.radius if told else s.least_apart
     known = one.known & two.known
@@ -250,7 +248,7 @@ def _clash(
     worst = against[np.lexsort([ways[against], -odds[against].round(1)])[0]]
     agents = [graph.nodes[row[worst]].agent for row in (seen.observers, seen.others)]
     x, y = seen.offsets[worst]
-    bearing = math.remainder(math.atan2(y, x) - graph.means[seen.observers[worst], 2], math.tau)
+    bearing = math.remainder(math.atan2(y, x) - seen.headings[worst], math.tau)
     side = ("ahead", "to its left", "behind", "to its right")[round(bearing / (math.pi / 2)) % 4]
     return Clash(
         agents[0], agents[1], first.clock, len(against), float(ways[worst]),

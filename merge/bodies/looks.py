@@ -1,4 +1,4 @@
-"""Looks: what one robot's proximity sensors saw, node by node."""
+"""Looks: what one robot's proximity sensors saw, moment by moment."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from hybridmap.pose import Array
 from hybridmap.ranges import Ranges
+from hybridmap.wake import Wake
 
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What K sensors saw at N nodes.
+    """What K sensors saw at N moments.
 
     Attributes:
         bearings: (N, K) rad, in robot.
@@ -28,18 +29,24 @@ class Looks:
     seen: NDArray[np.bool_]
 
     @staticmethod
-    def of(ranges: Sequence[Ranges]) -> Looks:
-        """Of one robot's nodes, in their order.
+    def of(ranges: Sequence[Ranges], wakes: Sequence[Wake]) -> Looks:
+        """Of one robot's nodes, in their order, and then of their wakes, likewise.
 
         That there is nothing is also what a broken sensor says. So a look that met nothing at all, and a
         sensor that has never met anything, are not believed.
         """
+        looks = [*((one, one.distances) for one in ranges)]
+        looks += [(one, row) for one, wake in zip(ranges, wakes, strict=True) for row in wake.distances]
         most = max((len(one) for one in ranges), default=0)
-        bearings, distances = np.zeros((2, len(ranges), most))
-        there, met = np.zeros((2, len(ranges), most), np.bool_)
-        for k, one in enumerate(ranges):
+        bearings, distances = np.zeros((2, len(looks), most))
+        there, met = np.zeros((2, len(looks), most), np.bool_)
+        for k, (one, row) in enumerate(looks):
             there[k, : len(one)] = True
-            bearings[k, : len(one)], distances[k, : len(one)] = one.bearings, one.distances
-            met[k, : len(one)] = one.distances < one.reach - 1e-6
+            bearings[k, : len(one)], distances[k, : len(one)] = one.bearings, row
+            met[k, : len(one)] = row < one.reach - 1e-6
         believed = there & met.any(axis=1, keepdims=True) & met.any(axis=0, keepdims=True)
         return Looks(bearings, distances, believed)
+
+    def take(self, order: NDArray[np.int64]) -> Looks:
+        """Some of the looks, or all in another order."""
+        return Looks(self.bearings[order], self.distances[order], self.seen[order])

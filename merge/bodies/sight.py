@@ -72,10 +72,13 @@ class Looking:
 
     Attributes:
         moments: (M,) indices of the times when they looked.
-        observers: (M,) rows of the nodes in the graph.
-        others: (M,) rows of the other robot's nodes that are nearest in time.
-        offsets: (M, 2) m, from the observer to the other, in the merged frame.
-        spreads: (M, 2, 2) m^2, how the other wanders between its nodes.
+        observers: (M,) rows in the graph of the nodes that tell where they were.
+        headings: (M,) rad, of the observers in the merged frame.
+        levers: (M, 2) m, from that node to the observer, in the merged frame: it was on its way from it.
+        others: (M,) rows of the other robot's nodes that tell where it was.
+        other_levers: (M, 2) m, from that node to the other.
+        offsets: (M, 2) m, from the observer to the other.
+        spreads: (M, 2, 2) m^2, how both wander beside these nodes and between them.
         radii: (M,) m, of the other.
         looks: (P,) which look a ray belongs to, ascending.
         directions: (P, 2) of the rays, unit vectors in the merged frame.
@@ -84,7 +87,10 @@ class Looking:
 
     moments: NDArray[np.int64]
     observers: NDArray[np.int64]
+    headings: Array
+    levers: Array
     others: NDArray[np.int64]
+    other_levers: Array
     offsets: Array
     spreads: Array
     radii: Array
@@ -119,28 +125,32 @@ def looking(graph: PoseGraph, observer: Trail, other: Trail, stay: Stay, times: 
         observer: its trail.
         other: the other's.
         stay: where the other one was at `times`.
-        times: (T,) s, ascending; among them all times of the observer's nodes while both trails last.
+        times: (T,) s, ascending; among them all times of the observer's trail while both trails last.
     """
-    rows = graph.index(observer.nodes)
-    moments = np.minimum(np.searchsorted(times, observer.times), len(times) - 1)
-    offsets = stay.places[moments] - graph.means[rows, :2]
+    rows, other_rows = graph.index(observer.nodes), graph.index(other.nodes)[stay.nearest]
+    postures = observer.postures(graph)
+    at = np.minimum(np.searchsorted(times, observer.times), len(times) - 1)
+    offsets = stay.places[at] - postures[:, :2]
     furthest = np.max(observer.looks.distances, axis=1, initial=0.0, where=observer.looks.seen)
     near = np.hypot(offsets[:, 0], offsets[:, 1]) < furthest + other.radius
-    good = (times[moments] == observer.times) & stay.known[moments] & near & (other.radius > 0.0)
-    nodes = np.flatnonzero(good)
-    moments = moments[nodes]
-    looks, sensors = np.nonzero(observer.looks.seen[nodes])
-    angles = (graph.means[rows[nodes], 2, None] + observer.looks.bearings[nodes])[looks, sensors]
+    good = np.flatnonzero((times[at] == observer.times) & stay.known[at] & near & (other.radius > 0.0))
+    moments = at[good]
+    looks, sensors = np.nonzero(observer.looks.seen[good])
+    angles = (postures[good, 2, None] + observer.looks.bearings[good])[looks, sensors]
+    levers = postures[good, :2] - graph.means[rows[good], :2]
     return Looking(
         moments=moments,
-        observers=rows[nodes],
-        others=graph.index(other.nodes)[stay.nearest[moments]],
-        offsets=offsets[nodes],
-        spreads=stay.spreads[moments],
-        radii=np.full(len(nodes), other.radius),
+        observers=rows[good],
+        headings=postures[good, 2],
+        levers=levers,
+        others=other_rows[moments],
+        other_levers=stay.places[moments] - graph.means[other_rows[moments], :2],
+        offsets=offsets[good],
+        spreads=stay.spreads[moments] + observer.drifts[good, None, None] ** 2 * np.eye(2),
+        radii=np.full(len(good), other.radius),
         looks=looks,
         directions=np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        lengths=observer.looks.distances[nodes][looks, sensors],
+        lengths=observer.looks.distances[good][looks, sensors],
     )
 
 
@@ -181,25 +191,30 @@ def errors_in_common(graph: PoseGraph, seen: Looking, settings: SightSettings | 
     joint = graph.covariance([graph.nodes[k] for k in rows]).reshape(3 * len(rows), -1)
     headings = graph.means[:, 2]
     looks = np.arange(len(seen))
-    # Right perturbations: a node moves along its own axes, and all that it looks at turns with it.
+    # Right perturbations: a node moves along its own axes, and all that it looks at turns with it. So does
+    # the robot that was on its way from it.
     by_node = np.zeros((len(seen), 2, len(rows), 3))
     seats = np.searchsorted(rows, seen.observers)
     by_node[looks, :, seats, :2] = -_rotations(headings[seen.observers])
-    by_node[looks, :, seats, 2] = seen.offsets[:, ::-1] * [1.0, -1.0]
-    by_node[looks, :, np.searchsorted(rows, seen.others), :2] = _rotations(headings[seen.others])
+    by_node[looks, :, seats, 2] = -_turned(seen.levers + seen.offsets)
+    seats = np.searchsorted(rows, seen.others)
+    by_node[looks, :, seats, :2] = _rotations(headings[seen.others])
+    by_node[looks, :, seats, 2] = _turned(seen.other_levers)
     design = by_node.reshape(2 * len(seen), -1)
     # What is between the maps the one sees from the one side, the other from the other.
     agents = np.array([graph.nodes[row].agent for row in seen.others])
     apart = np.kron(np.where(agents == agents[0], 1.0, -1.0)[:, None], np.eye(2))
-    covariance = design @ joint @ design.T + s.floor_xy**2 * apart @ apart.T
-    count = min(MODES, len(covariance))
-    values, vectors = scipy.linalg.eigh(
-        covariance, subset_by_index=[len(covariance) - count, len(covariance) - 1]
+    root = np.linalg.cholesky(joint + 1e-10 * np.eye(len(joint)))
+    factor = np.hstack([design @ root, s.floor_xy * apart])
+    # There are many more looks than nodes, so the principal components come from the smaller side.
+    count = min(MODES, *factor.shape)
+    _, vectors = scipy.linalg.eigh(
+        factor.T @ factor, subset_by_index=[factor.shape[1] - count, factor.shape[1] - 1]
     )
-    modes = vectors * np.sqrt(np.maximum(values, 0.0))
+    modes = factor @ vectors
     ways, weights = _shells(count, np.array(s.sigmas))
     by_look = modes.reshape(len(seen), 2, count)
-    own = covariance.reshape(len(seen), 2, len(seen), 2)[looks, :, looks, :]
+    own = np.einsum("mik,mjk->mij", *[factor.reshape(len(seen), 2, -1)] * 2)
     rest = own - by_look @ by_look.transpose(0, 2, 1)
     return Errors((ways @ modes.T).reshape(len(ways), len(seen), 2), rest, weights)
 
@@ -219,6 +234,12 @@ def _rotations(headings: Array) -> Array:
     """(M, 2, 2) rotation matrices."""
     cos, sin = np.cos(headings), np.sin(headings)
     out: Array = np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
+    return out
+
+
+def _turned(ways: Array) -> Array:
+    """(M, 2) how the ends of ways move, m for each rad by which their beginnings turn."""
+    out: Array = ways[:, ::-1] * [-1.0, 1.0]
     return out
 
 

@@ -29,7 +29,8 @@ def looks(offsets: Array, lengths: Array, spread: float = 0.03, bearings: Array 
     angles = np.arange(k) * 2 * np.pi / k if bearings is None else bearings
     rows = np.arange(m)
     return Looking(
-        moments=rows, observers=rows, others=rows + m, offsets=offsets,
+        moments=rows, observers=rows, headings=np.zeros(m), levers=np.zeros((m, 2)), others=rows + m,
+        other_levers=np.zeros((m, 2)), offsets=offsets,
         spreads=np.tile(spread**2 * np.eye(2), (m, 1, 1)), radii=np.full(m, RADIUS),
         looks=np.repeat(rows, k),
         directions=np.tile(np.stack([np.cos(angles), np.sin(angles)], axis=1), (m, 1)),
