@@ -18,6 +18,7 @@ from hybridmap.descriptor import quantise
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
+from hybridmap.wake import FURTHEST, LONGEST, MOST, Wake
 from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet
 
 # Examples run on machines that are busy with other things.
@@ -74,11 +75,21 @@ def ranges(draw: st.DrawFn) -> Ranges:
 
 
 @st.composite
+def wakes(draw: st.DrawFn, ranges: Ranges) -> Wake:
+    count = draw(st.integers(0, MOST))
+    random = np.random.default_rng(draw(seeds))
+    postures = random.uniform([-FURTHEST, -FURTHEST, -3.1], [FURTHEST, FURTHEST, 3.1], (count, 3))
+    distances = np.minimum(random.uniform(0, 2 * ranges.reach, (count, len(ranges))), ranges.reach)
+    return Wake(np.sort(random.uniform(-LONGEST, LONGEST, count)), postures, distances) if count else Wake()
+
+
+@st.composite
 def nodes(draw: st.DrawFn) -> Node:
     camera = draw(cameras())
     stamp_ns = draw(st.integers(0, 2**63 - 1))
     radius = draw(st.integers(0, 5000)) / 1000.0
     clock = draw(st.sampled_from(["", "utc", "sim-office-7"]))
+    seen = draw(ranges())
     return Node(
         draw(node_ids),
         stamp_ns,
@@ -87,7 +98,8 @@ def nodes(draw: st.DrawFn) -> Node:
         draw(landmarks(camera)),
         clock,
         radius,
-        draw(ranges()),
+        seen,
+        draw(wakes(seen)),
     )
 
 
