@@ -37,7 +37,7 @@ class SelectionSettings:
     """How many landmarks a node keeps, and which.
 
     Attributes:
-        most_bytes: what a node may cost on the wire, all included.
+        most_bytes: what a node may cost on the wire, all but its wake included.
         crowd: landmarks nearer to each other than about this share of the image's width crowd each other.
         alike: distance of two decoded descriptors beyond which they cannot be taken for each other.
     """

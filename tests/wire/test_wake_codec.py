@@ -58,7 +58,8 @@ def test_other_lengths_are_refused(size):
     ("ages", "postures", "distances"),
     [([0.0], [[0.0, 0.0]], [[]]), ([0.0, 1.0], [[0.0] * 3], [[]]), ([1.0, 0.0], [[0.0] * 3] * 2, [[], []]),
      ([np.nan], [[0.0] * 3], [[]]), ([301.0], [[0.0] * 3], [[]]), ([0.0], [[31.0, 0.0, 0.0]], [[]]),
-     ([0.0], [[0.0, 0.0, np.inf]], [[]]), (range(MOST + 1), np.zeros((MOST + 1, 3)), np.zeros((MOST + 1, 0)))],
+     ([0.0], [[0.0, 0.0, np.inf]], [[]]),
+     (range(MOST + 1), np.zeros((MOST + 1, 3)), np.zeros((MOST + 1, 0)))],
 )  # fmt: skip
 def test_what_does_not_belong_together_is_refused(ages, postures, distances):
     with pytest.raises(InvalidValue, match="wake"):

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from hybridmap.camera import Camera
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.ranges import Ranges
+from hybridmap.wake import MOST, Wake
 from merge.bodies.clash import Clash
 from merge.bodies.exclusion import ExclusionSettings, chances_clear, clash_of
 from merge.bodies.trails import Trail, trails_of
@@ -38,6 +40,14 @@ class Walk:
         self.truth = way[leg] + share[:, None] * (way[leg + 1] - way[leg])
         self.way = way
 
+    def wake(self, node: int) -> Wake:
+        """Where it was each second until the next node, beside a node that looks east."""
+        end = self.times[node + 1] if node + 1 < len(self.times) else self.times[node]
+        times = np.arange(self.times[node] + 1.0, end, 1.0)[:MOST]
+        places = [np.interp(times, self.ticks, self.truth[:, k]) - self.way[node, k] for k in range(2)]
+        postures = np.stack([*places, np.zeros(len(times))], axis=1)
+        return Wake(times - self.times[node], postures, np.zeros((len(times), 0)))
+
     def moved(self, by: Array) -> None:
         self.truth, self.way = self.truth + by, self.way + by
 
@@ -61,13 +71,13 @@ def apart(a: Walk, b: Walk) -> Array:
 
 def trails(
     a: Walk, b: Walk, clocks: tuple[str, str] = ("net", "net"), agents: str = "ab",
-    radii: tuple[float, float] = (0.0, 0.0),
+    radii: tuple[float, float] = (0.0, 0.0), wakes: bool = False,
 ) -> list[Trail]:  # fmt: skip
     found = []
     for k, walk in enumerate((a, b)):
         nodes = [
             Node(NodeId(agents[k], k, i), round(time * 1e9), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
-                 Landmarks.empty(), clocks[k], radii[k])
+                 Landmarks.empty(), clocks[k], radii[k], Ranges(), walk.wake(i) if wakes else Wake())
             for i, time in enumerate(walk.times)
         ]  # fmt: skip
         found += trails_of(nodes)
@@ -119,6 +129,57 @@ def test_it_is_the_same_from_either_side() -> None:
     assert np.isclose(forth.evidence, back.evidence, rtol=0.1)
 
 
+def scarce(seed: int, late: float) -> tuple[Walk, Walk, np.random.Generator]:
+    """Two robots that do much the same, so late one after the other, and make a node all 16 seconds only."""
+    rng = np.random.default_rng(seed)
+    a = Walk(rng, 80)
+    b = Walk(rng, way=a.way + rng.normal(0, 0.03, a.way.shape))
+    for walk, more in ((a, 0.0), (b, late)):
+        walk.times = (a.times + more)[::4]
+        walk.ticks, walk.truth, walk.way = a.ticks + more, a.truth, walk.way[::4]
+    b.truth = b.truth + rng.normal(0, 0.01, 2)
+    return a, b, rng
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_nodes_are_scarce_their_wakes_tell(seed: int) -> None:
+    """Between nodes nobody knows where the robots were, unless the nodes' wakes do."""
+    a, b, rng = scarce(seed, 0.7)
+    whole = graph(a, b, rng)
+    found = clash_of(whole, *trails(a, b, wakes=True))
+    assert found is not None and found.evidence > 10 and found.nearest < 0.15
+    bare = clash_of(whole, *trails(a, b))
+    assert bare is None or bare.evidence < found.evidence / 2
+
+
+def test_moments_of_wakes_are_where_their_nodes_are_put() -> None:
+    """Against postures composed one by one; a view is a moment of its own, and times ascend."""
+    rng = np.random.default_rng(6)
+    nodes, means = [], rng.uniform(-3, 3, (5, 3))
+    for k in range(5):
+        ages, postures = np.sort(rng.uniform(-1, 9, k)), rng.uniform(-1, 1, (k, 3))
+        nodes.append(
+            Node(NodeId("a", 1, k), round(1e10 * (k + 1)), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
+                 Landmarks.empty(), "net", 0.2, Ranges(), Wake(ages, postures, np.zeros((k, 0))))
+        )  # fmt: skip
+    (trail,) = trails_of(list(reversed(nodes)))
+    ids = tuple(node.id for node in nodes)
+    found = trail.postures(PoseGraph(ids[0], ids, means, scipy.sparse.eye(15, format="csc")))
+    expected = [
+        (10.0 * (k + 1) + age, k, (Pose2(*means[k]) @ Pose2(*beside)).vector)
+        for k, node in enumerate(nodes)
+        for age, beside in [(0.0, np.zeros(3)), *zip(node.wake.ages, node.wake.node_from_robot, strict=True)]
+    ]
+    expected.sort(key=lambda row: row[0])
+    assert trail.times == pytest.approx([time for time, _, _ in expected])
+    assert trail.nodes == tuple(ids[k] for _, k, _ in expected)
+    assert found[:, :2] == pytest.approx(np.array([vector[:2] for _, _, vector in expected]))
+    assert np.exp(1j * found[:, 2]) == pytest.approx(np.exp([1j * vector[2] for _, _, vector in expected]))
+    assert [view.id for view in trail.views] == list(ids) and trail.view_times == pytest.approx(
+        10.0 * np.arange(1, 6)
+    )
+
+
 def test_nothing_is_said_without_a_clock_that_both_share() -> None:
     a, b, rng = twins(0)
     assert clash(a, b, rng, clocks=("net", "own")) is None
@@ -151,8 +212,11 @@ def test_where_nobody_knows_where_the_robot_was_nothing_is_said() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10**6), st.sampled_from(["follows", "wanders"]), st.sampled_from([0.005, 0.02, 0.04]))
-def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma: float) -> None:
+@given(
+    st.integers(0, 10**6), st.sampled_from(["follows", "wanders"]), st.sampled_from([0.005, 0.02, 0.04]),
+    st.booleans(),
+)  # fmt: skip
+def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma: float, wakes: bool) -> None:
     """They come as near as 0.35 m, centre to centre, again and again: bodies of 0.3 m and a hand between."""
     rng = np.random.default_rng(seed)
     a = Walk(rng)
@@ -162,11 +226,12 @@ def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma:
     step = 0.02 * np.array([np.cos(angle), np.sin(angle)])
     while apart(a, b).min() < 0.35:
         b.moved(step)
-    one, two = trails(a, b)
+    one, two = trails(a, b, wakes=wakes)
     assert clash_of(graph(a, b, rng, sigma=sigma), one, two) is None
 
 
-def test_robots_that_nearly_touch_all_the_time_seldom_look_like_a_clash() -> None:
+@pytest.mark.parametrize("wakes", [False, True])
+def test_robots_that_nearly_touch_all_the_time_seldom_look_like_a_clash(wakes: bool) -> None:
     """The bound holds even where bodies are exactly as small as supposed: here at 0.2 m, with loose doubt."""
     s = ExclusionSettings(doubt=0.1, least_witnesses=1)
     refused = 0
@@ -176,7 +241,7 @@ def test_robots_that_nearly_touch_all_the_time_seldom_look_like_a_clash() -> Non
         b = Walk(rng, way=a.way + rng.normal(0, 0.1, a.way.shape))
         while apart(a, b).min() < 0.2:
             b.moved(np.array([0.02, 0.0]))
-        refused += clash_of(graph(a, b, rng), *trails(a, b), s) is not None
+        refused += clash_of(graph(a, b, rng), *trails(a, b, wakes=wakes), s) is not None
     assert refused <= 10
 
 
