@@ -115,8 +115,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="processes; more than cores spoils tick_ms")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if arguments.trials < 1 or min(arguments.landmarks) < 6:
-        parser.error("at least one trial, and at least 6 landmarks, are needed")
+    if min(arguments.trials, arguments.jobs) < 1 or min(arguments.landmarks) < 6 or arguments.seed < 0:
+        parser.error("at least one trial and job, at least 6 landmarks, and seed 0 or more are needed")
     console = Console(stderr=arguments.json)
     result: dict[str, dict[str, dict[str, float]]] = {name: {} for name in DRIVERS}
     counts: dict[str, int] = {}

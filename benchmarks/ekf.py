@@ -167,8 +167,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.runs, arguments.jobs) < 1:
-        parser.error("--runs and --jobs must be at least 1")
+    if min(arguments.runs, arguments.jobs) < 1 or arguments.seed < 0:
+        parser.error("--runs and --jobs must be at least 1, --seed at least 0")
     console = Console(stderr=arguments.json)
     one_thread()
     with console.status("timing ..."):

@@ -189,6 +189,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
+    if arguments.seed < 0:
+        parser.error("--seed must be at least 0")
     console = Console(stderr=arguments.json)
     with console.status("three filters take turns ..."):
         figures = measure(arguments.seed)

@@ -128,8 +128,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
-    if min(arguments.runs, arguments.steps, arguments.jobs) < 1:
-        parser.error("--runs, --steps and --jobs must be at least 1")
+    if min(arguments.runs, arguments.steps, arguments.jobs) < 1 or arguments.seed < 0:
+        parser.error("--runs, --steps and --jobs must be at least 1, --seed at least 0")
     console = Console(stderr=arguments.json)
     one_thread()
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:

@@ -114,6 +114,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if set(arguments.seeds) & set(arguments.check):
         parser.error("--check needs seeds that are not in --seeds")
+    if min(arguments.seeds + arguments.check) < 0 or min(arguments.nodes) < 100 or min(arguments.queries) < 4:
+        parser.error("at least 100 nodes, 4 queries and seeds that are not negative are needed")
     console = Console(stderr=arguments.json)
     (nodes, more_nodes), (queries, more_queries) = arguments.nodes, arguments.queries
     with Progress(console=console) as bar:

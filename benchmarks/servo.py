@@ -127,6 +127,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="processes; more than cores spoils tick_ms")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     arguments = parser.parse_args()
+    if min(arguments.trials, arguments.jobs) < 1 or arguments.seed < 0:
+        parser.error("--trials and --jobs must be at least 1, --seed at least 0")
     console = Console(stderr=arguments.json)
     with ProcessPoolExecutor(arguments.jobs) as pool:
         results = pool.map(

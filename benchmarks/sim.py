@@ -150,6 +150,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
+    robots = arguments.robots
+    if not 1 <= min(robots) <= max(robots) <= 16 or not arguments.seconds > 0 or arguments.seed < 0:
+        parser.error("--robots are 1 to 16, --seconds more than 0, --seed at least 0")
     cv2.setNumThreads(1)
     result = measure(arguments.robots, arguments.seconds, arguments.seed, quiet=arguments.json)
     if arguments.json:
