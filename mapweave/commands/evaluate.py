@@ -70,7 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     from mapweave.commands.network import settings_of
     from mapweave.examination.examine import examine
+    from mapweave.output_folder import check_output
 
+    if arguments.out is not None:
+        check_output(arguments.out)
     pipeline = settings_of(arguments).pipeline
     console = Console(stderr=True)
     examination = examine(arguments.folder, arguments.camera, arguments.focal, pipeline, console)
@@ -98,11 +101,14 @@ def run_merge(arguments: argparse.Namespace) -> int:
 
     from mapweave.commands.network import settings_of
     from mapweave.examination.merging import examine_merging
+    from mapweave.output_folder import check_output
     from mapweave.settings import merge_settings
 
     settings = settings_of(arguments)
     merge = merge_settings(settings, arguments.settings)
     console = Console(stderr=True)
+    if arguments.out is not None:
+        check_output(arguments.out)
     examination = examine_merging(arguments.folder, arguments.robots, settings.pipeline, merge, console)
     report = examination.report()
     out = arguments.out or Path("out/eval-merge") / examination.name

@@ -157,6 +157,7 @@ def run_one(arguments: argparse.Namespace) -> int:
 
 def run_batch(arguments: argparse.Namespace) -> int:
     """Run many trials and print the table."""
+    from mapweave.output_folder import check_output
     from mapweave.trial.batch import BatchOptions, run_batch_of_trials
     from mapweave.trial.scenario import load_scenario, scenario_path
 
@@ -166,7 +167,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
     options = BatchOptions(
         first=first,
         seeds=arguments.seeds,
-        out=arguments.out or Path("out/sim") / scenario.name,
+        out=check_output(arguments.out or Path("out/sim") / scenario.name),
         processes=not arguments.one_process,
         settings=settings.pipeline,
         settings_file=arguments.settings,

@@ -69,11 +69,17 @@ def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
 def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
     taken = tmp_path / "taken"
     taken.write_text("a file where a folder should be")
-    for folder in (taken, taken / "in" / "it"):
-        words = "is a file; give a folder"
+    for folder, words in ((taken, "is a file; give a folder"), (taken / "in" / "it", "is a file")):
         assert words in complaint(capfd, "replay", recording, "--offline", "--data", folder)
         assert words in complaint(capfd, "server", "--listen", nobody, "--data", folder)
         assert words in complaint(capfd, "demo", "--out", folder)
+        for command in (
+            ["sim", "batch", "office"],
+            ["eval", "relocalize", recording],
+            ["eval", "merge", recording],
+        ):
+            said = complaint(capfd, *command, "--out", folder)
+            assert f"{taken}: is a file; give a folder" in said, "before anything is measured"
     path = tmp_path / "a.mapweave"
     write_map_file(path, MapFile("agent", "r0.1", one_node()))
     assert str(taken) in complaint(capfd, "map", "show", path, "--out", taken / "a.png")
