@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import textwrap
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
@@ -14,6 +16,7 @@ from hybridmap.explanation import (
     PairExplanation,
     RouteExplanation,
     Standing,
+    Witness,
 )
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.ruling import Ruling
@@ -21,6 +24,8 @@ from merge.graph.links import DOUBLES
 
 MOST_WITNESSES = 12
 """Lines of other links; `--json` has all."""
+WIDTH = 110
+"""Columns of a line of numbers."""
 TITLES = {
     Standing.LINKED: "are linked",
     Standing.OWN: "are joined",
@@ -44,9 +49,10 @@ def pair_words(told: PairExplanation) -> list[str]:
         lines.append(f"  b seen from a {_posture(told.a_from_b)}")
         off = told.residuals_px[np.isfinite(told.residuals_px)]
         if len(off):
-            lines.append(f"  residuals     median {np.median(off):.1f} px, worst {off.max():.1f} px")
-        numbers = ", ".join(f"{name} {value:.3g}" for name, value in sorted(told.evidence.items()))
-        lines.append(f"  evidence      {numbers}")
+            rest = f"; {told.evidence['rms_px']:.1f} px" if "rms_px" in told.evidence else ""
+            rest += " if depths may be off as far as they are uncertain" if rest else ""
+            lines.append(f"  residuals     median {np.median(off):.1f} px, worst {off.max():.1f} px{rest}")
+        lines += _evidence(told.evidence)
     if told.misfit is not None:
         misfit = told.misfit
         lines.append(f"  in the map    {_posture(misfit.merged_a_from_b)}")
@@ -62,7 +68,7 @@ def pair_words(told: PairExplanation) -> list[str]:
         lines.append(
             f"  other links   {count} of {len(told.witnesses)} between the same pieces of map agree:"
         )
-    for witness in sorted(told.witnesses, key=lambda w: w.distance2)[:MOST_WITNESSES]:
+    for witness in _telling(told.witnesses):
         word = "agrees" if witness.agrees else "contradicts"
         kept = "stands" if witness.kept else "refused"
         lines.append(f"    {witness.a} - {witness.b}: {word}, {_sigmas(witness.distance2)}, {kept}")
@@ -71,6 +77,22 @@ def pair_words(told: PairExplanation) -> list[str]:
     lines += [f"  {claim}" for claim in told.claims]
     lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
     return lines
+
+
+def _evidence(evidence: Mapping[str, float]) -> list[str]:
+    """All numbers, in lines between which none is torn from its name."""
+    tied = "\N{NO-BREAK SPACE}"
+    words = ", ".join(f"{name}{tied}{value:.3g}" for name, value in sorted(evidence.items()))
+    lines = textwrap.wrap(words, WIDTH, initial_indent="  evidence      ", subsequent_indent=" " * 16)
+    return [line.replace(tied, " ") for line in lines]
+
+
+def _telling(witnesses: Sequence[Witness]) -> list[Witness]:
+    """Those that are told, nearest first: of many that agree some leave their lines to those that do not."""
+    ranked = sorted(witnesses, key=lambda w: w.distance2)
+    against = [w for w in ranked if not w.agrees]
+    agree = [w for w in ranked if w.agrees][: MOST_WITNESSES - min(len(against), MOST_WITNESSES // 2)]
+    return [*agree, *against[: MOST_WITNESSES - len(agree)]]
 
 
 def maps_words(told: MapsExplanation) -> list[str]:

@@ -17,6 +17,8 @@ WIDTH = 12.0
 """Of a picture, inches."""
 GAP = 0.06
 """Between the two images, as a share of their width."""
+LINE = 0.2
+"""Of a line of words, inches."""
 BAD_PX = 10.0
 """Residual from which on a line has the last colour, px: depths are known to a few per cent."""
 
@@ -37,7 +39,9 @@ def draw_link(told: PairExplanation, path: Path) -> None:
     left, right = told.a.camera, told.b.camera
     shift = left.width * (1.0 + GAP)
     across, down = shift + right.width, max(left.height, right.height)
-    figure = Figure(figsize=(WIDTH, 0.84 * WIDTH * down / across + 1.7), dpi=110, layout="constrained")
+    reason = textwrap.wrap(told.reason, 110)
+    height = 0.84 * WIDTH * down / across + 1.7 + LINE * len(reason)
+    figure = Figure(figsize=(WIDTH, height), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for node, offset in ((told.a, 0.0), (told.b, shift)):
@@ -56,12 +60,13 @@ def draw_link(told: PairExplanation, path: Path) -> None:
     if told.probability is not None:
         sure = told.probability > 0.9999
         title += ", probability over 0.9999" if sure else f", probability {told.probability:.4f}"
-    axes.set_title(title + "\n" + "\n".join(textwrap.wrap(told.reason, 110)), fontsize=10)
+    axes.set_title("\n".join([title, *reason]), fontsize=10)
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     image = io.BytesIO()
-    figure.savefig(image, format="png")
+    # An axis that is off does not keep room for its title.
+    figure.savefig(image, format="png", bbox_inches="tight", pad_inches=0.1)
     write_whole(path, image.getvalue())
 
 

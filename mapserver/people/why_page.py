@@ -101,7 +101,11 @@ function showPair(pair) {
     const agree = pair.witnesses.filter(w => w.agrees).length;
     add(box, "p", `${agree} of ${pair.witnesses.length} other links between the same pieces of map agree:`);
     const list = add(box, "ul");
-    for (const w of pair.witnesses.slice().sort((v, w) => v.distance2 - w.distance2).slice(0, 12)) {
+    // Of many that agree some leave their lines to those that do not.
+    const ranked = pair.witnesses.slice().sort((v, w) => v.distance2 - w.distance2);
+    const against = ranked.filter(w => !w.agrees);
+    const shown = ranked.filter(w => w.agrees).slice(0, 12 - Math.min(against.length, 6));
+    for (const w of [...shown, ...against.slice(0, 12 - shown.length)]) {
       const item = add(list, "li");
       to(item, w.a, w.b, `${w.a} - ${w.b}`);
       item.append(`: ${w.agrees ? "agrees" : "contradicts"}, ${Math.sqrt(w.distance2).toFixed(1)} standard ` +
