@@ -63,10 +63,10 @@ def explain_route(
         wary: as in Router.route.
 
     Raises:
-        InvalidValue: a node that was never there.
+        InvalidValue: a node that was never there, of those that are blocked too.
     """
     merged = router.merged
-    for end in (start, goal):
+    for end in (start, goal, *(node for pair in blocked for node in pair)):
         merged.check(end)
     if missing := router.missing(start, goal):
         return _apart(merged, start, goal, missing)

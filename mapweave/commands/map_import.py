@@ -29,9 +29,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Read, optimise, write, say how much better it is."""
     from dataclasses import replace
 
+    from hybridmap.errors import InvalidValue
     from mapweave.g2o import read_g2o, write_g2o
     from mapweave.g2o_optimum import optimum_of
 
+    if arguments.out.suffix == ".mapweave":
+        raise InvalidValue(
+            f"{arguments.out}: what is written is a pose graph, no map; end its name with .g2o"
+        )
     graph = read_g2o(arguments.file)
     poses = optimum_of(graph)
     write_g2o(arguments.out, replace(graph, poses=poses))

@@ -51,9 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
         # A robot's own map has one frame, whatever hangs together in it.
         arguments.component = 0
     if arguments.component not in sizes and sizes:
-        raise InvalidValue(
-            f"the map has no component {arguments.component}; its components are 0 to {len(sizes) - 1}"
-        )
+        there = "one, 0" if len(sizes) == 1 else f"0 to {len(sizes) - 1}"
+        raise InvalidValue(f"the map has no component {arguments.component}; it has {there}")
     landmarks = [len(n.landmarks) for n in hybrid.nodes.values()]
     kinds: dict[str, int] = {}
     for edge in hybrid.edges.values():

@@ -159,6 +159,8 @@ def test_what_never_was_is_refused_with_what_there_is(router: Router) -> None:
         explain_route(router, nodes_of(ME)[0], NodeId(*ME, 9))
     with pytest.raises(InvalidValue, match=r"there is no map z\.1"):
         explain_route(router, NodeId("z", 1, 1), nodes_of(ME)[0])
+    with pytest.raises(InvalidValue, match=r"map b\.1 has no node 2"):
+        explain_route(router, *nodes_of(ME)[:2], blocked=[(nodes_of(ME)[0], NodeId(*OTHER, 2))])
     assert explain_route(router, *nodes_of(ME)[:1] * 2).found
 
 

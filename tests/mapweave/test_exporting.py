@@ -176,7 +176,7 @@ def test_the_command_writes_and_says_what_is_left_out(
     assert "6 nodes of others are left out" in err
     arguments = ["map", "export", str(file), "--to", form, "-o", str(tmp_path / "no"), "--component", "7"]
     assert main(arguments) == 1
-    assert "the map has no component 7; its components are 0 to 1" in capfd.readouterr().err
+    assert "the map has no component 7; it has 0 to 1" in capfd.readouterr().err
     assert not (tmp_path / "no").exists()
 
 
@@ -225,6 +225,9 @@ def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(
     factors, values = gtsam.readG2o(str(tmp_path / "in.g2o"), False)
     factors.add(gtsam.PriorFactorPose2(0, values.atPose2(0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
     best = 2.0 * factors.error(gtsam.GaussNewtonOptimizer(factors, values).optimize())
+    wrong = tmp_path / "out.mapweave"
+    assert main(["map", "import", str(tmp_path / "in.g2o"), "-o", str(wrong)]) == 1
+    assert "what is written is a pose graph, no map" in capfd.readouterr().err and not wrong.exists()
     arguments = ["map", "import", str(tmp_path / "in.g2o"), "-o", str(tmp_path / "out.g2o"), "--json"]
     assert main(arguments) == 0
     told = json.loads(capfd.readouterr().out)

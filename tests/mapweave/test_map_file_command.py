@@ -94,7 +94,7 @@ def test_the_summary_of_a_merged_map(merged_file, capfd, tmp_path):
     assert found["drawn"] == "component 1, 1 nodes"
     assert (tmp_path / "other.png").read_bytes() != (tmp_path / "pictures" / "m.png").read_bytes()
     assert main(["map", "show", str(merged_file), "--component", "2"]) == 1
-    assert "has no component 2; its components are 0 to 1" in capfd.readouterr().err
+    assert "has no component 2; it has 0 to 1" in capfd.readouterr().err
 
 
 def test_without_a_picture_none_is_drawn(agent_file, capfd):
