@@ -119,6 +119,14 @@ class Chronicle:
             log.warning("what has happened to the maps is not kept: %s", error)
 
 
+def between(before: MergedMap, after: MergedMap, stamp_ns: int) -> tuple[Happening, ...]:
+    """What has become of the maps from one merge to another, with the time at which that was asked for."""
+    parts = joined_maps(before)
+    joined, parted = joinings(parts, after), partings(parts, before.links, after)
+    fresh = [*_briefly(Kind.JOINED, joined), *_briefly(Kind.PARTED, parted)]
+    return tuple(Happening(stamp_ns, kind, _one_line(words)) for kind, words in fresh)
+
+
 def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pair, str]:
     """Two maps that are not one, since two robots cannot have been where the links between them say."""
     part_of = {one: number for number, part in enumerate(parts) for one in part}

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from hybridmap.change import EdgePut
+from hybridmap.history import Happening
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId
 from hybridmap.ruling import Rulings
@@ -23,8 +24,13 @@ PROBABILITY = "probability"
 """Name among the evidence of a link in a file: see merge.belief.credence."""
 
 
-def map_file_of(merged: MergedMap) -> MapFile:
-    """All that a merged map is: nodes, edges, links with their probabilities, refusals, rulings, postures."""
+def map_file_of(merged: MergedMap, history: Iterable[Happening] = ()) -> MapFile:
+    """All that a merged map is: nodes, edges, links with their probabilities, refusals, rulings, postures.
+
+    Args:
+        merged: the map.
+        history: what has become of its maps by itself.
+    """
     whole = merged.union()
     probabilities = credences(merged)
     for link in merged.links:
@@ -40,6 +46,7 @@ def map_file_of(merged: MergedMap) -> MapFile:
         merged.rulings.made,
         merged.superseded,
         merged.faded,
+        tuple(history),
     )
 
 

@@ -113,8 +113,10 @@ class MapServer:
             self._bus, self._keys, self._store, self._name, self._upkeep.take, replay=self._upkeep.read
         )
         self._services = Services(
-            self._bus, self._keys, self._name, self._in_step, self._desk, self._blockages, self.status
-        )
+            self._bus, self._keys, self._name, self._in_step, self._desk, self._blockages, self.status,
+            # Wall time would make two files of one simulated drive differ.
+            lambda: () if self._settings.lockstep else self._chronicle.happenings,
+        )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._in_step, self._desk, self._rulings, self._upkeep.rule,
             # In lock-step whoever asks waits until all is merged.

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from hybridmap.errors import Busy, MapweaveError
+from hybridmap.history import Happening
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages
 from mapserver.desk import Desk
@@ -41,6 +42,7 @@ class Services:
         desk: Desk,
         blockages: Blockages,
         status: Callable[[], dict[str, Scalar]],
+        history: Callable[[], Iterable[Happening]],
     ) -> None:
         """Begin to answer.
 
@@ -52,11 +54,13 @@ class Services:
             desk: for questions that take long.
             blockages: takes note of where robots did not get through.
             status: of the server.
+            history: of the maps, for who takes them along.
         """
         self._answers = answers
         self._desk = desk
         self._blockages = blockages
         self._status = status
+        self._history = history
         self._closing: list[Closing] = [
             bus.serve(keys.relocalize(name), self._relocalize_later),
             bus.serve(keys.route(name), guarded(self._route)),
@@ -95,7 +99,7 @@ class Services:
         return encode_known_answer(answer)
 
     def _map(self, payload: bytes) -> bytes:
-        return pack_map_file(map_file_of(self._answers().merged))
+        return pack_map_file(map_file_of(self._answers().merged, self._history()))
 
     def _tell_status(self, payload: bytes) -> bytes:
         self._answers()

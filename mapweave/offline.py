@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hybridmap.errors import InvalidFile
+from hybridmap.history import Happening
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.ruling import Rulings
@@ -29,11 +30,13 @@ class Parts:
         maps: the robots' own, by id.
         rulings: all that people have ruled in any of the files.
         notes: what was left aside, one sentence each.
+        history: what any of the files tells that has become of the maps, in order.
     """
 
     maps: dict[MapId, HybridMap]
     rulings: Rulings
     notes: tuple[str, ...] = ()
+    history: tuple[Happening, ...] = ()
 
 
 def parts_of(files: Mapping[Path, MapFile]) -> Parts:
@@ -64,7 +67,9 @@ def parts_of(files: Mapping[Path, MapFile]) -> Parts:
                     notes.append(f"map {map_id} is taken from {path}, since that in {there} is older")
             maps[map_id], origin[map_id] = one, path
         rulings += Rulings(content.rulings)
-    return Parts(maps, rulings, tuple(notes))
+    told = {one for content in files.values() for one in content.history}
+    history = sorted(told, key=lambda one: (one.stamp_ns, one.kind, one.words))
+    return Parts(maps, rulings, tuple(notes), tuple(history))
 
 
 def _length(one: HybridMap) -> int:

@@ -34,7 +34,7 @@ class KeptHistory:
 
 def encode_history(happenings: Sequence[Happening]) -> bytes:
     """What has happened, in order; raises InvalidValue if it would not decode."""
-    data = pack({"h": [_pack(one) for one in happenings]})
+    data = pack({"h": [pack_happening(one) for one in happenings]})
     return _checked(data)
 
 
@@ -47,7 +47,7 @@ def encode_kept_history(kept: KeptHistory) -> bytes:
     """For a server's disk; raises InvalidValue if it would not decode."""
     data = pack(
         {
-            "h": [_pack(one) for one in kept.happenings],
+            "h": [pack_happening(one) for one in kept.happenings],
             "p": [[list(one) for one in sorted(part)] for part in kept.parts],
             "a": [[list(one), list(two)] for one, two in sorted(kept.apart)],
         }
@@ -68,23 +68,29 @@ def decode_kept_history(data: bytes) -> KeptHistory:
 
 
 def _happenings(reader: Reader) -> tuple[Happening, ...]:
-    return tuple(_read(reader, value) for value in reader.array("h", MAX_HAPPENINGS))
+    return read_happenings(reader, "h")
 
 
-def _pack(one: Happening) -> list[object]:
+def pack_happening(one: Happening) -> list[object]:
+    """A happening as a list."""
     return [one.stamp_ns, one.kind.value, one.words]
 
 
-def _read(reader: Reader, value: Any) -> Happening:
+def read_happenings(reader: Reader, name: str) -> tuple[Happening, ...]:
+    """A list of lists as happenings; raises InvalidMessage. Kinds of a newer program are left out."""
+    found = (_read(reader, value) for value in reader.array(name, MAX_HAPPENINGS))
+    return tuple(one for one in found if one is not None)
+
+
+def _read(reader: Reader, value: Any) -> Happening | None:
     parts = reader.as_array(value, "happening", 32)
     # More parts than are known here are a newer program's.
     if len(parts) < 3:
         raise reader.error(f"a happening has {len(parts)} parts instead of 3")
     kind = reader.as_text(parts[1], "kind", 16)
-    if kind not in set(Kind):
-        raise reader.error(f"kind {kind!r} is unknown")
     stamp_ns = reader.as_integer(parts[0], "stamp", 0, MAX_STAMP_NS)
-    return Happening(stamp_ns, Kind(kind), reader.as_text(parts[2], "words", MAX_WORDS))
+    words = reader.as_text(parts[2], "words", MAX_WORDS)
+    return Happening(stamp_ns, Kind(kind), words) if kind in set(Kind) else None
 
 
 def _maps(reader: Reader, value: Any) -> list[MapId]:

@@ -27,11 +27,13 @@ from numpy.typing import NDArray
 
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from hybridmap.history import Happening
 from hybridmap.node import Edge, NodeId
 from hybridmap.pose import PoseGaussian
 from hybridmap.ruling import Ruling
 from hybridmap.superseded import Superseded
 from wire.codec import MAX_BODY_BYTES, decode_body, encode_body
+from wire.history_codec import pack_happening, read_happenings
 from wire.landmark_codec import MAX_LANDMARKS
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import POSTURE, pack_posture, unpack_posture
@@ -80,6 +82,7 @@ class MapFile:
         rulings: of people on what shall not be linked, in order.
         superseded: of a merged map: nodes that newer ones stand for.
         faded: of a merged map: (N,) which of a node's N landmarks are thought to be gone.
+        history: of a merged map: what has become of its maps by itself, in order.
     """
 
     kind: Kind
@@ -90,6 +93,7 @@ class MapFile:
     rulings: tuple[Ruling, ...] = ()
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
+    history: tuple[Happening, ...] = ()
 
 
 def write_map_file(path: Path, content: MapFile) -> None:
@@ -189,6 +193,7 @@ def _pack(content: MapFile) -> bytes:
                 [list(node), np.packbits(gone, bitorder="little").tobytes()]
                 for node, gone in content.faded.items()
             ],
+            "history": [pack_happening(one) for one in content.history],
         }
     )
 
@@ -229,7 +234,8 @@ def _unpack(content: bytes) -> MapFile:
         for value in (reader.array("faded", MAX_ELEMENTS) if reader.has("faded") else [])
     )
     title = reader.text("title", MAX_TITLE)
-    return MapFile(kinds[name], title, changes, postures, refused, rulings, superseded, faded)
+    history = read_happenings(reader, "history") if reader.has("history") else ()
+    return MapFile(kinds[name], title, changes, postures, refused, rulings, superseded, faded, history)
 
 
 def _read_refused(reader: Reader, value: Any) -> RefusedPair:

@@ -21,7 +21,7 @@ def add_to(actions: Any) -> None:
         description="Say what has become of the maps that a running server keeps, oldest first: which became "
         "one, which came apart and what took their links away, which are kept apart since two robots cannot "
         "have been where their links say, and what people have ruled. The server keeps the newest 500 on its "
-        "disk, and every ruling. A map file (--map) holds what people have ruled.",
+        "disk, and every ruling; a map file (--map) holds what was known when it was written.",
     )
     parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
@@ -59,4 +59,5 @@ def _history(arguments: argparse.Namespace) -> tuple[Happening, ...]:
 
     if arguments.map is None:
         return decode_history(ask(arguments, Keys.any_history, b"")[0].payload)
-    return with_rulings((), Rulings(read_map_file(arguments.map).rulings))
+    content = read_map_file(arguments.map)
+    return with_rulings(content.history, Rulings(content.rulings))

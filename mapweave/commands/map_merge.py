@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = merge_settings(settings_of(arguments), arguments.settings)
     parts = parts_of({path: read_map_file(path) for path in arguments.files})
     merged = merged_with_progress(parts.maps, parts.rulings, settings)
-    write_map_file(arguments.out, map_file_of(merged))
+    write_map_file(arguments.out, map_file_of(merged, parts.history))
     joined = joinings((), merged)
     apart = [one.reason for one in explain_fleet(merged, 20) if not one.joined]
     if arguments.json:

@@ -80,6 +80,7 @@ def _settled(arguments: argparse.Namespace) -> None:
 
 def _rewrite(arguments: argparse.Namespace, ruling: Ruling) -> None:
     from hybridmap.ruling import Rulings
+    from mapserver.chronicle import between
     from mapserver.mapfiles import map_file_of, merged_of
     from mapweave.commands.map_merge import merged_with_progress
     from mapweave.commands.network import settings_of
@@ -92,9 +93,11 @@ def _rewrite(arguments: argparse.Namespace, ruling: Ruling) -> None:
     check_place(arguments.out or arguments.map)
     settings = merge_settings(settings_of(arguments), arguments.settings)
     content = read_map_file(arguments.map, "merged")
-    check_ruling(merged_of(content, settings), Rulings(content.rulings), ruling)
+    before = merged_of(content, settings)
+    check_ruling(before, Rulings(content.rulings), ruling)
     parts = parts_of({arguments.map: content})
     merged = merged_with_progress(parts.maps, parts.rulings + Rulings([ruling]), settings)
     out = arguments.out or arguments.map
-    write_map_file(out, map_file_of(merged))
+    history = (*parts.history, *between(before, merged, ruling.stamp_ns))
+    write_map_file(out, map_file_of(merged, history))
     print(f"{out}: {merged.summary()}")

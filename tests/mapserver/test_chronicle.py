@@ -201,6 +201,7 @@ def test_it_comes_through_bytes() -> None:
     assert decode_kept_history(encode_kept_history(kept)) == kept
     with pytest.raises(InvalidValue, match="printable"):
         encode_history([Happening(5, Kind.PARTED, "two\nlines")])
-    for fields in ({"h": [[1, "danced", "x"]]}, {"h": [[1, "joined"]]}, {"h": 5}, {}):
+    assert decode_history(pack({"h": [[1, "danced", "x"], [6, "failed", "no"]]})) == happenings[1:]
+    for fields in ({"h": [[1, "joined"]]}, {"h": [[1, 2, "x"]]}, {"h": 5}, {}):
         with pytest.raises(InvalidMessage):
             decode_history(pack(fields))

@@ -164,8 +164,13 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     assert "are one map" in out and links(path) == links(files[3])
     out = said("map", "explain", "r0.1", "r1.1", "--map", path)
     assert "anna ruled that they shall not" in out and "bob ruled that they may be linked again" in out
-    first, second = said("map", "history", "--map", path).splitlines()
-    assert "anna" in first and "two kitchens" in first and "bob" in second and " UTC  ruled " in first
+    lines = said("map", "history", "--map", path).splitlines()
+    kinds = [line.split("UTC  ")[1][:10].strip() for line in lines]
+    assert kinds == ["ruled", "parted", "ruled", "joined"]
+    assert all("anna" in line and "two kitchens" in line for line in lines[:2]) and "bob" in lines[2]
+    # What a file tells goes on into what is made of it, once.
+    said("map", "merge", path, files[3], "-o", tmp_path / "again.mapweave")
+    assert said("map", "history", "--map", tmp_path / "again.mapweave").splitlines() == lines
     assert said("map", "history", "--map", files[3]).startswith("nothing has joined")
     pair = links(path)[0]
     said("map", "unmerge", *pair, "--map", path, "-o", tmp_path / "one.mapweave")
