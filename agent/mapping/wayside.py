@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agent.observation import Observation, RobotDescription
+from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
 from hybridmap.ranges import Ranges
 from hybridmap.wake import FURTHEST, LONGEST, MOST, Wake
@@ -21,6 +22,15 @@ class WaysideSettings:
     """
 
     period: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no time.
+
+        Raises:
+            InvalidValue: the period is not positive.
+        """
+        if not self.period > 0.0:
+            raise InvalidValue(f"wayside: a period of {self.period:g} s; it must be more than 0")
 
 
 class Wayside:

@@ -10,6 +10,7 @@ import pytest
 from agent.mapping.mapper import Mapper
 from agent.mapping.wayside import Wayside, WaysideSettings
 from agent.observation import Observation, Odometry
+from hybridmap.errors import InvalidValue
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 from hybridmap.wake import MOST
@@ -107,3 +108,9 @@ def test_a_mapped_drive_leaves_a_wake_where_the_robot_was(walls, clocked):
     # The next node begins with none of it.
     mapper.finish(replace(observation, stamp_ns=observation.stamp_ns + 1))
     assert sum(len(one.wake) for one in mapper.map.nodes.values()) == 3
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, np.nan])
+def test_a_period_that_is_no_time_is_refused(period):
+    with pytest.raises(InvalidValue, match="wayside"):
+        WaysideSettings(period)
