@@ -47,7 +47,7 @@ def partings(
         )
         for part in parts[1:]:
             lost = _refused_now(part, whole, after) if links is None else _lost(part, links, after)
-            out.append(f"{_named(parts[0])} and {_named(part)} are no longer one map: {lost}")
+            out.append(f"{_briefly(parts[0])} and {_briefly(part)} are no longer one map: {lost}")
     return tuple(out)
 
 
@@ -82,18 +82,15 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
             n = next((n for n in left if counts[n]), left[0])
             left.remove(n)
             by = _links(counts[n]) if counts[n] else "way of others"
-            out.append(f"{_briefly(joined)} and {_named(parts[n])} are one map now, by {by}")
+            out.append(f"{_briefly(joined)} and {_briefly(parts[n])} are one map now, by {by}")
             joined, counts = joined | parts[n], counts + ties.get((k, n), Counter())
     return tuple(out)
 
 
 def _briefly(maps: frozenset[MapId]) -> str:
-    return _named(maps) if len(maps) <= MOST_NAMED else f"{len(maps)} maps with {min(maps)}"
-
-
-def _named(maps: Iterable[MapId]) -> str:
-    names = [str(one) for one in sorted(maps)]
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} with {names[-1]}"
+    """For example `r0.1+r2.1`: with `and` nobody would know which are on which side."""
+    named = "+".join(str(one) for one in sorted(maps))
+    return named if len(maps) <= MOST_NAMED else f"{len(maps)} maps with {min(maps)}"
 
 
 def _refused_now(part: frozenset[MapId], whole: frozenset[MapId], after: MergedMap) -> str:

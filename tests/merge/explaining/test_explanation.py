@@ -303,9 +303,25 @@ def test_what_joins_at_once_is_told_map_by_map_and_each_link_once() -> None:
     merged = merger.merged()
     assert len(merged.components) == 1
     told = joinings((), merged)
-    assert told[0].startswith("a.1 and ") and told[-1].startswith("5 maps with a.1 and ") and len(told) == 5
+    assert (
+        told[0].startswith("a.1 and ")
+        and told[1].startswith("a.1+")
+        and told[-1].startswith("5 maps with a.1 and ")
+        and len(told) == 5
+    )
     count = sum(int(words.rsplit(" by ", 1)[1].split()[0]) for words in told)
     assert count == sum(not link.within for link in merged.links)
+
+
+def test_of_many_maps_that_part_the_number_is_told() -> None:
+    one = MapId("a", 1)
+    node = NodeId(*one, 1)
+    sides = [[MapId(f"{side}{k}", 1) for k in range(count)] for side, count in (("x", 300), ("y", 2))]
+    maps = {name: HybridMap() for side in sides for name in side}
+    parts = tuple(frozenset(node._replace(agent=name.agent) for name in side) for side in sides)
+    apart = MergedMap(maps, (), (), parts, {})
+    (words,) = partings([frozenset(maps)], [], apart)
+    assert words.startswith("300 maps with x0.1 and y0.1+y1.1 are no longer one map: ")
 
 
 def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
