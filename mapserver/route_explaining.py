@@ -21,7 +21,7 @@ from merge.graph.merged import MergedMap
 
 TOLL = 1e4
 """What a gap costs where as few as possible are looked for, m: more than any way through a building."""
-CLEARLY = 0.1
+CLEARLY = 0.01
 """A way that is not driven is told of if it is cheaper by more than this, m."""
 WORDS = {
     "mapped": "its robot drove here while it mapped",
@@ -98,10 +98,10 @@ def _why(router: Router, found: Route, best: Route, hops: tuple[Hop, ...], gaps:
     """Of a way that was found."""
     steps = "1 step" if len(hops) == 1 else f"{len(hops)} steps"
     length = sum(hop.distance for hop in hops)
-    reason = f"{steps} over {length:.1f} m, cost {found.cost:.1f} m"
+    reason = f"{steps} over {length:.1f} m, cost {found.cost:.2f} m"
     if gaps:
         many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-        reason += f"; a way for {best.cost:.1f} m has {many} that robots do not drive"
+        reason += f"; a way for {best.cost:.2f} m has {many} that robots do not drive"
     else:
         reason += "; no cheaper one is known, not even over what nobody drives"
     older = sum(node in router.merged.superseded for node in found.nodes[1:-1])

@@ -15,7 +15,7 @@ import pytest
 from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidFile, InvalidValue
-from hybridmap.explanation import MapsExplanation, Standing
+from hybridmap.explanation import MapsExplanation, RouteExplanation, Standing
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ends, Ruling
@@ -43,6 +43,8 @@ from wire.keys import Keys
 from wire.log_messages import decode_record
 from wire.mapfile import MapFile, pack_map_file, unpack_map_file
 from wire.memory import MemoryBus, MemoryHub
+from wire.messages import RouteRequest, encode_route_request
+from wire.route_explanation import decode_route_explanation
 
 A, B = MapId("a", 1), MapId("b", 1)
 KEYS = Keys("fleet")
@@ -156,6 +158,23 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
         unknown = ExplainRequest((NodeId("z", 1, 1), pair[0]))
         reply = asker.ask(KEYS.explain("s0"), encode_explain_request(unknown))
         assert "there is no map z.1; known are: a.1, b.1" in reply.error
+
+
+def test_where_a_robot_did_not_get_through_is_known_when_somebody_asks_for_the_way(path: Path) -> None:
+    one, two = NodeId("a", 1, 1), NodeId("a", 1, 3)
+    with serving(path) as asker:
+
+        def way() -> RouteExplanation:
+            request = encode_explain_request(ExplainRequest((one, two), route=True))
+            return decode_route_explanation(asker.ask(KEYS.explain("s0"), request).payload)
+
+        free = way()
+        assert free.found and not free.gaps and [hop.b for hop in free.hops] == [two]
+        blocked = encode_route_request(RouteRequest(one, two, ((one, two),)))
+        assert not asker.ask(KEYS.route("s0"), blocked).error
+        told = way()
+        assert told.found and any("of late" in hop.words for hop in (*told.hops, *told.gaps))
+        assert [hop.b for hop in told.gaps] == [two] and sum(h.cost for h in told.hops) > free.hops[0].cost
 
 
 def test_what_is_undone_stays_undone_when_the_server_is_started_again(

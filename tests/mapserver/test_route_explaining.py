@@ -100,7 +100,7 @@ def test_the_way_is_the_one_that_robots_are_given(router: Router) -> None:
         assert hop.distance == pytest.approx(leg.previous_from_node.mean.distance(Pose2()))
         assert hop.turn == pytest.approx(leg.previous_from_node.mean.heading, abs=1e-9)
     assert not told.gaps and "no cheaper one is known" in told.reason
-    assert f"cost {sum(hop.cost for hop in told.hops):.1f} m" in told.reason
+    assert f"cost {sum(hop.cost for hop in told.hops):.2f} m" in told.reason
 
 
 def test_what_is_blocked_is_told_whether_there_is_another_way_or_none(router: Router) -> None:
