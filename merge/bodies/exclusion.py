@@ -28,7 +28,8 @@ from hybridmap.pose import Array
 from merge.bodies.absence import AbsenceSettings, absence
 from merge.bodies.clash import Clash
 from merge.bodies.draws import DRAWS, drawn
-from merge.bodies.sight import Looking, SightSettings, errors_in_common, looking, none_wrong, odds_against
+from merge.bodies.looking import Looking, looking
+from merge.bodies.sight import SightSettings, errors_in_common, none_wrong, odds_against
 from merge.bodies.trails import Trail, TrailSettings, stay
 from merge.graph.posegraph import PoseGraph
 

@@ -15,7 +15,8 @@ from hybridmap.ranges import Ranges
 from hybridmap.wake import Wake
 from merge.bodies.draws import drawn
 from merge.bodies.exclusion import clash_of
-from merge.bodies.sight import Looking, SightSettings, errors_in_common, none_wrong, odds_against
+from merge.bodies.looking import Looking
+from merge.bodies.sight import SightSettings, errors_in_common, none_wrong, odds_against
 from merge.bodies.trails import trails_of
 from merge.graph.posegraph import Measurement, PoseGraph, solve_graph
 
