@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.history import Happening, Kind
@@ -72,14 +72,16 @@ class Chronicle:
         if not merged.maps:
             return  # Nothing is read yet: what was one is no less so.
         before, now = self._kept.parts, tuple(joined_maps(merged))
-        joined, parted = joinings(before, merged), partings(before, self._links, merged)
+        same = now == before
+        joined = () if same else joinings(before, merged)
+        parted = () if same else partings(before, self._links, merged)
         apart = _kept_apart(merged, now)
+        was_in, is_in = _part_of(before), _part_of(now)
+        # Until two maps are one nothing new is told of them, and beyond the most nothing at all.
+        still = {(a, b) for a, b in self._kept.apart if is_in.get(a, -1) != is_in.get(b, -2)}
+        new = [pair for pair in apart if pair not in still][: MOST_APART - len(still)]
         # Of what has just parted it is told already what stands between.
-        held = [
-            words
-            for pair, words in apart.items()
-            if pair not in self._kept.apart and not any(part.issuperset(pair) for part in before)
-        ]
+        held = [apart[a, b] for a, b in new if was_in.get(a, -1) != was_in.get(b, -2)]
         for words in joined:
             log.info("%s", words)
         for words in (*parted, *held):
@@ -90,9 +92,7 @@ class Chronicle:
             *_briefly(Kind.KEPT_APART, held),
             *_briefly(Kind.PARTED, parted),
         ]
-        # Until the two are one nothing new is told of them.
-        still = {pair for pair in self._kept.apart if not any(part.issuperset(pair) for part in now)}
-        known = frozenset(sorted(still | apart.keys())[:MOST_APART])
+        known = frozenset(still | set(new))
         self._links = merged.links
         if fresh or now != before or known != self._kept.apart:
             self._keep(fresh, now, known)
@@ -127,9 +127,13 @@ def between(before: MergedMap, after: MergedMap, stamp_ns: int) -> tuple[Happeni
     return tuple(Happening(stamp_ns, kind, _one_line(words)) for kind, words in fresh)
 
 
+def _part_of(parts: Iterable[frozenset[MapId]]) -> dict[MapId, int]:
+    return {one: number for number, part in enumerate(parts) for one in part}
+
+
 def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pair, str]:
     """Two maps that are not one, since two robots cannot have been where the links between them say."""
-    part_of = {one: number for number, part in enumerate(parts) for one in part}
+    part_of = _part_of(parts)
     reasons: dict[Pair, Counter[str]] = {}
     speaks_of_bodies: dict[str, bool] = {}
     for r in merged.refused:

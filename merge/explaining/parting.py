@@ -42,9 +42,8 @@ def partings(
     part_of = {one: part for part in joined_maps(after) for one in part}
     out: list[str] = []
     for whole in before:
-        parts = sorted(
-            {part_of[one] & whole for one in whole if one in part_of}, key=lambda p: (-len(p), min(p))
-        )
+        met = {part_of[one] for one in whole if one in part_of}
+        parts = sorted({part & whole for part in met}, key=lambda p: (-len(p), min(p)))
         for part in parts[1:]:
             lost = _refused_now(part, whole, after) if links is None else _lost(part, links, after)
             out.append(f"{_briefly(parts[0])} and {_briefly(part)} are no longer one map: {lost}")
@@ -64,7 +63,7 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
     part_of = {one: part for part in before for one in part}
     wholes = []
     for whole in joined_maps(after):
-        known = {part_of[one] & whole for one in whole if one in part_of}
+        known = {part & whole for part in {part_of[one] for one in whole if one in part_of}}
         news = [frozenset([one]) for one in sorted(whole) if one not in part_of]
         wholes.append([*sorted(known, key=lambda p: (-len(p), min(p))), *news])
     seat = {one: (k, n) for k, parts in enumerate(wholes) for n, part in enumerate(parts) for one in part}

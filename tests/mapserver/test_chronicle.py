@@ -144,6 +144,25 @@ def test_who_cannot_have_been_there_is_told_until_the_maps_are_one(
     assert "same place at the same time" in again.newest
 
 
+def test_however_many_are_kept_apart_each_is_told_once(
+    one: MergedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mapserver.chronicle.MOST_APART", 3)
+    (link, *_) = (link for link in one.links if {link.a.map, link.b.map} == {A, B})
+    names = [MapId(f"r{k}", 1) for k in range(6)]
+    reason = Clash("a", "b", "hall", 40, 0.1, 12.0, 99.0).reason
+    refused = tuple(
+        refuse(replace(link, a=link.a._replace(agent="r0"), b=link.b._replace(agent=name.agent)), reason)
+        for name in names[1:]
+    )
+    parts = tuple(frozenset([link.a._replace(agent=name.agent)]) for name in names)
+    merged = MergedMap(dict.fromkeys(names, one.maps[A]), (), refused, parts, {})
+    chronicle = Chronicle()
+    for _ in range(3):
+        chronicle.follow(merged)
+    assert [kind for kind, _ in told(chronicle)] == [Kind.KEPT_APART] * 3
+
+
 def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> None:
     other = Merger()
     for map_id in (A, B):
