@@ -16,6 +16,7 @@ from hybridmap.change import NodePut
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
+from hybridmap.wake import Wake
 from merge.bodies.clash import Clash
 from merge.bodies.exclusion import ExclusionSettings, clash_of
 from merge.bodies.sight import SightSettings
@@ -111,6 +112,45 @@ def test_twins_should_have_seen_each_other(seed: int) -> None:
     assert f"{found.first} would have seen {found.second} " in found.reason
     assert f"m {found.where} at {found.time:.1f} s of clock" in found.reason
     assert f"its sensors saw nothing there, {found.moments} such moments" in found.reason
+
+
+def with_wakes(walks: Walks, every: int = 5) -> None:
+    """Of each robot's nodes one in five stays; the others become moments of its wake."""
+    kept = []
+    for name in ("r0", "r1"):
+        nodes = [node for node in walks.nodes if node.id.agent == name]
+        for k in range(0, len(nodes), every):
+            node, after = nodes[k], nodes[k + 1 : k + every]
+            beside = [(walks.truth[node.id].inverse() @ walks.truth[one.id]).vector for one in after]
+            wake = Wake(
+                np.array([(one.stamp_ns - node.stamp_ns) / 1e9 for one in after]),
+                np.array(beside).reshape(-1, 3),
+                np.array([one.ranges.distances for one in after]).reshape(-1, len(node.ranges)),
+            )
+            kept.append(replace(node, wake=wake))
+    walks.nodes = kept
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
+    """What nodes alone do not tell, or hardly, their wakes do; the same looks in other hands."""
+    walks = Walks("twins", seed, (0, 1), 150)
+    all_nodes = walks.clash(between_twins(seed))
+    with_wakes(walks)
+    found = walks.clash(between_twins(seed))
+    walks.nodes = [replace(node, wake=Wake()) for node in walks.nodes]
+    bare = walks.clash(between_twins(seed))
+    assert all_nodes is not None and found is not None and found.evidence > 6.9
+    assert bare is None or bare.moments < found.moments / 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_robots_in_one_room_are_not_refused_for_what_they_saw_on_the_way(seed: int) -> None:
+    """Neither where they meet, nor where the second is taken to be elsewhere by a few centimetres."""
+    walks = Walks("arena", seed, (0, 0), 100, length=4.0, width=3.0)
+    with_wakes(walks)
+    assert walks.clash(settings=ExclusionSettings(doubt=0.9, least_witnesses=1)) is None
+    assert walks.clash(moved=0.05) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
