@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ def add_to(actions: Any) -> None:
         help="as if a robot could not get through between these two; may be given again",
     )  # fmt: skip
     parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
+    parser.add_argument("--draw", type=Path, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--timeout", type=float, default=20.0, metavar="S", help="longest wait for an answer")
     add_network(parser)
@@ -46,8 +48,39 @@ def run(arguments: argparse.Namespace) -> int:
     start, goal = node_of(arguments.start), node_of(arguments.goal)
     blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
     told = explained_route(arguments, start, goal, blocked)
-    print(json.dumps(route_values(told)) if arguments.json else "\n".join(route_words(told)))
+    values, lines = route_values(told), route_words(told)
+    if arguments.draw is not None and told.found:
+        draw_route(arguments, told)
+        values["picture"] = str(arguments.draw)
+        lines.append(f"  picture   {arguments.draw}")
+    print(json.dumps(values) if arguments.json else "\n".join(lines))
+    if arguments.draw is not None and not told.found:
+        print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
     return 0 if told.found else 2
+
+
+def draw_route(arguments: argparse.Namespace, told: RouteExplanation) -> None:
+    """Draw a way on the part of the map through which it leads."""
+    import numpy as np
+
+    from hybridmap.hybrid_map import HybridMap
+    from mapweave.commands.map_ends import ask
+    from mapweave.picture import Drive, MapPicture, draw_map
+    from wire.keys import Keys
+    from wire.mapfile import read_map_file, unpack_map_file
+
+    if arguments.map is None:
+        content = unpack_map_file(ask(arguments, Keys.any_server_map, b"")[0].payload)
+    else:
+        content = read_map_file(arguments.map, "merged")
+    part, _ = content.postures[told.start]
+    postures = {node: p.mean for node, (number, p) in content.postures.items() if number == part}
+    way = [postures[node] for node in (told.start, *(hop.b for hop in told.hops))]
+    places = np.array([[pose.x, pose.y] for pose in way])
+    drive = Drive(places, way[0], way[-1], "the way", begun="start")
+    title = f"{told.start} to {told.goal}\n{told.reason}"
+    edges = list(HybridMap(content.changes).edges.values())
+    draw_map(MapPicture(title, postures, edges, drives=[drive]), arguments.draw)
 
 
 def explained_route(
