@@ -336,6 +336,8 @@ def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_
         ways = [
             json.loads(said("map", "route", *pair, "--json", *where)) for where in (("--map", files[3]), at)
         ]
+        said("map", "route", *pair, "--draw", tmp_path / "way.png", *at)
+        assert (tmp_path / "way.png").stat().st_size > 10_000
         assert ways[0]["found"] and [hop["b"] for hop in ways[0]["hops"]] == [h["b"] for h in ways[1]["hops"]]
         out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", *at)
         assert "r0.1 and r1.1 are not one map: undone with all links" in out
