@@ -88,7 +88,7 @@ def draw_fleet(
     truth: dict[NodeId, Pose2] = {}
     for k in range(s.robots):
         map_id = MapId(f"r{k}", 1)
-        walk = _walk(s, rng)
+        walk = walk_of(s, rng)
         maps[map_id] = map_of(map_id, walk, rng)
         truth |= {NodeId(map_id.agent, 1, n): posture for n, posture in enumerate(walk)}
     true = _true_links(truth, s, rng)
@@ -118,7 +118,7 @@ def map_of(map_id: MapId, walk: list[Pose2], rng: np.random.Generator) -> Hybrid
     return one
 
 
-def _walk(s: FleetSettings, rng: np.random.Generator) -> list[Pose2]:
+def walk_of(s: FleetSettings, rng: np.random.Generator) -> list[Pose2]:
     """Steps of 0.7 m with turns, and turns about at the walls."""
     here = Pose2.from_vector(rng.uniform([1.0, 1.0, -math.pi], [s.side - 1.0, s.side - 1.0, math.pi]))
     walk = [here]
@@ -141,7 +141,8 @@ def _pairs(truth: dict[NodeId, Pose2], s: FleetSettings) -> tuple[list[NodeId], 
     return nodes, np.triu(other, 1), far
 
 
-def _link(a: NodeId, b: NodeId, a_from_b: Pose2, rng: np.random.Generator) -> Link:
+def link_between(a: NodeId, b: NodeId, a_from_b: Pose2, rng: np.random.Generator) -> Link:
+    """A link that is off by about `LINK_SIGMAS`, with as many landmarks as links have."""
     measured = a_from_b @ Pose2.from_vector(rng.normal(0, LINK_SIGMAS))
     evidence = {"inliers": float(rng.integers(15, 50)), "share": float(rng.uniform(0.4, 0.9))}
     return Link(a, b, PoseGaussian(measured, np.diag(LINK_SIGMAS**2)), evidence=evidence)
@@ -154,7 +155,7 @@ def _true_links(truth: dict[NodeId, Pose2], s: FleetSettings, rng: np.random.Gen
     found = np.argwhere(other & (far < s.same) & (turn < math.radians(30.0)))
     chosen = rng.permutation(found)[: s.true_links]
     ends = [(nodes[i], nodes[j]) for i, j in chosen]
-    return [_link(a, b, truth[a].inverse() @ truth[b], rng) for a, b in ends]
+    return [link_between(a, b, truth[a].inverse() @ truth[b], rng) for a, b in ends]
 
 
 def _false_links(
@@ -178,5 +179,5 @@ def _false_links(
             fresh = one in truth and two in truth and (one, two) not in taken
             if fresh and one < two and len(links) < wanted:
                 taken.add((one, two))
-                links.append(_link(one, two, truth[one].inverse() @ moved @ truth[two], rng))
+                links.append(link_between(one, two, truth[one].inverse() @ moved @ truth[two], rng))
     return links

@@ -192,7 +192,9 @@ class Merger:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
-            merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
+            merged = self._islands.merge(
+                self._kept, self._verdicts, self._touched, self._rulings, self._succession.past
+            )
             renewed = self._renewer.renewed(merged)
             self._succession.follow(renewed.superseded)
             self._merged = self._fader.fade(renewed)

@@ -6,7 +6,7 @@ another, so an island that nothing has touched is kept as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import replace
 
 import networkx as nx
@@ -87,6 +87,7 @@ class Islands:
         verdicts: Verdicts,
         touched: set[MapId],
         rulings: Rulings,
+        past: Set[NodeId] = frozenset(),
     ) -> MergedMap:
         """Merge.
 
@@ -96,6 +97,8 @@ class Islands:
             touched: maps that were replaced, or with a node of which the verdicts have changed, since this
                 was called last.
             rulings: of people.
+            past: nodes of another day for which others stand. Where they are many, what was decided of their
+                links stands, see `merge.incremental.doubts`.
 
         Returns:
             What `merge_maps` makes of all maps.
@@ -121,16 +124,22 @@ class Islands:
             known = before.get(island)
             if known is None or island & touched:
                 inside = {one: maps[one] for one in sorted(island)}
-                if sum(len(one.nodes) for one in inside.values()) <= self._how.anew_up_to:
+                if self._quick(inside, past):
                     self._steps.pop(island, None)
                     known = self._anew(inside, verdicts.among(island))
                 else:
-                    known = self._step(inside, verdicts, news, before)
+                    known = self._step(inside, verdicts, news, before, past)
             self._merged[island] = known
         self._steps = {island: one for island, one in self._steps.items() if island in self._merged}
         self._resumed = Decided()
         island_of = {one: island for island in islands for one in island}
         return _together(list(self._merged.values()), maps, verdicts.across(island_of), rulings)
+
+    def _quick(self, maps: Mapping[MapId, HybridMap], past: Set[NodeId]) -> bool:
+        """Whether maps are few enough to be merged anew."""
+        nodes = [node for one in maps.values() for node in one.nodes]
+        old = sum(node in past for node in nodes)
+        return len(nodes) <= self._how.anew_up_to and old <= self._how.past_share * len(nodes)
 
     def _ties(self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts) -> list[frozenset[MapId]]:
         """Islands: maps that links or drives tie together."""
@@ -152,6 +161,7 @@ class Islands:
         verdicts: Verdicts,
         news: set[MapPair],
         before: Mapping[frozenset[MapId], MergedMap],
+        past: Set[NodeId],
     ) -> MergedMap:
         """The next step of an island, of which parts may have been merged anew until now."""
         known = [one for one in self._steps.values() if one.maps & maps.keys()]
@@ -161,12 +171,12 @@ class Islands:
             if any(node in self._resumed.places for one in maps.values() for node in one.nodes):
                 steps.resume(maps, self._resumed, verdicts, self._rulings)
                 news = news | verdicts.at(maps.keys())
-        strange = maps.keys() - steps.maps
+        strange = maps.keys() - steps.maps - self._rulings.retired.keys()
         for island in sorted(before, key=min):
             if island & strange:
                 steps.begin(before[island], strange, verdicts, self._rulings)
-        merged = steps.step(maps, verdicts, news | verdicts.at(strange), self._rulings)
-        self._steps[steps.maps] = steps
+        merged = steps.step(maps, verdicts, news | verdicts.at(strange), self._rulings, past)
+        self._steps[frozenset(maps)] = steps
         return merged
 
     def _anew(self, maps: Mapping[MapId, HybridMap], verdicts: Iterable[Verdict]) -> MergedMap:

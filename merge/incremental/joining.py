@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from hybridmap.node import MapId, NodeId
 from merge.belief.groups import LinkGroup
 from merge.belief.memory import Memory
+from merge.graph.candidates import Pair
 from merge.incremental.judgement import Judge
 from merge.incremental.ledger import Ledger
 from merge.incremental.sheets import Assembly, MapPair, Sheet
@@ -26,7 +27,7 @@ def join(
     settings: MergeSettings,
     memory: Memory,
     settle: Settle,
-) -> tuple[Assembly, int]:
+) -> tuple[Assembly, int, set[Pair]]:
     """Believe links that the components bear out, and join components, as long as any can be.
 
     Args:
@@ -40,7 +41,8 @@ def join(
         settle: optimises after each round.
 
     Returns:
-        The graph then, and how many links more are believed.
+        The graph then, how many links more are believed, and those that are not although they agree with each
+        other beyond chance.
     """
     waiting = Waiting(ledger.waiting, whole)
     judge = Judge(settings, memory, sheets, groups, waiting)
@@ -54,7 +56,8 @@ def join(
         ledger.tell(refused)
         if not believed:
             if last:
-                return whole, count
+                left = (pair for waits in ledger.waiting.values() for pair in waits)
+                return whole, count, judge.agreed.intersection(left)
             whole = settle(whole, set(), True)
             open_, last = set(heard), True
             continue

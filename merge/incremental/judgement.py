@@ -30,7 +30,12 @@ Join = tuple[NodeId, NodeId, Pose2]
 
 
 class Judge:
-    """Says which links of one step are believed."""
+    """Says which links of one step are believed.
+
+    Attributes:
+        agreed: links that agree with others of their maps beyond chance: if they are not believed, something
+            contradicts them.
+    """
 
     def __init__(
         self,
@@ -49,6 +54,7 @@ class Judge:
             groups: sorted links by maps, as they were judged last; those that are judged now are put there.
             waiting: links that are not believed yet.
         """
+        self.agreed: set[Pair] = set()
         self._settings = settings
         self._memory = memory
         self._sheets = sheets
@@ -110,6 +116,7 @@ class Judge:
         for maps in between:
             for every, some in zip((agreed, own, loops), self._tell(maps, heard), strict=True):
                 every |= some
+        self.agreed |= agreed
         inside = self._waiting.inside(between, whole)
         graphs: dict[int, WideGraph] = {}
         kept = [link for links in inside.values() for link in links if link.pair in own]

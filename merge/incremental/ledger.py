@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import replace
 
 from hybridmap.node import MapId, NodeId
@@ -16,6 +16,8 @@ from merge.graph.merged import MergedMap
 from merge.incremental.sheets import Bundle, MapPair, Sheet
 from merge.incremental.verdicts import Verdicts
 from merge.undoing import reason_of
+
+PAST = "others stand for a node of it since another day: it is heard again when all is decided again"
 
 
 class Ledger:
@@ -39,6 +41,8 @@ class Ledger:
         self.bundles: dict[MapPair, Bundle] = {}
         self.waiting: dict[MapPair, dict[Pair, Link]] = {}
         self.refused: dict[MapPair, dict[Pair, RefusedLink]] = {}
+        self._past: Set[NodeId] = frozenset()
+        self._labels: Mapping[NodeId, int] = {}
         self._links: dict[Pair, tuple[Link, Link]] = {}
         self._fallen: dict[Pair, tuple[Link, str]] = {}
 
@@ -76,6 +80,24 @@ class Ledger:
         for maps, here in links.items():
             self._believe(maps, here)
 
+    def hold(self, past: Set[NodeId], labels: Mapping[NodeId, int]) -> None:
+        """Let stand what was decided of links at these nodes, believed or not, within a component.
+
+        Those between components wait all the same: they may be what joins them one day.
+
+        Args:
+            past: nodes of another day for which others stand.
+            labels: which component each node is in.
+        """
+        self._past, self._labels = past, labels
+
+    def stands(self, pair: Pair) -> bool:
+        """Whether what was decided of a link stands."""
+        if self._past.isdisjoint(pair):
+            return False
+        first, second = (self._labels.get(node) for node in pair)
+        return first is not None and first == second
+
     def forget(self, maps: MapPair) -> None:
         """Maps that are in one island no longer."""
         for known in (self.bundles, self.waiting, self.refused):
@@ -103,6 +125,7 @@ class Ledger:
         first, second = self._sheets[maps[0]], self._sheets[maps[1]]
         refused: dict[Pair, RefusedLink] = {}
         waiting: dict[Pair, Link] = {}
+        before = self.refused.get(maps, {})
         believed = self.believed(maps)
         kept: dict[Pair, Link] = {}
         for pair, verdict in verdicts.between(maps).items():
@@ -118,20 +141,40 @@ class Ledger:
                 refused[pair] = refuse(verdict, fallen[1])
             elif pair in believed and believed[pair].a_from_b is verdict.a_from_b:
                 kept[pair] = self._links[pair][1]
+            elif self.stands(pair):
+                refused[pair] = before[pair] if pair in before else refuse(verdict, PAST)
             else:
                 waiting[pair] = self._links[pair][1]
         lost = set(believed.keys() - kept.keys())
         self._believe(maps, kept)
-        told = {pair: known for pair, known in self.refused.get(maps, {}).items() if pair in waiting}
+        told = {pair: known for pair, known in before.items() if pair in waiting}
         self.waiting[maps], self.refused[maps] = waiting, {**told, **refused}
         return lost
 
     def doubt_all(self) -> set[MapPair]:
-        """Forget what was decided, one link after the other: all shall be weighed and reviewed again."""
+        """Forget what was decided, one link after the other: all shall be weighed and reviewed again.
+
+        What is held stands.
+
+        Returns:
+            Maps between which anything is doubted.
+        """
         known = set(self.waiting)
-        for one in (self._fallen, self.bundles, self.refused, self._links):
-            one.clear()
-        return known
+        if not self._past:
+            for one in (self._fallen, self.bundles, self.refused, self._links):
+                one.clear()
+            return known
+        self._fallen = {pair: why for pair, why in self._fallen.items() if self.stands(pair)}
+        doubted = set()
+        for maps in known:
+            links = self.believed(maps)
+            stands = {pair: link for pair, link in links.items() if self.stands(pair)}
+            told = {pair: why for pair, why in self.refused.get(maps, {}).items() if self.stands(pair)}
+            if self.waiting[maps] or len(stands) < len(links) or len(told) < len(self.refused.get(maps, {})):
+                doubted.add(maps)
+                self._believe(maps, stands)
+                self.refused[maps] = told
+        return doubted
 
     def tell(self, refused: Iterable[tuple[Link, str]]) -> None:
         """Take note of why links wait."""

@@ -14,6 +14,7 @@ class StepSettings:
     Attributes:
         anew_up_to: islands of as many nodes are merged anew whenever they change, so that the outcome is
             exactly that of one merge.
+        past_share: if they have no greater share of nodes of another day for which others stand.
         whole_share: everything is decided again when so many measurements have come or gone since it was last
             done, as a share of all.
         whole_up_to: islands of more nodes are decided again beside the steps, for it would hold these up (see
@@ -23,6 +24,7 @@ class StepSettings:
     """
 
     anew_up_to: int = 600
+    past_share: float = 0.3
     whole_share: float = 0.1
     whole_up_to: int = 3000
     optimise_share: float = 0.01

@@ -153,6 +153,11 @@ class Assembly:
         """Of the component of a node."""
         return int(self.labels[self.row(node)])
 
+    def label_of(self) -> dict[NodeId, int]:
+        """Of the component of each node."""
+        nodes = (node for one in self._maps for node in self._sheets[one].nodes)
+        return dict(zip(nodes, self.labels.tolist(), strict=True))
+
     def anchors(self) -> Rows:
         """The row of the smallest node of each component: rows are in the order of ids."""
         out: Rows = np.unique(self.labels, return_index=True)[1]

@@ -18,17 +18,17 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Rulings
-from merge.belief.drives import refuse_drives
 from merge.belief.groups import LinkGroup
 from merge.belief.memory import Memory
 from merge.graph.links import Link, RefusedLink
-from merge.graph.merged import MergedMap, Postures
+from merge.graph.merged import MergedMap
 from merge.incremental.clashes import falling
 from merge.incremental.decided import Decided
+from merge.incremental.doubts import Doubts
 from merge.incremental.factors import Rows
-from merge.incremental.graph import WideGraph
 from merge.incremental.joining import join
 from merge.incremental.ledger import Ledger, ends_of
+from merge.incremental.outcome import outcome
 from merge.incremental.relaxing import RelaxSettings, relax
 from merge.incremental.settings import StepSettings
 from merge.incremental.sheets import Assembly, MapPair, Sheet
@@ -58,7 +58,8 @@ class Steps:
         self._ledger = Ledger(self._sheets, settings.consistency)
         self._own: dict[MapId, list[RefusedLink]] = {}
         self._groups: dict[MapPair, list[LinkGroup]] = {}
-        self._since, self._rough, self._plain = 0, 0, True
+        self._rough, self._plain = 0, True
+        self._doubts = Doubts(steps)
         self._touched: set[NodeId] = set()
         self._ruled: Rulings | None = None
         self._moved: Rows = np.zeros(0, np.int64)
@@ -71,21 +72,16 @@ class Steps:
 
     @property
     def stale(self) -> bool:
-        """Whether everything should be decided again, and no step does it."""
-        return not self._small and self._changed_enough()
-
-    @property
-    def _small(self) -> bool:
-        return sum(len(sheet.nodes) for sheet in self._sheets.values()) <= self._steps.whole_up_to
-
-    def _changed_enough(self) -> bool:
-        return self._since > self._steps.whole_share * max(len(self._all.factors), 1)
+        """Whether something should be decided again, and no step does it."""
+        return self._doubts.due and not self._doubts.within
 
     def begin(self, merged: MergedMap, some: Set[MapId], verdicts: Verdicts, rulings: Rulings) -> None:
         """Take over what was merged otherwise of some maps: which links are believed, and where nodes are."""
         for map_id in sorted(some & merged.maps.keys()):
             one = merged.maps[map_id]
-            self._place(map_id, one, rulings, {node: merged.pose(node) for node in one.nodes})
+            # One that was retired until now is nowhere.
+            known = {n: merged.pose(n) for n in one.nodes if merged.component_of(n) is not None}
+            self._place(map_id, one, rulings, known)
             # What held them where they are may not have come along.
             self._touched |= one.nodes.keys()
         self._ledger.begin(merged, verdicts)
@@ -100,10 +96,15 @@ class Steps:
             )
             self._touched |= one.nodes.keys()
         self._ledger.resume(decided.believed, verdicts)
-        self._since = self._rough = 0
+        self._doubts.since = self._rough = 0
 
     def step(
-        self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, news: Iterable[MapPair], rulings: Rulings
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        news: Iterable[MapPair],
+        rulings: Rulings,
+        past: Set[NodeId] = frozenset(),
     ) -> MergedMap:
         """Merge what has changed.
 
@@ -112,40 +113,51 @@ class Steps:
             verdicts: on pairs of their nodes.
             news: between which maps verdicts or rulings have changed since the last step.
             rulings: of people.
+            past: nodes of another day for which others stand, see `Doubts`.
 
         Returns:
             The island's merged map.
         """
-        self._leave(self._sheets.keys() - maps.keys())
-        changed = {one for one in maps if self._place(one, maps[one], rulings)}
+        some = maps.keys() - rulings.retired.keys()
+        self._leave(self._sheets.keys() - some)
+        changed = {one for one in maps if one in some and self._place(one, maps[one], rulings)}
+        known, ledger, doubts = self._ledger.known, self._ledger, self._doubts
+        ledger.hold(doubts.begin(self._sheets, past, rulings), doubts.labels)
         self._ruled = rulings
-        fresh = {pair for pair in news if pair[0] in maps and pair[1] in maps}
-        known, ledger = self._ledger.known, self._ledger
+        fresh = {pair for pair in news if some.issuperset(pair)}
         ledger.weigh(fresh, verdicts)
         for pair in sorted(fresh | {pair for pair in known if pair[0] in changed or pair[1] in changed}):
             lost = ledger.review(pair, verdicts, rulings)
-            self._since += len(lost)
+            doubts.since += len(lost)
             self._touched |= ends_of(lost)
-        whole = (self._small or not ledger.bundles) and self._changed_enough()
+        self._decide(fresh, changed, verdicts, rulings)
+        if doubts.doubtful and doubts.small:
+            self._decide(fresh, changed, verdicts, rulings)
+        return outcome(maps, self._all, ledger, self._own, self._settings.consistency, rulings)
+
+    def _decide(self, fresh: set[MapPair], changed: set[MapId], verdicts: Verdicts, rulings: Rulings) -> None:
+        """Judge what is new, or what is to be decided again, and optimise."""
+        doubts, ledger = self._doubts, self._ledger
+        whole = doubts.due and (doubts.within or not ledger.bundles)
+        everything = whole and doubts.everything
         if whole:
-            changed = set(self._sheets)
-            fresh = self._doubt_all(verdicts, rulings)
+            changed, fresh = set(self._sheets), self._doubt_all(verdicts, rulings, everything)
         # All is tried with limited pull first, what is new is tested by what is believed.
         self._plain, self._moved = not whole, np.zeros(0, np.int64)
         self._assemble()
         self._follow(self._touched)
         self._touched = set()
-        self._all, more = join(
+        self._all, more, against = join(
             fresh, self._all, ledger, self._sheets, self._groups, self._settings, self._memory, self._settled
         )
-        self._since += more
-        if not whole and self._since - self._rough > self._steps.optimise_share * len(self._all.factors):
-            self._rough = self._since
+        doubts.since += more
+        if not whole and doubts.since - self._rough > self._steps.optimise_share * len(self._all.factors):
+            self._rough = doubts.since
             self._relax_all(believed=True)
         self._settle(self._all.nodes_at(self._moved), whole, changed)
         if whole:
-            self._since = self._rough = 0
-        return self._outcome(maps, rulings)
+            doubts.since = self._rough = 0
+        doubts.end(self._sheets, self._all, against, everything)
 
     def _settle(self, nodes: Iterable[NodeId], whole: bool, changed: set[MapId]) -> None:
         """Optimise until no link strains too much and no robots clash, then with all links at full pull."""
@@ -163,11 +175,11 @@ class Steps:
             lost = lost or self._fall(changed)
             if not lost:
                 break
-            self._since += len(lost)
+            self._doubts.lost(link.pair for link in lost)
             ends = {node for link in lost for node in link.pair}
             if whole:
                 # Of a large map the rest is where it should be.
-                everything, touched = self._small, ends
+                everything, touched = self._doubts.small, ends
             touched |= ends
             self._assemble()
         if whole and not everything:
@@ -200,17 +212,19 @@ class Steps:
             known = {} if before is None else before.known()
         after = Sheet.of(one, pieces, known, undone.refused)
         told = after.said() ^ (set() if before is None else before.said())
-        self._since += len(told)
+        self._doubts.since += len(told)
         self._touched |= {node for a, b, _ in told for node in (a, b) if node in after.rows}
         self._sheets[map_id] = after
         self._own[map_id] = [r for piece in pieces for r in piece.refused] + list(undone.refused)
         return True
 
-    def _doubt_all(self, verdicts: Verdicts, rulings: Rulings) -> set[MapPair]:
-        """Let all links wait again: what was decided one after the other is decided together."""
+    def _doubt_all(self, verdicts: Verdicts, rulings: Rulings, everything: bool) -> set[MapPair]:
+        """Let all links wait again, or all but those at past nodes: they are decided together."""
+        self._ledger.hold(frozenset() if everything else self._doubts.past, self._doubts.labels)
         known = self._ledger.doubt_all()
-        for map_id, sheet in self._sheets.items():
-            self._sheets[map_id] = Sheet.of(sheet.one, sheet.fragments, {}, sheet.undone)
+        if everything:
+            for map_id, sheet in self._sheets.items():
+                self._sheets[map_id] = Sheet.of(sheet.one, sheet.fragments, {}, sheet.undone)
         self._ledger.weigh(known, verdicts)
         for maps in sorted(known):
             self._ledger.review(maps, verdicts, rulings)
@@ -243,7 +257,11 @@ class Steps:
 
     def _relax(self, rows: Rows, how: RelaxSettings, believed: bool) -> None:
         huber, one = math.inf if believed else self._settings.huber, self._all
-        one.means, moved = relax(one.factors, one.means, one.anchors(), rows, huber, how)
+        held = one.anchors()
+        if how.least < len(one.means):
+            # They move when everything does.
+            held = np.union1d(held, one.rows(self._doubts.past))
+        one.means, moved = relax(one.factors, one.means, held, rows, huber, how)
         self._moved = np.union1d(self._moved, np.concatenate([moved, rows]))
 
     def _settled(self, whole: Assembly, nodes: set[NodeId], last: bool) -> Assembly:
@@ -263,7 +281,7 @@ class Steps:
         lost: list[Link] = []
         near: set[MapId] = set()
         for k in np.argsort(-strains, kind="stable").tolist():
-            if strains[k] <= self._settings.strain or (lost and self._small):
+            if strains[k] <= self._settings.strain or (lost and self._doubts.small):
                 break
             if near.isdisjoint(node.map for node in links[k].pair):
                 near |= {node.map for node in links[k].pair}
@@ -279,22 +297,3 @@ class Steps:
         for story, reason in found:
             self._ledger.disbelieve(story, reason, for_good=True)
         return [link for story, _ in found for link in story]
-
-    def _outcome(self, maps: Mapping[MapId, HybridMap], rulings: Rulings) -> MergedMap:
-        """The island as a merged map."""
-        labels = np.unique(self._all.labels)
-        graphs: list[WideGraph] = [self._all.graph(int(label), math.inf) for label in labels]
-        graphs.sort(key=lambda graph: (-len(graph.nodes), graph.anchor))
-        links = [link for bundle in self._ledger.bundles.values() for link in bundle.links.values()]
-        refused = [r for known in self._ledger.refused.values() for r in known.values()]
-        refused += [r for known in self._own.values() for r in known]
-        refused += refuse_drives(maps, graphs, self._settings.consistency)
-        return MergedMap(
-            dict(sorted(maps.items())),
-            tuple(sorted(links, key=lambda link: link.pair)),
-            tuple(sorted(refused, key=lambda refusal: refusal.pair)),
-            tuple(frozenset(graph.rows) for graph in graphs),
-            Postures(graphs),
-            tuple(graphs),
-            rulings,
-        )

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId, NodeId
+from hybridmap.pose import Array
 from hybridmap.reach import RECOGNISED
 from hybridmap.reach_book import ReachBook
+from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import PoseGraph
 from merge.life.adjacency import Adjacency
@@ -79,6 +81,12 @@ class Passages:
         found = self._trees[graph.anchor].query_ball_point(graph.means[graph.rows[node], :2], reach)
         near = (graph.nodes[k] for k in found)
         return sorted(other for other in near if other != node and (also_gone or other not in self._gone))
+
+    def stances(self, node: NodeId, others: Sequence[NodeId]) -> Array:
+        """(K, 3) m, m, rad, how other nodes of the same component stand to a node."""
+        graph = self._graph(node)
+        here, there = (graph.means[graph.index(some)] for some in ([node], others))
+        return compose_poses(inverse_poses(here), there)
 
     def spare(self, node: NodeId, successor: NodeId, detour: float) -> bool:
         """Whether every neighbour of a node is reached from its successor without the node.

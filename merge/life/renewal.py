@@ -21,10 +21,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hybridmap.node import Node, NodeId
-from hybridmap.pose import Pose2
+from hybridmap.pose import Array, Pose2
 from hybridmap.reach import ReachSettings, least_in_view
 from hybridmap.reach_book import ReachBook
-from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
 from hybridmap.superseded import Superseded
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
@@ -242,9 +241,7 @@ class _Round:
         if node not in self._basins:
             s = self._settings.reach
             around = self._passages.around(node, s.farthest, also_gone=True)
-            here = self._merged.pose(node).vector[None]
-            there = np.array([self._merged.pose(other).vector for other in around]).reshape(-1, 3)
-            between = compose_poses(inverse_poses(here), there)
+            between = self._passages.stances(node, around)
             distances, turns = np.hypot(between[:, 0], between[:, 1]), np.abs(between[:, 2])
             order = np.argsort(distances / s.farthest + turns / s.widest, kind="stable")
             inside = (distances <= s.farthest) & (turns <= s.widest)
@@ -277,17 +274,24 @@ class _Round:
         verdict = self._comparisons.link(a, b, s.found)
         if verdict is None:
             return None
-        there = self._merged.relative(*verdict.pair)
-        assert there is not None, "nodes of one component"
-        off = (verdict.a_from_b.mean.inverse() @ there.mean).vector
-        spread = verdict.a_from_b.covariance + there.covariance + np.diag(np.square(s.floor))
-        return verdict if float(off @ np.linalg.solve(spread, off)) < s.gate else None
+        off = (verdict.a_from_b.mean.inverse() @ self._between(*verdict.pair)).vector
+        spread = verdict.a_from_b.covariance + np.diag(np.square(s.floor))
+        # The map's own doubt only lets more pass, and of a large map it takes long to say.
+        if _distance2(off, spread) >= s.gate:
+            there = self._merged.relative(*verdict.pair)
+            assert there is not None, "nodes of one component"
+            return verdict if _distance2(off, spread + there.covariance) < s.gate else None
+        return verdict
 
     def _one_visit(self, a: Node, b: Node) -> bool:
         return a.id.map == b.id.map and abs(a.stamp_ns - b.stamp_ns) < self._settings.again * SECOND
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2:
         return self._merged.pose(a).inverse() @ self._merged.pose(b)
+
+
+def _distance2(off: Array, spread: Array) -> float:
+    return float(off @ np.linalg.solve(spread, off))
 
 
 def _ordered(a: NodeId, b: NodeId) -> tuple[NodeId, NodeId]:
