@@ -58,7 +58,8 @@ def ranger_points(proximity: NDArray[Any], description: RobotDescription) -> Arr
 def guard(command: Command, proximity: NDArray[Any], description: RobotDescription) -> Guarded:
     """The command, or as much of it as cannot touch what the rangers see before the robot could stop.
 
-    The round footprint is swept along the arc of the command for two ticks and the stopping distance. A turn
+    The round footprint is swept along the arc of the command for two ticks and the stopping distance, and as
+    far again: what stands there may be another robot that comes the other way and brakes no sooner. A turn
     on the spot moves no round footprint and always passes; so does a motion that leads away from a point
     which is too near already.
 
@@ -85,7 +86,7 @@ def guard(command: Command, proximity: NDArray[Any], description: RobotDescripti
 def _free(command: Command, points: Array, description: RobotDescription) -> bool:
     """Whether the arc of a command, with its stopping distance, stays clear of the points."""
     speed = abs(command.forward)
-    way = 2.0 * speed * description.tick + speed * speed / (2.0 * _DECELERATION)
+    way = 2.0 * (2.0 * speed * description.tick + speed * speed / (2.0 * _DECELERATION))
     s = np.linspace(0.0, way, 2 + math.ceil(way / 0.02))[1:]
     turn = command.turn / speed * s
     chord = math.copysign(1.0, command.forward) * s * np.sinc(0.5 * turn / math.pi)

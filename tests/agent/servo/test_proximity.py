@@ -55,6 +55,35 @@ def test_no_collision_in_a_random_world(
             assert len(gap) == 0 or gap.min() > 0.0
 
 
+@pytest.mark.parametrize("aside", [0.0, 0.05, 0.12, 0.25])
+@pytest.mark.parametrize("speeds", [(0.26, 0.26), (0.3, 0.3), (0.3, 0.1)])
+def test_two_that_drive_at_each_other_do_not_touch(
+    robot: RobotDescription, aside: float, speeds: tuple[float, float]
+) -> None:
+    """Each sees the other one and not that it comes; wheels follow a command with a lag of 0.12 s."""
+    closest, steps = math.inf, 20
+    for start in np.linspace(0.8, 0.9, 7):
+        here, there, driven = Pose2(), Pose2(float(start), aside, math.pi), [*speeds]
+        for _ in range(60):
+            wanted = [
+                guard(
+                    Command(speed, 0.0), read_rangers(robot, mine, _post(other, robot)), robot
+                ).command.forward
+                for speed, mine, other in zip(speeds, (here, there), (there, here), strict=True)
+            ]
+            for _ in range(steps):
+                share = 1.0 - math.exp(-robot.tick / steps / 0.12)
+                driven = [v + share * (to - v) for v, to in zip(driven, wanted, strict=True)]
+                here = here @ Pose2(driven[0] * robot.tick / steps)
+                there = there @ Pose2(driven[1] * robot.tick / steps)
+                closest = min(closest, here.distance(there) - 2.0 * robot.radius)
+    assert closest > 0.01
+
+
+def _post(other: Pose2, robot: RobotDescription) -> Array:
+    return np.array([[other.x, other.y, robot.radius]])
+
+
 def test_the_guard_stops_both_ways_and_lets_the_robot_leave(robot: RobotDescription) -> None:
     wall_ahead = np.where(np.abs(robot.ranger_bearings) < 0.5, 0.02, robot.ranger_reach)
     stopped = guard(Command(0.2, 0.1), wall_ahead, robot)
