@@ -45,11 +45,13 @@ class Merging:
     Attributes:
         stands: whether what was decided of nodes of another day stands.
         seconds: of the processor, of each merge.
+        beside: the same, of what the map server decides again beside its merges.
         merged: the newest map.
     """
 
     stands: bool
     seconds: list[float] = field(default_factory=list)
+    beside: float = 0.0
     merged: MergedMap = field(default_factory=MergedMap.empty)
     _islands: Islands = field(default_factory=Islands)
     _verdicts: Verdicts = field(default_factory=Verdicts)
@@ -67,6 +69,10 @@ class Merging:
         self.merged = self._islands.merge(self._maps, self._verdicts, touched, Rulings(), self._past)
         self.seconds.append(time.process_time() - began)
         self._past = today.past if self.stands else frozenset()
+        if again := self._islands.again(self._maps, self._verdicts):
+            began = time.process_time()
+            again.run()
+            self.beside += time.process_time() - began
 
 
 def main() -> None:
@@ -119,6 +125,7 @@ def run(
             f"{name}merge_s": round(statistics.median(way.seconds[-LAST:]), 3),
             f"{name}merge_s_most": round(max(way.seconds), 3),
             f"{name}merge_s_all": round(sum(way.seconds), 3),
+            f"{name}beside_s_all": round(way.beside, 3),
             f"{name}components": len(way.merged.components),
             f"{name}links": len(links),
             f"{name}links_false": len(links - true),

@@ -33,6 +33,7 @@ class Doubts:
         past: nodes of another day for which others stand.
         labels: of the components of all nodes at the end of the last step.
         since: measurements that have come or gone since anything was decided again.
+        trusted: what it begins with was decided by another process, all of it.
     """
 
     def __init__(self, settings: StepSettings) -> None:
@@ -43,7 +44,7 @@ class Doubts:
         """
         self.past: Set[NodeId] = frozenset()
         self.labels: Mapping[NodeId, int] = {}
-        self.since = 0
+        self.since, self.trusted = 0, False
         self._settings = settings
         self._count = self._decided = self._nodes = 0
         self._rulings: Rulings | None = None
@@ -116,7 +117,9 @@ class Doubts:
             if before is not None and parts.setdefault(before, now[name]) != now[name]:
                 self._doubtful = True
         self.labels, self._count = now, len(whole.factors)
-        self._doubtful |= not against <= self._contradicting
+        self._doubtful |= not self.trusted and not against <= self._contradicting
         self._contradicting |= against
+        if self.trusted or decided:
+            self._decided, self.trusted = self._count, False
         if decided:
-            self._decided, self._doubtful, self._contradicting = self._count, False, set(against)
+            self._doubtful, self._contradicting = False, set(against)

@@ -96,7 +96,7 @@ class Steps:
             )
             self._touched |= one.nodes.keys()
         self._ledger.resume(decided.believed, verdicts)
-        self._doubts.since = self._rough = 0
+        self._doubts.since, self._rough, self._doubts.trusted = 0, 0, True
 
     def step(
         self,

@@ -124,7 +124,7 @@ def test_whatever_happens_to_nodes_that_others_stand_for() -> None:
     life, rng = Life(21, 0.3), np.random.default_rng(21)
     islands = Islands(steps=StepSettings(anew_up_to=0, past_share=0.0))
     past: set[NodeId] = set()
-    merges = alike = 0
+    apart = links = 0
     for _ in range(60):
         life.step()
         if life.maps and rng.random() < 0.05:
@@ -133,15 +133,15 @@ def test_whatever_happens_to_nodes_that_others_stand_for() -> None:
             ruling = Ruling((which, which), bool(rng.random() < 0.6), "anna", life.number)
             life.rulings = life.rulings + Rulings([ruling])
         nodes = [node for one in life.maps.values() for node in one.nodes]
-        past = {n for n in past if rng.random() > 0.02} | {n for n in nodes if rng.random() < 0.03}
+        past = {n for n in sorted(past) if rng.random() > 0.02} | {n for n in nodes if rng.random() < 0.03}
         if rng.random() < 0.4:
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings, past)
             life.touched, anew = set(), life.anew()
             one, two = ({link.pair for link in some.links} for some in (merged, anew))
-            merges, alike = merges + 1, alike + (one == two)
+            apart, links = apart + len(one ^ two), links + len(two)
             assert set(merged.postures) == set(anew.postures)
-    # In 18 such lives, with 0 and 30 % false links, 412 of 419 merges had the same links.
-    assert merges > 10 and alike >= merges - 3
+    # In 26 such lives, with 0 and 30 % false links, 575 of 591 merges had the same links.
+    assert links > 50 and apart <= 0.1 * links
 
 
 def test_people_rule_on_days_that_stand() -> None:
@@ -205,3 +205,27 @@ def test_a_false_join_of_days_that_stand_falls_when_others_contradict_it(seed: i
         believed.append(bool(found))
     assert believed[0] and not believed[-1]
     assert set(merged.components) == set(anew.components)
+
+
+def test_another_process_goes_on_without_deciding_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    daily = Daily(3, 0.3)
+    daily.live(8)
+    waiting: list[int] = []
+    real = steps.join
+
+    def counted(*a):  # type: ignore[no-untyped-def]
+        waiting.append(sum(map(len, a[2].waiting.values())))
+        return real(*a)
+
+    decided, daily.islands = daily.islands.decisions(), Islands(steps=SMALL)
+    daily.islands.resume(decided)
+    daily.verdicts = Verdicts()
+    daily.tell(daily.links.values())
+    daily.touched |= set(daily.maps)
+    past, daily.past = daily.past, frozenset()
+    # Nobody knows yet who stands for whom.
+    check(daily.merged(), daily.anew())
+    daily.past = past
+    monkeypatch.setattr(steps, "join", counted)
+    check(daily.live(1), daily.anew())
+    assert max(waiting) < 0.5 * len(daily.links)
