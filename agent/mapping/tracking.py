@@ -16,6 +16,7 @@ from agent.mapping.continuity import Continuity, Sight, relit, turned
 from agent.mapping.dispute import Dispute
 from agent.mapping.track_history import TrackHistory
 from agent.mapping.track_settings import TrackingSettings
+from agent.mapping.unheld import Unheld
 from agent.mapping.view import View, associate, even_choice
 from agent.observation import Observation, RobotDescription
 from agent.vision.hidden import Hidden
@@ -49,6 +50,7 @@ class Tracking:
         self._settings = settings
         self._tracker = Tracker(lens, settings.tracker)
         self._hidden = Hidden(settings.hidden)
+        self._unheld = Unheld()
         own = replace(settings.filter, side_slip=description.side_slip)
         self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
         # Two images are compared by points that live for one step: nothing to hold them to.
@@ -152,6 +154,8 @@ class Tracking:
             self._tracker.keep(~np.isin(self._tracker.ids, refused))
         if len(self._filter.ids) - len(self._hidden.ids) < self._settings.refill:
             self._fill()
+        ids = self._tracker.ids[: None if self._unused is not None else 0]
+        self._unheld.note(ids, self._tracker.pixels[: len(ids)], self._filter.predict_pixels(ids))
         self.remember()
 
     def remember(self, force: bool = False) -> None:
@@ -281,7 +285,7 @@ class Tracking:
         if len(ids):
             order = np.argsort(ids)
             place = np.clip(np.searchsorted(ids[order], self._tracker.ids), 0, len(ids) - 1)
-            rows = self._filter.predict_pixels()[order[place]]
+            rows = self._filter.predict_pixels()[order[place]] + self._unheld.aside(self._tracker.ids)
             hit = (ids[order][place] == self._tracker.ids) & self._camera.contains(rows)
             expected[hit] = rows[hit]
         return expected

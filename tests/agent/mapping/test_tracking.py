@@ -85,6 +85,22 @@ def test_further_tracks_hold_the_heading_when_wheels_lie(walls, description):
     assert error(refill=8) < 0.6 * error(refill=0)
 
 
+def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last(walls, description):
+    """Few tracks in one corner: wheels are trusted alone, lie by and by, and nobody carried the robot off.
+
+    A robot before a bare wall once took itself for carried off when its filter was 20 px off its tracks.
+    """
+    tracking, pose = begun(walls, description, TrackingSettings(least_spread=1.5)), Pose2()
+    alive = len(tracking.ids)
+    for tick in range(1, 21):
+        before, pose = pose, Pose2(0.002 * tick)
+        observed = walls.observe(before, pose, tick)
+        tracking.step(replace(observed, odometry=Odometry(observed.odometry.forward, 0.01)))
+        assert tracking.strange == tracking.blank == 0
+    assert abs(tracking.pose.mean.heading - 0.2) < 1e-6, "by the wheels alone"
+    assert len(tracking.ids) > 0.9 * alive
+
+
 def past(image: np.ndarray, tick: int) -> np.ndarray:
     """Somebody with a striped coat walks through the view, as wide as a third of it."""
     left = 16 * tick - 110
