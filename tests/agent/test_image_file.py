@@ -39,7 +39,8 @@ def test_what_is_no_image_is_one_line(tmp_path, how, capfd):
             path.write_text("no image")
         case "torn":
             path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
-    with pytest.raises(DeviceError, match=re.escape(f"{path}: not an image that can be read")):
+    words = "no such file" if how == "missing" else "not an image that can be read"
+    with pytest.raises(DeviceError, match=re.escape(f"{path}: {words}")):
         read_grey(path)
     # OpenCV has something to say of a torn file, and nothing of the others.
     assert how == "torn" or capfd.readouterr().err == ""
