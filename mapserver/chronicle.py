@@ -28,7 +28,7 @@ MOST_APART = 2000
 MOST_AT_ONCE = 50
 """Happenings of one sort that one merge adds one by one: a thousand maps may join at once."""
 Pair = tuple[MapId, MapId]
-BODIES = ("would have seen", "would have been at the same place")
+BODIES = ("would have seen", "would have been at the same place", "show nothing of what the other one mapped")
 """What a refusal says where two robots cannot have been where the links put them."""
 
 

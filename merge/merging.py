@@ -26,8 +26,8 @@ from merge.belief.drives import refuse_drives
 from merge.belief.joining import Outliers, Solver, optimise
 from merge.belief.memory import Memory
 from merge.belief.readmission import readmitted
-from merge.bodies.exclusion import ExclusionSettings
 from merge.bodies.refutation import Refutation
+from merge.bodies.settings import ExclusionSettings
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap, Postures
 from merge.graph.posegraph import HUBER
@@ -112,7 +112,8 @@ def merge_maps(
                 unjoined, strained = (
                     [r for r in some if r.pair not in told] for some in (unjoined, strained)
                 )
-        impossible = refutation.impossible(groups, solved, kept)
+        refuted = {key for key, group in groups.items() if group.refuted}
+        impossible = refutation.impossible(solved, kept, refuted)
         if not impossible:
             break
         for key, reason in impossible.items():

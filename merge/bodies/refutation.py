@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import networkx as nx
@@ -11,10 +11,11 @@ import numpy as np
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from merge.belief.consistency import ConsistencySettings
-from merge.belief.groups import LinkGroup
 from merge.belief.joining import Solver
 from merge.bodies.clash import Clash
-from merge.bodies.exclusion import ExclusionSettings, clash_of
+from merge.bodies.exclusion import clash_of
+from merge.bodies.settings import ExclusionSettings
+from merge.bodies.suspicion import suspicion
 from merge.bodies.trails import Trail, trails_of
 from merge.graph.links import Link
 from merge.graph.posegraph import PoseGraph
@@ -66,8 +67,13 @@ class Refutation:
         first, second = sorted(self._solver.by_node[node].name for node in link.pair)
         return first, second
 
+    def keys_of(self, links: Iterable[Link]) -> set[Key]:
+        """Between which fragments links are; those at other nodes are left out."""
+        known = self._solver.by_node
+        return {self.key_of(link) for link in links if link.a in known and link.b in known}
+
     def impossible(
-        self, groups: Mapping[Key, LinkGroup], solved: Sequence[PoseGraph], kept: Sequence[Link]
+        self, solved: Sequence[PoseGraph], kept: Sequence[Link], refuted: Collection[Key]
     ) -> dict[Key, str]:
         """Groups that must fall, with reasons.
 
@@ -76,11 +82,11 @@ class Refutation:
         and the weakest is the likeliest.
 
         Args:
-            groups: all links.
             solved: the components.
             kept: the links that made them.
+            refuted: between which fragments other links have been refuted.
         """
-        clashes = dict(self._clashes(solved))
+        clashes = dict(self._clashes(solved, refuted))
         if not clashes:
             return {}
         weights: dict[Key, int] = {}
@@ -94,7 +100,9 @@ class Refutation:
         weakest = _weakest_on_the_way(weights, start, end)
         return {weakest: f"{clash.reason}, and these are the weakest links that join the two"}
 
-    def _clashes(self, solved: Sequence[PoseGraph]) -> Iterator[tuple[Key, Clash]]:
+    def _clashes(
+        self, solved: Sequence[PoseGraph], refuted: Collection[Key] = ()
+    ) -> Iterator[tuple[Key, Clash]]:
         """Pairs of fragments in one component that clash, by whichever clock says so most clearly."""
         for graph in solved:
             trails = [
@@ -103,7 +111,11 @@ class Refutation:
             found: dict[Key, list[Clash]] = {}
             for k, other in _near(graph, [trail for _, trail in trails]):
                 (first, one), (second, two) = trails[k], trails[other]
-                clash = clash_of(graph, one, two, self._exclusion) if first != second else None
+                if first == second:
+                    continue
+                clash = clash_of(graph, one, two, self._exclusion)
+                if clash is None and (min(first, second), max(first, second)) in refuted:
+                    clash = suspicion(graph, one, two, self._exclusion)
                 if clash is not None:
                     found.setdefault((first, second), []).append(clash)
             for key, clashes in found.items():

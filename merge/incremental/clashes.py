@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import networkx as nx
 import numpy as np
@@ -42,6 +42,7 @@ def clashing(
     some: Sequence[MapId],
     graphs: Sequence[WideGraph],
     kept: Sequence[Link],
+    fallen: Iterable[Link],
     settings: MergeSettings,
 ) -> tuple[dict[Key, str], Refutation]:
     """Groups of links that must fall, with reasons, and who says so.
@@ -51,13 +52,14 @@ def clashing(
         some: maps whose robots may clash.
         graphs: the components that hold their nodes.
         kept: believed links between them.
+        fallen: links that were refuted before.
         settings: of the merge.
     """
     fragments: list[Fragment] = [piece for one in some for piece in sheets[one].fragments]
     maps = {one: sheets[one].one for one in some}
     refutation = Refutation(maps, Solver(fragments), settings.consistency, settings.exclusion)
     try:
-        return refutation.impossible({}, graphs, kept), refutation
+        return refutation.impossible(graphs, kept, refutation.keys_of(fallen)), refutation
     except (nx.NetworkXNoPath, nx.NodeNotFound):
         # They are joined by way of maps that are not among these: the next merge made anew will tell.
         return {}, refutation
@@ -68,6 +70,7 @@ def falling(
     bundles: Mapping[MapPair, Bundle],
     whole: Assembly,
     changed: set[MapId],
+    fallen: Iterable[Link],
     settings: MergeSettings,
 ) -> list[tuple[list[Link], str]]:
     """Links that must fall together, with reasons: under them robots would walk through each other.
@@ -77,6 +80,7 @@ def falling(
         bundles: links that are believed.
         whole: the graph that they make.
         changed: maps whose nodes may have moved.
+        fallen: links that were refuted before.
         settings: of the merge.
     """
     some = neighbours(sheets, changed)
@@ -86,7 +90,7 @@ def falling(
     kept = [link for bundle in inside.values() for link in bundle.links.values()]
     labels = sorted({whole.label(node) for one in some for node in sheets[one].nodes})
     graphs = [whole.graph(label, math.inf) for label in labels]
-    impossible, refutation = clashing(sheets, some, graphs, kept, settings)
+    impossible, refutation = clashing(sheets, some, graphs, kept, fallen, settings)
     return [
         ([link for link in kept if refutation.key_of(link) == key], reason)
         for key, reason in impossible.items()

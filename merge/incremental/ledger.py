@@ -51,6 +51,11 @@ class Ledger:
         """Maps between which there are links."""
         return {*self.bundles, *self.waiting}
 
+    @property
+    def fallen(self) -> list[Link]:
+        """Links that are refused as long as they are seen as they are."""
+        return [link for link, _ in self._fallen.values()]
+
     def believed(self, maps: MapPair) -> Mapping[Pair, Link]:
         """The links between two maps that are believed."""
         return self.bundles[maps].links if maps in self.bundles else {}

@@ -293,7 +293,9 @@ class Steps:
 
     def _fall(self, changed: set[MapId]) -> list[Link]:
         """Refuse groups of links under which robots would walk through each other."""
-        found = falling(self._sheets, self._ledger.bundles, self._all, changed, self._settings)
+        refuted = [r.link for groups in self._groups.values() for group in groups for r in group.refuted]
+        fallen = self._ledger.fallen + [link for link in refuted if link is not None]
+        found = falling(self._sheets, self._ledger.bundles, self._all, changed, fallen, self._settings)
         for story, reason in found:
             self._ledger.disbelieve(story, reason, for_good=True)
         return [link for story, _ in found for link in story]

@@ -14,7 +14,8 @@ from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.wake import MOST, Wake
 from merge.bodies.clash import Clash
-from merge.bodies.exclusion import ExclusionSettings, chances_clear, clash_of
+from merge.bodies.exclusion import chances_clear, clash_of
+from merge.bodies.settings import ExclusionSettings
 from merge.bodies.trails import Trail, trails_of
 from merge.graph.posegraph import PoseGraph
 

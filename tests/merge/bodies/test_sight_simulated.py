@@ -18,7 +18,8 @@ from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.wake import Wake
 from merge.bodies.clash import Clash
-from merge.bodies.exclusion import ExclusionSettings, clash_of
+from merge.bodies.exclusion import clash_of
+from merge.bodies.settings import ExclusionSettings
 from merge.bodies.sight import SightSettings
 from merge.bodies.trails import trails_of
 from merge.graph.posegraph import PoseGraph
