@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable
 
@@ -12,14 +11,10 @@ from agent.mission import Answer, Question
 from agent.observation import Observation
 from agent.pipeline import Pipeline, Step
 from agent.sharing.replication import Replicator
-
-log = logging.getLogger(__name__)
+from agent.synchronization import FreeRunning, Synchronization
 
 REPORT_EVERY = 5
 """Ticks between two status reports."""
-
-LOCKSTEP_PATIENCE = 30.0
-"""In lock-step: how long a tick may wait for its own disk, and for a server that can be reached, s."""
 
 
 class Runner:
@@ -30,7 +25,7 @@ class Runner:
         pipeline: Pipeline,
         fleet: FleetLink,
         replicator: Replicator,
-        lockstep: bool = False,
+        synchronization: Synchronization | None = None,
         on_step: Callable[[Step], None] = lambda step: None,
     ) -> None:
         """Put the parts together.
@@ -39,14 +34,13 @@ class Runner:
             pipeline: the mind.
             fleet: questions, missions, status.
             replicator: where changes go: to the own disk, then to the server.
-            lockstep: let time stand still until the disk, a server in reach and the answers have come, so
-                that the outcome does not depend on the machine's speed (simulation only).
+            synchronization: what the loop waits for; nothing if not given.
             on_step: called after each tick, for progress.
         """
         self._pipeline = pipeline
         self._fleet = fleet
         self._replicator = replicator
-        self._lockstep = lockstep
+        self._synchronization = synchronization or FreeRunning()
         self._on_step = on_step
         self._questions: tuple[Question, ...] = ()
         self._answers: tuple[Answer, ...] = ()
@@ -60,8 +54,7 @@ class Runner:
         step = self._pipeline.step(observation, answers)
         if step.changes:
             self._replicator.submit(step.changes, observation.stamp_ns)
-            if self._lockstep:
-                self._await_server()
+            self._synchronization.changes_submitted(self._replicator, self._fleet)
         self._questions = step.questions
         now = self._ticks % REPORT_EVERY == 0 or bool(step.questions)
         self._fleet.report(step.status, observation.stamp_ns, publish=now)
@@ -69,30 +62,18 @@ class Runner:
         self._on_step(step)
         return step
 
-    def _await_server(self) -> None:
-        """Lock-step: the tick lasts until the own disk, and a server that is in reach, have the changes."""
-        there = self._replicator.flush(LOCKSTEP_PATIENCE)
-        if there and self._fleet.server_in_reach():
-            there = self._replicator.wait_acknowledged(LOCKSTEP_PATIENCE)
-            # A network that went away meanwhile is a scenario's doing, and no reason to complain.
-            there = there or not self._fleet.server_in_reach()
-        if not there:
-            log.warning(
-                "what was mapped was not saved within %g s: this run may not repeat itself", LOCKSTEP_PATIENCE
-            )
-
     @property
     def curious(self) -> bool:
         """Whether the last tick had questions."""
         return bool(self._questions)
 
     def exchange(self) -> None:
-        """Ask what the last tick wanted to know. A robot waits for no answer, but in lock-step."""
+        """Ask what the last tick wanted to know."""
+        self._synchronization.before_questions()
         for question in self._questions:
             self._fleet.ask(question)
         self._questions = ()
-        if self._lockstep:
-            self._answers = self._fleet.answers(wait=True)
+        self._answers = self._synchronization.answers(self._fleet)
 
     def run(self, robot: Robot, stop: threading.Event) -> int:
         """Loop until the body has no more observations, `stop` is set or the pipeline wants a fresh map.
@@ -107,7 +88,5 @@ class Runner:
                 break
             robot.act(self.tick(observation).command)
             if self.curious:
-                if self._lockstep:
-                    robot.rendezvous()
                 self.exchange()
         return self._ticks - first

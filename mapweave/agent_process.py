@@ -18,11 +18,12 @@ from agent.fleet import FleetLink
 from agent.mission import Idle, Mission
 from agent.observation import Observation, RobotDescription
 from agent.pipeline import Pipeline, PipelineSettings, Step
-from agent.runner import LOCKSTEP_PATIENCE, Runner
+from agent.runner import Runner
 from agent.sharing.journal import Journal
 from agent.sharing.kept import Kept
 from agent.sharing.merged_postures import MergedPostures
 from agent.sharing.replication import Replicator
+from agent.synchronization import FreeRunning, Synchronization
 from hybridmap.node import MapId
 from wire.bus import Bus
 from wire.keys import Keys
@@ -45,7 +46,7 @@ class AgentOptions:
         fresh: begin a new map even if the journal holds one.
         mission: at the start.
         seed: of the random choices in exploration.
-        lockstep: wait for answers between ticks.
+        synchronization: what the loop waits for between ticks.
         server: whose acknowledgement lets changes be forgotten.
         total: observations that will come, if that is known.
         patience: how long to wait at the end until the server has everything, s.
@@ -57,7 +58,7 @@ class AgentOptions:
     fresh: bool = False
     mission: Mission = field(default_factory=Idle)
     seed: int = 0
-    lockstep: bool = False
+    synchronization: Synchronization = field(default_factory=FreeRunning)
     server: str = "s0"
     total: int | None = None
     patience: float = 5.0
@@ -137,18 +138,12 @@ class Agent:
         pipeline.set_mission(options.mission if mission is None else mission)
         self.pipeline = pipeline
         self.replicator = Replicator(self._bus, self._keys, self.journal, map_id, servers=(options.server,))
-        # In lock-step a slow machine must not turn an answer into none.
-        patience = LOCKSTEP_PATIENCE if options.lockstep else 3.0
-        # What comes by the clock would not repeat itself.
-        listening = not options.lockstep
-        self.merged_postures = (
-            MergedPostures(self._bus, self._keys, options.name, options.server) if listening else None
-        )
+        self.merged_postures = MergedPostures(self._bus, self._keys, options.name, options.server)
         self._fleet = FleetLink(
-            self._bus, self._keys, map_id, patience, options.server,
+            self._bus, self._keys, map_id, options.synchronization.answer_timeout, options.server,
             self.replicator.unacknowledged, self._placed,
         )  # fmt: skip
-        self.runner = Runner(pipeline, self._fleet, self.replicator, options.lockstep, self._on_step)
+        self.runner = Runner(pipeline, self._fleet, self.replicator, options.synchronization, self._on_step)
 
     @property
     def map_id(self) -> MapId:
@@ -189,12 +184,11 @@ class Agent:
         return path
 
     def _placed(self) -> int:
-        return self.merged_postures.count(self.map_id) if self.merged_postures else 0
+        return self.merged_postures.count(self.map_id)
 
     def _leave(self) -> None:
         self._fleet.close()
-        if self.merged_postures:
-            self.merged_postures.close()
+        self.merged_postures.close()
         self.replicator.flush(10.0)
         self.replicator.close()
 

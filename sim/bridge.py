@@ -20,10 +20,11 @@ from agent.drivers.messages import (
 from agent.drivers.remote import clip
 from hybridmap.errors import MapweaveError
 from sim.desk import ControlDesk
+from sim.keys import SimKeys
 from sim.lockstep import Lockstep, Seat
+from sim.lockstep_robot import Rendezvous, decode_rendezvous
 from sim.simulated import Simulated
 from wire.bus import Bus, Request
-from wire.keys import Keys
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +60,7 @@ class SimBridge:
             held: let no time pass before somebody asks for it (see SimControl.advance).
             farewell: how long `close` waits for agents that have not heard yet that the end has come, s.
         """
-        keys = Keys(fleet)
+        keys = SimKeys(fleet)
         self._keys = keys
         self._simulation = simulation
         self._farewell = farewell
@@ -76,8 +77,9 @@ class SimBridge:
         self._declared = [bus.watch(keys.robot_drivers(), self._presence)]
         for name in simulation.robots:
             self._declared.append(bus.serve(keys.robot_describe(name), self._describer(name)))
-            self._declared.append(bus.serve(keys.robot_step(name), self._stepper(name)))
-        self._declared.append(bus.serve(keys.sim_control(), self._control))
+            self._declared.append(bus.serve(keys.robot_step(name), self._stepper(name, decode_step)))
+            self._declared.append(bus.serve(keys.rendezvous(name), self._stepper(name, decode_rendezvous)))
+        self._declared.append(bus.serve(keys.control(), self._control))
         self._declared.append(bus.announce(keys.sim_alive()))
 
     def run(self, stop: threading.Event) -> None:
@@ -90,7 +92,7 @@ class SimBridge:
             while not (self._stopping or stop.is_set()):
                 self._read_inbox()
                 seats = self._lockstep.due(time.monotonic())
-                asking = [seat for seat in seats if seat.step is not None and seat.step.rendezvous]
+                asking = [seat for seat in seats if isinstance(seat.step, Rendezvous)]
                 if asking:
                     # Everybody has finished the tick: these may ask the fleet now, the others wait for them.
                     for seat in asking:
@@ -121,7 +123,7 @@ class SimBridge:
         """Advance by one tick, then sense and answer robot by robot: one thinks while the next is sensed."""
         commands = {}
         for seat in seats:
-            if seat.step is not None:
+            if isinstance(seat.step, StepRequest):
                 commands[seat.name] = clip(seat.step.command, self._simulation.describe(seat.name))
         self._simulation.advance(commands)
         for seat in seats:
@@ -194,16 +196,18 @@ class SimBridge:
         answer = encode_description(self._simulation.describe(name))
         return lambda request: request.reply(answer)
 
-    def _stepper(self, name: str) -> Callable[[Request], None]:
+    def _stepper(
+        self, name: str, decode: Callable[[bytes], StepRequest | Rendezvous]
+    ) -> Callable[[Request], None]:
         def take(request: Request) -> None:
-            step = decode_step(request.payload)
+            step = decode(request.payload)
             if not self._put(lambda: self._receive(name, step, request)):
                 request.refuse(ENDED)
                 self._tell({name})
 
         return take
 
-    def _receive(self, name: str, step: StepRequest, request: Request) -> None:
+    def _receive(self, name: str, step: StepRequest | Rendezvous, request: Request) -> None:
         self._lockstep.receive(name, step, request, time.monotonic())
 
     def _control(self, request: Request) -> None:

@@ -15,9 +15,9 @@ from agent.drivers.messages import AGAIN
 from hybridmap.errors import InvalidValue, NotConnected
 from hybridmap.pose import Array, Pose2
 from sim.floorplan import FloorPlan, Rectangle
+from sim.keys import SimKeys
 from sim.snapshot import Snapshot
 from wire.bus import Bus
-from wire.keys import Keys
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 
 MAX_BYTES = 64 * 2**20
@@ -76,7 +76,7 @@ class SimControl:
             timeout: how long to wait for an answer, s; it comes between two ticks.
         """
         self._bus = bus
-        self._key = Keys(fleet).sim_control()
+        self._key = SimKeys(fleet).control()
         self._timeout = timeout
 
     def kidnap(self, robot: str, world_from_robot: Pose2) -> None:

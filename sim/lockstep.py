@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from agent.drivers.messages import AGAIN, StepRequest
 from hybridmap.errors import InvalidValue
+from sim.lockstep_robot import Rendezvous
 from wire.bus import Request
 
 log = logging.getLogger(__name__)
@@ -40,7 +41,7 @@ class Seat:
     name: str
     active: bool = False
     asked: bool = False
-    step: StepRequest | None = None
+    step: StepRequest | Rendezvous | None = None
     request: Request | None = None
     since: float = 0.0
     sequence: int = 0
@@ -76,7 +77,7 @@ class Lockstep:
         """Names of the robots that time waits for."""
         return {seat.name for seat in self._seats.values() if seat.active}
 
-    def receive(self, name: str, step: StepRequest, request: Request, now: float) -> None:
+    def receive(self, name: str, step: StepRequest | Rendezvous, request: Request, now: float) -> None:
         """Take a robot's step; one that was answered before is answered at once with the same."""
         seat = self._seats[name]
         newest = seat.step.sequence if seat.step is not None else seat.sequence

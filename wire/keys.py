@@ -12,7 +12,6 @@
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
     mapweave/1/<fleet>/robot/<robot>/driver/<number>  liveliness of whoever drives that body
-    mapweave/1/<fleet>/sim/control                    question to the simulator; likewise alive
 
 The identity is a chunk at a fixed place before the class of the message, so that an access rule can name it.
 """
@@ -190,7 +189,7 @@ class Keys:
         """Pattern: every server."""
         return f"{self.root}/server/*/alive"
 
-    # A body or the simulator speaks.
+    # A body speaks.
 
     def robot_describe(self, robot: str) -> str:
         """Where a robot's body describes itself."""
@@ -207,14 +206,6 @@ class Keys:
     def robot_drivers(self) -> str:
         """Pattern: everybody who drives a body."""
         return f"{self.root}/robot/*/driver/*"
-
-    def sim_control(self) -> str:
-        """Where the simulator takes commands (kidnap, truth, stop)."""
-        return f"{self.root}/sim/control"
-
-    def sim_alive(self) -> str:
-        """Under which the simulator is alive."""
-        return f"{self.root}/sim/alive"
 
     # What a key that came from outside says. Each raises InvalidMessage if it is of another form.
 

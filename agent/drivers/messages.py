@@ -49,22 +49,15 @@ class StepRequest:
         sequence: 1 begins a conversation; each further step is one more. The same number again asks for the
             same answer again, and moves nothing.
         command: what the wheels shall do.
-        rendezvous: answer with nothing, as soon as every other robot has finished this tick, and let no
-            time pass. Who asks the fleet something right then gets an answer that does not depend on how
-            quick the others were.
     """
 
     sequence: int
     command: Command
-    rendezvous: bool = False
 
 
 def encode_step(step: StepRequest) -> bytes:
     """Encode a step."""
-    fields: dict[str, object] = {"q": step.sequence, "c": [step.command.forward, step.command.turn]}
-    if step.rendezvous:
-        fields["z"] = True
-    return pack(fields)
+    return pack({"q": step.sequence, "c": [step.command.forward, step.command.turn]})
 
 
 def decode_step(data: bytes) -> StepRequest:
@@ -75,10 +68,7 @@ def decode_step(data: bytes) -> StepRequest:
     """
     reader = Reader(data, "step", MAX_SMALL_BYTES)
     forward, turn = _numbers(reader, "c", 2, 2, -FASTEST, FASTEST)
-    rendezvous = reader.any("z") if reader.has("z") else False
-    if type(rendezvous) is not bool:
-        raise reader.error("z must be true or false")
-    return StepRequest(reader.integer("q", 1, MAX_NUMBER), Command(forward, turn), rendezvous)
+    return StepRequest(reader.integer("q", 1, MAX_NUMBER), Command(forward, turn))
 
 
 def encode_observation(observation: Observation) -> bytes:

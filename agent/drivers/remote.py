@@ -104,18 +104,6 @@ class RemoteRobot:
         self._sequence += 1
         return observation
 
-    def rendezvous(self) -> None:
-        """Wait until every other robot of the simulation has finished this tick; no time passes.
-
-        Raises:
-            DeviceError: nobody answers, or not properly.
-        """
-        if self._closed.is_set():
-            return
-        step = StepRequest(self._sequence + 1, self._command, rendezvous=True)
-        self._ask(self._step_key, encode_step(step), bytes)
-        self._sequence += 1
-
     def act(self, command: Command) -> Command:
         """Keep the command for the next tick.
 

@@ -131,9 +131,6 @@ class Replay:
         """Nothing moves: what is applied is always standing still."""
         return Command()
 
-    def rendezvous(self) -> None:
-        """A recording waits for nobody."""
-
     def close(self) -> None:
         """Nothing to let go of."""
 

@@ -26,10 +26,6 @@ class Robot(Protocol):
         """Send a command; returns the command that is really applied (clipped to the limits)."""
         ...
 
-    def rendezvous(self) -> None:
-        """In lock-step simulation: wait until all robots have finished this tick; elsewhere: nothing."""
-        ...
-
     def close(self) -> None:
         """Stop the wheels and let go."""
         ...

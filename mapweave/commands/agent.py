@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agent.drivers.robot import Robot
+from agent.synchronization import Synchronization
 from hybridmap.node import check_name
 from mapweave.commands.network import (
     add_network,
@@ -18,6 +19,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     tell_if_alone,
 )
+from wire.bus import Bus
 
 
 def add_to(commands: Any) -> None:
@@ -53,7 +55,6 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
-    from agent.drivers.remote import RemoteRobot
     from agent.mission import Carried, Explore, Idle, Mission
     from mapweave.agent_process import AgentOptions, run_agent
     from wire.keys import check_epoch
@@ -70,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         tell_if_alone(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
-        robot = RemoteRobot(body, network.fleet, name)
+        robot, synchronization = _body(arguments, body, network.fleet, name)
         # Who is told to stop while it waits for its body stops waiting.
         threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
         missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
@@ -81,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
             fresh=arguments.fresh,
             mission=missions[arguments.mission],
             seed=arguments.seed,
-            lockstep=arguments.lockstep,
+            synchronization=synchronization,
             server=network.server,
         )
         run_agent(robot, bus, keys, settings.pipeline, options, stop)
@@ -90,6 +91,19 @@ def run(arguments: argparse.Namespace) -> int:
             body.close()
         bus.close()
     return 0
+
+
+def _body(arguments: argparse.Namespace, bus: Bus, fleet: str, name: str) -> tuple[Robot, Synchronization]:
+    """The body behind Zenoh keys, and what the loop waits for: a simulation may be driven in lock-step."""
+    from agent.drivers.remote import RemoteRobot
+    from agent.synchronization import FreeRunning, Lockstep
+
+    if not arguments.lockstep:
+        return RemoteRobot(bus, fleet, name), FreeRunning()
+    from sim.lockstep_robot import LockstepRobot
+
+    robot = LockstepRobot(bus, fleet, name)
+    return robot, Lockstep(robot.rendezvous)
 
 
 def _close_on(stop: threading.Event, robot: Robot) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from agent.fleet import decode_mission
 from agent.observation import Command
+from agent.synchronization import Lockstep
 from hybridmap.errors import MapweaveError
 from mapserver.server import MapServer, ServerSettings
 from mapweave.agent_process import Agent, AgentOptions
@@ -17,9 +18,9 @@ from mapweave.settings import load_settings, merge_settings
 from mapweave.trial.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
 from sim.control import SimControl
 from sim.desk import ControlDesk
+from sim.keys import SimKeys
 from sim.simulation import Simulation
 from wire.bus import Request
-from wire.keys import Keys
 from wire.log_messages import encode_record
 from wire.memory import Faults, MemoryBus, MemoryHub
 
@@ -33,7 +34,7 @@ class LocalFleet:
     def __init__(self, stage: Stage) -> None:
         """Nothing runs yet."""
         self._stage = stage
-        self.keys = Keys(FLEET)
+        self.keys = SimKeys(FLEET)
         self._hub = MemoryHub()
         self.bus = MemoryBus(self._hub)
         self.control = SimControl(self.bus, FLEET, timeout=60.0)
@@ -65,7 +66,7 @@ class LocalFleet:
             except MapweaveError as error:
                 request.refuse(str(error))
 
-        sim_bus.serve(self.keys.sim_control(), answer)
+        sim_bus.serve(self.keys.control(), answer)
         for robot in stage.robots:
             self.start_agent(robot)
 
@@ -108,7 +109,7 @@ class LocalFleet:
             epoch=FIRST_EPOCH,
             mission=mission,
             seed=stage.agent_seed(robot),
-            lockstep=True,
+            synchronization=Lockstep(),
             server=SERVER,
         )
         self._agents[robot] = Agent(

@@ -18,11 +18,11 @@ from hybridmap.pose import Array, Pose2
 from sim.bridge import SimBridge
 from sim.control import SimControl
 from sim.floorplan import FloorPlan, Rectangle
+from sim.keys import SimKeys
 from sim.simulated import Simulated
-from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
 
-KEYS = Keys("test")
+KEYS = SimKeys("test")
 TICK_NS = 100_000_000
 CAMERA = Camera(width=32, height=24, fx=27.0, fy=27.0, cx=15.5, cy=11.5, mount_height=0.3)
 PLAN = FloorPlan(

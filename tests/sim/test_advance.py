@@ -7,11 +7,11 @@ import time
 
 import pytest
 
-from agent.drivers.remote import RemoteRobot
 from agent.observation import Command
 from hybridmap.pose import Pose2
 from sim.bridge import SimBridge
 from sim.control import SimControl
+from sim.lockstep_robot import LockstepRobot
 from sim.simulation import Simulation
 from wire.memory import MemoryBus, MemoryHub
 
@@ -32,7 +32,7 @@ class Table:
         self.meet = set()
 
     def drive(self, name, pause=0.0):
-        robot = RemoteRobot(MemoryBus(self.hub), "test", name)
+        robot = LockstepRobot(MemoryBus(self.hub), "test", name)
 
         def run():
             while (observation := robot.sense()) is not None:

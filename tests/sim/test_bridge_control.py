@@ -49,7 +49,7 @@ def test_truth_of_the_past(stage: Stage) -> None:
         control.truth_at("r1", [9 * TICK_NS])
     with pytest.raises(InvalidValue, match="no robot 'r9'; there are r0, r1"):
         control.trajectory("r9")
-    (reply,) = stage.join().ask(KEYS.sim_control(), b"\x81", 5.0)
+    (reply,) = stage.join().ask(KEYS.control(), b"\x81", 5.0)
     assert reply.error.startswith("control: ")
 
 
@@ -92,7 +92,7 @@ def test_who_asks_between_end_and_close_is_refused(stage: Stage) -> None:
     assert stage.thread is not None
     stage.thread.join(30.0)
     assert stage.robot("r0").sense() is None
-    (reply,) = stage.join().ask(KEYS.sim_control(), b"", 1.0)
+    (reply,) = stage.join().ask(KEYS.control(), b"", 1.0)
     assert reply.error == ENDED
 
 

@@ -30,7 +30,6 @@ def test_the_layout_is_the_one_that_access_rules_are_written_for() -> None:
     assert KEYS.ack("s0", "r0") == "mapweave/1/warehouse/server/s0/ack/r0"
     assert KEYS.relocalize("s0") == "mapweave/1/warehouse/server/s0/relocalize"
     assert KEYS.robot_step("r0") == "mapweave/1/warehouse/robot/r0/step"
-    assert KEYS.sim_control() == "mapweave/1/warehouse/sim/control"
 
 
 @given(maps, names)
@@ -50,7 +49,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
         KEYS.servers_alive(): KEYS.server_alive(server),
         KEYS.robot_drivers(): KEYS.robot_driver(server, one.epoch),
     }
-    others = [KEYS.log(one), KEYS.mission(one.agent), KEYS.robot_describe(server), KEYS.sim_alive()]
+    others = [KEYS.log(one), KEYS.mission(one.agent), KEYS.robot_describe(server), f"{KEYS.root}/sim/alive"]
     for pattern in keys:
         check_pattern(pattern)
         for own_pattern, key in keys.items():

@@ -1,0 +1,25 @@
+"""Keys of the simulator: nothing of a robot or a server stands here, and nothing of these in `wire`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hybridmap.node import check_name
+from wire.keys import Keys
+
+
+@dataclass(frozen=True)
+class SimKeys(Keys):
+    """The keys of one fleet and of the simulator that it lives in."""
+
+    def control(self) -> str:
+        """Where the simulator takes commands (kidnap, truth, stop)."""
+        return f"{self.root}/sim/control"
+
+    def sim_alive(self) -> str:
+        """Under which the simulator is alive."""
+        return f"{self.root}/sim/alive"
+
+    def rendezvous(self, robot: str) -> str:
+        """Where a robot's agent waits until every robot has finished the tick."""
+        return f"{self.root}/sim/rendezvous/{check_name(robot)}"

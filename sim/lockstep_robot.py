@@ -1,0 +1,61 @@
+"""A robot of the simulation whose agent can wait for the other robots: what repeatable runs need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from agent.drivers.remote import PATIENCE, RemoteRobot
+from sim.keys import SimKeys
+from wire.bus import Bus
+from wire.packing import MAX_NUMBER, Reader, pack
+
+MAX_BYTES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Rendezvous:
+    """A step that moves nothing: answered with nothing when every other robot has finished the tick.
+
+    No time passes. A question that an agent asks the fleet right then has an answer that does not depend on
+    how quick the other robots were.
+
+    Attributes:
+        sequence: counts together with the steps of the same robot.
+    """
+
+    sequence: int
+
+
+def encode_rendezvous(step: Rendezvous) -> bytes:
+    """Encode it."""
+    return pack({"q": step.sequence})
+
+
+def decode_rendezvous(data: bytes) -> Rendezvous:
+    """Decode it.
+
+    Raises:
+        InvalidMessage: anything is wrong with it.
+    """
+    return Rendezvous(Reader(data, "rendezvous", MAX_BYTES).integer("q", 1, MAX_NUMBER))
+
+
+class LockstepRobot(RemoteRobot):
+    """A simulated body behind Zenoh keys."""
+
+    def __init__(self, bus: Bus, fleet: str, name: str, patience: float = PATIENCE) -> None:
+        """Nothing is asked yet; see RemoteRobot."""
+        super().__init__(bus, fleet, name, patience)
+        self._rendezvous_key = SimKeys(fleet).rendezvous(name)
+
+    def rendezvous(self) -> None:
+        """Wait until every other robot of the simulation has finished this tick; no time passes.
+
+        Raises:
+            DeviceError: nobody answers, or not properly.
+        """
+        if self._closed.is_set():
+            return
+        step = Rendezvous(self._sequence + 1)
+        self._ask(self._rendezvous_key, encode_rendezvous(step), bytes)
+        self._sequence += 1
