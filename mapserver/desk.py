@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -26,7 +26,7 @@ class DeskSettings:
     """How questions are shared out.
 
     Attributes:
-        workers: threads; 0: whoever asks does the work itself, one after the other and without a limit.
+        workers: questions that are worked on at once.
         in_time: a question that would have its answer later than this, as far as is known, is refused, unless
             a worker is free, s.
         too_late: one whose turn comes so late that its answer would take so many times as long is refused
@@ -49,8 +49,8 @@ class DeskSettings:
         Raises:
             SettingsError: a number out of range.
         """
-        if not 0 <= self.workers <= 64:
-            raise SettingsError(f"{self.workers} workers; use 0 to 64")
+        if not 1 <= self.workers <= 64:
+            raise SettingsError(f"{self.workers} workers; use 1 to 64")
         if not (self.in_time > 0.0 and self.first_guess > 0.0 and self.longest_pause > 0.0):
             raise SettingsError("in_time, first_guess and longest_pause must be positive")
         if not self.too_late >= 1.0:
@@ -67,13 +67,17 @@ class Desk:
     """
 
     def __init__(
-        self, settings: DeskSettings | None = None, clock: Callable[[], float] = time.monotonic
+        self,
+        settings: DeskSettings | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        executor: Executor | None = None,
     ) -> None:
         """Start the workers.
 
         Args:
             settings: how many, and what is too long.
             clock: tells the time, s.
+            executor: does the work; threads of its own if not given. It is shut down with this.
         """
         self._settings = settings or DeskSettings()
         self._clock = clock
@@ -85,7 +89,7 @@ class Desk:
         self._appointment = -math.inf
         self._booked: dict[int, float] = {}
         workers = self._settings.workers
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="desk") if workers else None
+        self._pool = executor or ThreadPoolExecutor(workers, thread_name_prefix="desk")
 
     def submit(self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True) -> Future[_T]:
         """Have something done.
@@ -102,13 +106,6 @@ class Desk:
         Raises:
             Busy: it would wait too long; nothing was done.
         """
-        if self._pool is None:
-            done: Future[_T] = Future()
-            try:
-                done.set_result(self._timed(work, usual))
-            except Exception as error:  # noqa: BLE001 - goes to whoever asks for the result, as a worker's does
-                done.set_exception(error)
-            return done
         with self._lock:
             s, now, wait = self._settings, self._clock(), self._wait()
             latest = s.too_late * s.in_time
@@ -133,8 +130,7 @@ class Desk:
 
     def close(self) -> None:
         """Finish what was taken on. Twice is no error."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._pool.shutdown()
 
     def _wait(self) -> float:
         """How long a question that comes now would wait for a worker, s."""

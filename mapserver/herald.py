@@ -10,7 +10,7 @@ import math
 import secrets
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -55,7 +55,14 @@ class _Told:
 class Herald:
     """Publishes news when it is bidden to, and gives all that it has told to whoever asks."""
 
-    def __init__(self, bus: Bus, keys: Keys, name: str, settings: HeraldSettings | None = None) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        name: str,
+        settings: HeraldSettings | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Begin to answer.
 
         Args:
@@ -63,7 +70,9 @@ class Herald:
             keys: of the fleet.
             name: of the server in the fleet.
             settings: what is worth telling.
+            clock: only grows, s.
         """
+        self._clock = clock
         self._bus, self._keys, self._name = bus, keys, name
         self._settings = settings or HeraldSettings()
         self._run = secrets.randbits(64)
@@ -84,7 +93,7 @@ class Herald:
             merged: the newest merged map.
             now: monotonic, s.
         """
-        now = time.monotonic() if now is None else now
+        now = self._clock() if now is None else now
         if now - self._looked < self._settings.every:
             return
         self._looked = now

@@ -43,6 +43,7 @@ class Services:
         blockages: Blockages,
         status: Callable[[], dict[str, Scalar]],
         history: Callable[[], Iterable[Happening]],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin to answer.
 
@@ -55,7 +56,9 @@ class Services:
             blockages: takes note of where robots did not get through.
             status: of the server.
             history: of the maps, for who takes them along.
+            clock: only grows, s.
         """
+        self._clock = clock
         self._answers = answers
         self._desk = desk
         self._blockages = blockages
@@ -86,8 +89,8 @@ class Services:
     def _route(self, payload: bytes) -> bytes:
         request = decode_route_request(payload)
         answers = self._answers()
-        self._blockages.report(request.blocked, time.monotonic())
-        wary = self._blockages.known(time.monotonic())
+        self._blockages.report(request.blocked, self._clock())
+        wary = self._blockages.known(self._clock())
         answer = answers.router.route(
             request.start, request.goal, request.blocked, wary, request.start_from_robot
         )

@@ -1,13 +1,11 @@
-"""Keeps the answers up to date: a thread of its own takes changes in and makes the merged map anew."""
+"""Keeps the answers up to date: takes changes in and merges in the background, piece by piece."""
 
 from __future__ import annotations
 
 import logging
-import queue
 import threading
-import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 
 from hybridmap.change import Change, NodePut
@@ -20,6 +18,7 @@ from mapserver.merging.deciding import Deciding
 from mapserver.merging.findingskeeper import FindingsKeeper
 from mapserver.merging.merger import Merger, MergerSettings
 from mapserver.places.placeindex import PlaceIndex
+from mapserver.schedule import Job, Schedule
 from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings
 
@@ -35,30 +34,13 @@ MOST_WORDS = 1000
 """Characters of an event in a status message."""
 
 
-@dataclass(frozen=True)
-class _Read:
-    """All of the store has been handed over; `taken` is set when it is taken in."""
-
-    taken: threading.Event = field(default_factory=threading.Event)
-
-
-@dataclass(frozen=True)
-class _Decided:
-    """What was to be decided again as a whole is decided, or could not be."""
-
-    well: bool
-
-
-News = Change | list[Change] | Rulings
-
-
 class Upkeep:
-    """Merges beside the questions. Only its thread touches the merger; done answers replace those before."""
+    """Merges beside the questions. Only its jobs touch the merger; new answers replace those before."""
 
     def __init__(
         self,
-        share: float,
-        by_itself: bool = True,
+        schedule: Schedule,
+        share: float = 0.4,
         index: PlaceIndex | None = None,
         merge: MergeSettings | None = None,
         keeper: FindingsKeeper | None = None,
@@ -67,29 +49,26 @@ class Upkeep:
         """Begin with nothing.
 
         Args:
+            schedule: runs the work, all of it one after the other.
             share: at most this share of the time is spent making the merged map anew.
-            by_itself: merge whenever there is something new; else only when somebody waits for it.
             index: is filled with the nodes that come; may have them already.
             merge: how maps are merged.
             keeper: of what comparing nodes has found.
             chronicle: of what becomes of the maps.
         """
+        self._schedule = schedule
         self._keeper = keeper
         self._chronicle = chronicle or Chronicle()
         self._share = share
-        self._by_itself = by_itself
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
-        self._deciding = Deciding(self._merger, lambda well: self._changes.put(_Decided(well)))
-        self._changes: queue.SimpleQueue[News | threading.Event | _Read | _Decided | None] = (
-            queue.SimpleQueue()
-        )
+        self._deciding = Deciding(self._merger, schedule, self._decided)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
         self._plight = ""
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
-        self._thread = threading.Thread(target=self._work, name="merge", daemon=True)
+        schedule.idle(self._idle)
 
     @property
     def answers(self) -> Answers:
@@ -106,9 +85,17 @@ class Upkeep:
         """Whether everything that has come is merged, or could not be."""
         return self._done == self._came
 
+    def current(self) -> Answers:
+        """Answers that know all that a question may expect them to know (see Schedule.catch_up)."""
+        self._schedule.catch_up()
+        return self._answers
+
     def start(self) -> None:
         """Begin to merge."""
-        self._thread.start()
+        if self._keeper:
+            keeper = self._keeper
+            self._schedule.post(lambda: keeper.restore(self._merger))
+        self._schedule.start()
 
     def take(self, change: Change) -> None:
         """Take note of a change, in the order of its log. Returns at once.
@@ -116,10 +103,11 @@ class Upkeep:
         A new place can be found from now on, however long a merge goes on: whoever merges takes the change in
         when its turn comes, and what it makes of the index then is what holds.
         """
-        if self._by_itself and isinstance(change.body, NodePut):
+        self._schedule.observe(change.stamp_ns)
+        if isinstance(change.body, NodePut):
             self._fresh[change.body.node.id] = change.body.node
             self._merger.index.add(change.body.node)
-        self._put(change)
+        self._post(lambda: self._take(change))
 
     def read(self, changes: Iterable[Change]) -> None:
         """Take in all that is in a store, map by map in the order of its log, once this has started.
@@ -130,104 +118,95 @@ class Upkeep:
         Raises:
             InvalidFile: the store is damaged.
         """
-        rest = iter(changes)
+        rest, taken = iter(changes), threading.Event()
         self._reading = True
         try:
             while some := list(islice(rest, READ_AT_ONCE)):
-                self._put(some)
+                self._post(partial(self._read, some))
         finally:
-            self._reading = False
-            end = _Read()
-            self._changes.put(end)
-        end.taken.wait()
+            self._schedule.post(lambda: self._end_reading(taken))
+        self._schedule.catch_up()
+        taken.wait()
 
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others. Returns at once."""
-        self._put(rulings)
+        self._post(lambda: self._merger.rule(rulings))
 
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         merged = threading.Event()
-        self._changes.put(merged)
+        self._schedule.post(lambda: self._settle(merged))
+        self._schedule.catch_up()
         return merged.wait(timeout)
 
     def close(self) -> None:
         """Stop after what has come."""
-        self._changes.put(None)
-        self._thread.join(30.0)
+        self._schedule.post(lambda: self._save(last=True))
+        self._schedule.close()
 
-    def _put(self, news: News) -> None:
+    def _post(self, job: Job) -> None:
+        """Post a job after which the merged map is out of date."""
         with self._counting:
             self._came += 1
-        self._changes.put(news)
 
-    def _work(self) -> None:
-        if self._keeper:
-            self._keeper.restore(self._merger)
-        try:
-            self._keep_up()
-        finally:
-            self._save(last=True)
+        def change() -> None:
+            try:
+                job()
+            finally:
+                self._applied += 1
+                self._dirty = True
+
+        self._schedule.post(change)
 
     def _save(self, last: bool = False) -> None:
         if self._keeper:
             self._keeper.save(self._merger, last)
 
-    def _keep_up(self) -> None:
-        rest_until = 0.0
-        while True:
-            pause = max(rest_until - time.monotonic(), 0.0)
-            try:
-                # What comes in pieces is merged when it is whole.
-                waits = (self._dirty or self._curious) and self._by_itself and not self._reading
-                change = self._changes.get(timeout=pause + 0.02 if waits else None)
-            except queue.Empty:
-                if self._merger.uncompared:
-                    self._look_around()
-                    continue
-                began = time.monotonic()
-                if self._dirty:
-                    self._merge()
-                else:
-                    self._prepare(PREPARED_AT_ONCE)
-                spent = time.monotonic() - began
-                rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
-                self._save()
-                self._deciding.begin()
-                continue
-            if change is None:
-                return
-            if isinstance(change, _Read):
-                if self._by_itself and self._merger.uncompared:
-                    self._tell_apart()
-                change.taken.set()
-                continue
-            if isinstance(change, _Decided):
-                self._dirty |= change.well
-                if not change.well:
-                    self._merger.give_up()
-                continue
-            if isinstance(change, threading.Event):
-                if self._dirty:
-                    self._merge()
-                if self._curious and not self._by_itself:
-                    self._prepare(len(self._answers.merged.postures))
-                change.set()
-                self._save()
-                continue
-            if isinstance(change, Rulings):
-                self._merger.rule(change)
-            elif isinstance(change, list):
-                self._read(change)
-            else:
-                self._apply(change)
-                if isinstance(change.body, NodePut):
-                    # A newer one of the same place may wait already.
-                    self._forget(change.body.node)
-            self._applied += 1
-            self._dirty = True
-            if time.monotonic() > rest_until + 2.0:
-                rest_until = time.monotonic()
+    def _idle(self) -> float | None:
+        """A piece of the work that can wait: compare nodes, merge, prepare answers."""
+        # What comes in pieces is merged when it is whole.
+        if self._reading or not (self._dirty or self._curious):
+            return None
+        if self._merger.uncompared:
+            self._look_around()
+            return 0.0
+        began = self._schedule.monotonic()
+        if self._dirty:
+            self._merge()
+        else:
+            self._prepare(PREPARED_AT_ONCE)
+        spent = self._schedule.monotonic() - began
+        self._save()
+        self._deciding.begin()
+        return spent * (1.0 / self._share - 1.0)
+
+    def _settle(self, merged: threading.Event) -> None:
+        if self._dirty:
+            self._merge()
+        merged.set()
+        self._save()
+
+    def _end_reading(self, taken: threading.Event) -> None:
+        self._reading = False
+        if self._merger.uncompared:
+            self._tell_apart()
+        taken.set()
+
+    def _decided(self, well: bool) -> None:
+        """What was to be decided again as a whole is decided, or could not be; called from any thread."""
+
+        def take_up() -> None:
+            self._dirty |= well
+            if not well:
+                self._merger.give_up()
+
+        self._schedule.post(take_up)
+
+    def _take(self, change: Change) -> None:
+        self._apply(change)
+        if isinstance(change.body, NodePut):
+            # A newer one of the same place may wait already.
+            self._forget(change.body.node)
 
     def _forget(self, node: Node) -> None:
         if self._fresh.get(node.id) is node:

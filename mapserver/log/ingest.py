@@ -266,7 +266,7 @@ class Ingest:
         return None
 
     def _apply(self, one: AgentLog, entries: list[Entry], covered: int | None) -> None:
-        """Commit, acknowledge, pass on: in this order."""
+        """Commit, pass on, acknowledge: in this order."""
         if not entries and covered is None:
             return
         try:
@@ -284,13 +284,14 @@ class Ingest:
         for refusal in applied.refusals:
             log.warning("refused %s %d: %s", one.map, refusal.sequence, refusal.reason)
         self._count(applied=len(applied.changes), refused=len(applied.refusals))
-        self._acknowledge(one)
         for change in applied.changes:
             try:
                 self._on_change(change)
             except Exception:
                 # The change is safe on the disk; whoever choked on it must not stop the other robots' logs.
                 log.exception("passing on %s %d failed", change.map, change.sequence)
+        # Last: a robot whose changes are acknowledged may ask at once what has become of them.
+        self._acknowledge(one)
 
     def _acknowledge(self, one: AgentLog) -> None:
         ack = Ack(one.map, one.log_id, one.watermark, one.refusals)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -25,13 +26,15 @@ WORTHWHILE = 0.02
 class FindingsKeeper:
     """Brings them back at the start, and saves them after merges. Only the merging thread may call it."""
 
-    def __init__(self, path: Path, fresh: bool = False) -> None:
+    def __init__(self, path: Path, fresh: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
         """Take note of where they lie.
 
         Args:
             path: of the store's file; they lie beside it.
             fresh: the store is new: nobody need be told that nothing is known of its nodes.
+            clock: tells the time, s.
         """
+        self._clock = clock
         self._path = path.with_name(path.name + SUFFIX)
         self._fresh = fresh
         self._saved: tuple[int, int] = (0, 0)
@@ -39,7 +42,7 @@ class FindingsKeeper:
 
     def restore(self, merger: Merger) -> None:
         """Let a merger that begins have what is known, if the file is there and sound."""
-        began = time.monotonic()
+        began = self._clock()
         try:
             findings = load(self._path, _made_by(merger))
         except InvalidFile as error:
@@ -49,7 +52,7 @@ class FindingsKeeper:
         else:
             log.info(
                 "%d nodes were compared with each other before, %d pairs; %.1f s",
-                len(findings.prints), len(findings), time.monotonic() - began,
+                len(findings.prints), len(findings), self._clock() - began,
             )  # fmt: skip
         merger.recollect(findings)
         self._saved = len(findings.prints), len(findings)
@@ -65,16 +68,16 @@ class FindingsKeeper:
             return  # The file knows more than this process yet.
         now, least = merger.compared, 0.0 if last else WORTHWHILE
         new = max(abs(one - before) for one, before in zip(now, self._saved, strict=True))
-        if not new or new < least * max(now) or (time.monotonic() < self._rest_until and not last):
+        if not new or new < least * max(now) or (self._clock() < self._rest_until and not last):
             return
-        began = time.monotonic()
+        began = self._clock()
         try:
             save(self._path, merger.findings(), _made_by(merger))
         except InvalidFile as error:
             log.warning("%s; the next start takes longer", error)
             return
         self._saved = now
-        self._rest_until = time.monotonic() + (time.monotonic() - began) / SHARE
+        self._rest_until = self._clock() + (self._clock() - began) / SHARE
 
 
 def _made_by(merger: Merger) -> str:

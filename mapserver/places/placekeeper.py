@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from pathlib import Path
 
@@ -25,29 +24,26 @@ WORTHWHILE = 0.02
 class PlaceKeeper:
     """Brings the index back at the start, as far as the store still says the same, and saves it."""
 
-    def __init__(self, store: Store, path: Path, every: float = EVERY) -> None:
+    def __init__(self, store: Store, path: Path) -> None:
         """Read the file, if it is there and fits the store.
 
         Args:
             store: says what is true.
             path: of the store's file; the index lies beside it.
-            every: seconds between two looks.
         """
-        self._store, self._path, self._every = store, path.with_name(path.name + SUFFIX), every
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="places", daemon=True)
+        self._store, self._path = store, path.with_name(path.name + SUFFIX)
         self.index = self._restored()
         self._saved = self.index.version
 
-    def start(self) -> None:
-        """Begin to save now and then."""
-        self._thread.start()
+    def look(self) -> None:
+        """Save the index if that is worth while; called every so many seconds."""
+        (before, _), (now, nodes) = self._saved, self.index.version
+        # A large index is not written for a few nodes: they are soon put in again.
+        if now - before >= WORTHWHILE * nodes:
+            self._save()
 
     def close(self) -> None:
         """Save for the last time; nobody may add to the index any more."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join()
         self._save()
 
     def _restored(self) -> PlaceIndex:
@@ -64,13 +60,6 @@ class PlaceKeeper:
             len(index), gone, time.monotonic() - began,
         )  # fmt: skip
         return index
-
-    def _work(self) -> None:
-        while not self._stop.wait(self._every):
-            (before, _), (now, nodes) = self._saved, self.index.version
-            # A large index is not written for a few nodes: they are soon put in again.
-            if now - before >= WORTHWHILE * nodes:
-                self._save()
 
     def _save(self) -> None:
         state = self.index.version

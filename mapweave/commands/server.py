@@ -42,6 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
     from hybridmap.node import check_name
     from mapserver.people.web import Web, parse_address
+    from mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapserver.server import MapServer, ServerSettings
     from mapweave.settings import merge_settings
     from wire.bus_settings import BusSettings
@@ -59,12 +60,13 @@ def run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:
-        how = ServerSettings(lockstep=arguments.lockstep, desk=settings.desk, merge=merge)
+        how = ServerSettings(desk=settings.desk, merge=merge)
+        schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         with ExitStack() as stack:
             path = arguments.data / f"{name}.sqlite"
             if path.exists() and path.stat().st_size > LARGE:
                 print(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ...", flush=True)
-            server = MapServer(bus, keys, path, name, how)
+            server = MapServer(bus, keys, path, name, how, schedule)
             stack.enter_context(server)
             where = ", ".join(network.endpoints)
             print(f"map server {name} of fleet {network.fleet} listens at {where}", flush=True)

@@ -12,6 +12,7 @@ from agent.fleet import decode_mission
 from agent.observation import Command
 from agent.synchronization import Lockstep
 from hybridmap.errors import MapweaveError
+from mapserver.schedule import LockstepSchedule
 from mapserver.server import MapServer, ServerSettings
 from mapweave.agent_process import Agent, AgentOptions
 from mapweave.settings import load_settings, merge_settings
@@ -128,8 +129,9 @@ class LocalFleet:
         """Start the server with the disk that is there."""
         self._stage.store.parent.mkdir(parents=True, exist_ok=True)
         self._server_bus, file = MemoryBus(self._hub), self._stage.settings_file
-        settings = ServerSettings(lockstep=True, merge=merge_settings(load_settings(file), file))
-        self._server = MapServer(self._server_bus, self.keys, self._stage.store, SERVER, settings)
+        settings = ServerSettings(merge=merge_settings(load_settings(file), file))
+        schedule = LockstepSchedule()
+        self._server = MapServer(self._server_bus, self.keys, self._stage.store, SERVER, settings, schedule)
         self._server.__enter__()
 
     def cut(self, robot: str) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from hybridmap.errors import Busy, SettingsError
 from mapserver.desk import Desk, DeskSettings
+from mapserver.schedule import LockstepSchedule
 
 
 class Clock:
@@ -46,7 +47,7 @@ class Counter:
         self.desk.close()
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [1, 2])
 def test_what_is_unusual_teaches_the_desk_nothing(workers: int) -> None:
     """A person's question takes seconds; no robot is turned away for it afterwards."""
     clock = Clock()
@@ -194,8 +195,8 @@ def test_the_time_that_a_question_takes_is_learned() -> None:
 
 
 def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
-    for workers in (0, 1):
-        desk = Desk(DeskSettings(workers))
+    for executor in (None, LockstepSchedule().executor(1)):
+        desk = Desk(DeskSettings(1), executor=executor)
         assert desk.submit(lambda: 3 + 4, 1).result(5) == 7
         for _ in range(3):
             with pytest.raises(ZeroDivisionError):
@@ -249,7 +250,8 @@ def test_closing_finishes_what_was_taken_on() -> None:
     assert done == list(range(20))
 
 
-def test_without_workers_the_asker_works_and_nobody_is_refused() -> None:
-    desk = Desk(DeskSettings(0, in_time=0.1, first_guess=100.0))
+def test_in_lockstep_the_asker_works_and_nobody_is_refused() -> None:
+    schedule = LockstepSchedule()
+    desk = Desk(DeskSettings(1, in_time=0.1, first_guess=100.0), schedule.monotonic, schedule.executor(1))
     threads = [desk.submit(threading.current_thread, k).result() for k in range(50)]
     assert set(threads) == {threading.current_thread()}

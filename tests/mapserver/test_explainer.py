@@ -26,6 +26,7 @@ from mapserver.log.store import Store
 from mapserver.mapfiles import map_file_of, maps_of, merged_of
 from mapserver.merging.merger import Merger
 from mapserver.routes import Router
+from mapserver.schedule import LockstepSchedule
 from mapserver.server import MapServer, ServerSettings
 from merge.belief.consistency import ConsistencySettings
 from merge.graph.merged import MergedMap
@@ -114,7 +115,7 @@ def serving(path: Path) -> Iterator[Asker]:
     hub = MemoryHub()
     bus, asker = MemoryBus(hub), MemoryBus(hub)
     try:
-        with MapServer(bus, KEYS, path, "s0", ServerSettings(lockstep=True)):
+        with MapServer(bus, KEYS, path, "s0", schedule=LockstepSchedule()):
             yield Asker(asker)
     finally:
         asker.close()
@@ -268,7 +269,7 @@ def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
     bus, merged = MemoryBus(MemoryHub()), MergedMap.empty()
     with serving(path) as asker:
         merged = merged_of(asker.merged())
-    store, desk, settled = Store(path), Desk(DeskSettings(workers=0)), False
+    store, desk, settled = Store(path), Desk(DeskSettings(workers=1)), False
     answers = SimpleNamespace(merged=merged, router=Router(merged))
     explainer = Explainer(
         bus, KEYS, "s0", lambda: answers, desk, RulingBook(store), lambda rulings: None, lambda: settled,
@@ -292,10 +293,10 @@ def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
 def test_witnesses_are_held_to_the_gate_of_the_merge(path: Path) -> None:
     with serving(path) as asker:
         pair = min(links(asker.merged()))
-    strict = ServerSettings(lockstep=True, merge=MergeSettings(ConsistencySettings(gate=1e-9)))
+    strict = ServerSettings(merge=MergeSettings(ConsistencySettings(gate=1e-9)))
     hub = MemoryHub()
     bus, asking = MemoryBus(hub), MemoryBus(hub)
-    with MapServer(bus, KEYS, path, "s0", strict):
+    with MapServer(bus, KEYS, path, "s0", strict, LockstepSchedule()):
         reply = Asker(asking).ask(KEYS.explain("s0"), encode_explain_request(ExplainRequest(pair)))
         assert not any(witness.agrees for witness in decode_pair(reply.payload).witnesses)
     asking.close()

@@ -16,7 +16,8 @@ from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from hybridmap.query import KnownAnswer
 from mapserver.known import Known
 from mapserver.merging.merger import Merger
-from mapserver.server import MapServer, ServerSettings
+from mapserver.schedule import LockstepSchedule
+from mapserver.server import MapServer
 from merge.graph.merged import MergedMap, Placement
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
@@ -126,7 +127,7 @@ def test_no_more_is_told_than_a_message_holds(scene: Scene) -> None:
 def test_the_server_answers_over_the_bus(scene: Scene, tmp_path) -> None:
     hub, keys = MemoryHub(), Keys("fleet")
     bus, asker = MemoryBus(hub), MemoryBus(hub)
-    with MapServer(bus, keys, tmp_path / "s0.sqlite", "s0", ServerSettings(lockstep=True)):
+    with MapServer(bus, keys, tmp_path / "s0.sqlite", "s0", schedule=LockstepSchedule()):
         (reply,) = asker.ask(keys.any_known(), encode_known_request(KnownRequest(A, 0.0, 0.0, 9.0)), 5.0)
         assert "map a.1 is not in the merged map" in decode_known_answer(reply.payload).reason
         (reply,) = asker.ask(keys.any_known(), b"garbage", 5.0)

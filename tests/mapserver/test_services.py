@@ -19,6 +19,7 @@ from mapserver.desk import DeskSettings
 from mapserver.merging.merger import Merger
 from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.relocalization import Relocalizer
+from mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapserver.server import MapServer, ServerSettings
 from merge.graph.merged import MergedMap
 from wire.bus import Reply
@@ -46,8 +47,8 @@ class Served:
         hub = MemoryHub()
         self.bus, self.asker = MemoryBus(hub), MemoryBus(hub)
         desk = DeskSettings(workers=2, in_time=0.31, too_late=1e3, first_guess=0.1)
-        settings = ServerSettings(lockstep=lockstep, desk=desk)
-        self.server = MapServer(self.bus, KEYS, room.path, "s0", settings)
+        settings, schedule = ServerSettings(desk=desk), LockstepSchedule() if lockstep else LiveSchedule()
+        self.server = MapServer(self.bus, KEYS, room.path, "s0", settings, schedule)
         self.nodes = sorted(room.truth)
 
     def __enter__(self) -> Served:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from hybridmap.ruling import Ruling, Rulings
 from mapserver.merging.merger import Merger
 from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.judgement import NOWHERE
+from mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapserver.upkeep import Upkeep
 from merge.graph.merged import MergedMap
 
@@ -31,7 +33,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
         return real(merger)
 
     monkeypatch.setattr(Merger, "merged", held)
-    upkeep = Upkeep(1.0)
+    upkeep = Upkeep(LiveSchedule(), 1.0)
     assert upkeep.settled
     upkeep.start()
     rulings = Rulings([Ruling((MapId("a", 1), MapId("b", 1)), True, "anna", 0)])
@@ -66,7 +68,7 @@ def test_a_store_that_is_read_at_once_merges_like_its_changes_one_by_one(
         monkeypatch.setattr(Merger, "read", fails)
     merged = []
     for at_once in (True, False):
-        upkeep = Upkeep(1.0)
+        upkeep = Upkeep(LiveSchedule(), 1.0)
         upkeep.start()
         if at_once:
             upkeep.read(iter(changes))
@@ -108,7 +110,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
         return real(merger)
 
     monkeypatch.setattr(Merger, "merged", held)
-    upkeep = Upkeep(1.0)
+    upkeep = Upkeep(LiveSchedule(), 1.0)
     upkeep.start()
     upkeep.rule(Rulings())
     assert entered.wait(20)
@@ -137,7 +139,7 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
         real(merger, most)
 
     monkeypatch.setattr(Merger, "look_around", held)
-    upkeep = Upkeep(1.0)
+    upkeep = Upkeep(LiveSchedule(), 1.0)
     upkeep.start()
     upkeep.read(iter(changes))
     assert len(upkeep.answers.merged.components) == 2
@@ -153,15 +155,16 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
     upkeep.close()
 
 
-def test_in_lockstep_the_index_takes_nothing_out_of_turn() -> None:
+def test_in_lockstep_all_that_has_come_is_merged_when_somebody_asks() -> None:
     _, _, changes = mapped_room(("a",))
-    index = PlaceIndex()
-    upkeep = Upkeep(1.0, by_itself=False, index=index)
-    for change in changes:
-        upkeep.take(change)
-    assert len(index) == 0
+    index, schedule = PlaceIndex(), LockstepSchedule()
+    upkeep = Upkeep(schedule, 1.0, index=index)
     upkeep.start()
-    assert upkeep.settle(20) and len(upkeep.answers.merged.postures) == len(index) == 4
+    for change in changes:
+        upkeep.take(replace(change, stamp_ns=change.sequence))
+    assert len(upkeep.answers.merged.postures) == 0
+    assert len(upkeep.current().merged.postures) == len(index) == 4 and upkeep.settled
+    assert schedule.time_ns() == len(changes)
     upkeep.close()
 
 
@@ -169,7 +172,7 @@ def test_an_index_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
     """Whoever gave it saves it: a server's first start must leave a saved index, too."""
     _, _, changes = mapped_room(("a",))
     index = PlaceIndex()
-    upkeep = Upkeep(1.0, index=index)
+    upkeep = Upkeep(LiveSchedule(), 1.0, index=index)
     upkeep.start()
     upkeep.read(iter(changes))
     assert len(index) == 4

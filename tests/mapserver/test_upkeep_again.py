@@ -12,6 +12,7 @@ from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
+from mapserver.schedule import LiveSchedule
 from mapserver.upkeep import Upkeep
 from merge.incremental.again import Again
 from merge.incremental.settings import StepSettings
@@ -44,7 +45,7 @@ def test_answers_go_on_while_all_is_decided_again(
         steps = zip(nodes, [None, *edges], strict=True)
         bodies = [body for n, e in steps for body in (NodePut(n), EdgePut(e) if e else None) if body]
         logs.append([Change(map_id, k, 0, body) for k, body in enumerate(bodies, 1)])
-    upkeep = Upkeep(1.0)
+    upkeep = Upkeep(LiveSchedule(), 1.0)
     upkeep.start()
     try:
         with caplog.at_level(logging.INFO):

@@ -2,7 +2,6 @@
 
 import logging
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -223,7 +222,6 @@ def test_a_server_that_starts_again_has_its_places_at_once(
 
     keeper = PlaceKeeper(store, path)
     assert f"made anew: {path}{SUFFIX}: there is none yet" in caplog.text and len(keeper.index) == 0
-    keeper.start()
     keeper.index.extend(replayed())
     keeper.close()
     put(store, [NodeRetired(NodeId("a", 1, 4)), *(NodePut(node) for node in many(3, 200))], 91)
@@ -257,22 +255,17 @@ def test_a_full_disk_is_told_and_nothing_half_is_left(
 def test_a_running_server_saves_when_enough_is_new(tmp_path: Path) -> None:
     store = Store(tmp_path / "store.db")
     kept = tmp_path / f"store.db{SUFFIX}"
-    keeper = PlaceKeeper(store, tmp_path / "store.db", every=0.01)
-    keeper.start()
+    keeper = PlaceKeeper(store, tmp_path / "store.db")
     nodes = many(120)
     keeper.index.extend(nodes[:100])
-    end = time.monotonic() + 20
-    while not kept.exists():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    first = kept.stat().st_mtime_ns
+    keeper.look()
+    first = kept.read_bytes()
     keeper.index.add(nodes[100])
-    time.sleep(0.1)
-    assert kept.stat().st_mtime_ns == first
+    keeper.look()
+    assert kept.read_bytes() == first
     keeper.index.extend(nodes[101:])
-    while kept.stat().st_mtime_ns == first:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    keeper.look()
+    assert kept.read_bytes() != first
     keeper.close()
     assert len(snapshot.load(kept, store.positions())) == 120
     store.close()

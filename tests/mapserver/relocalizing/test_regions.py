@@ -20,6 +20,7 @@ from mapserver.relocalizing.lookalikes import LookAlikes
 from mapserver.relocalizing.regions import RegionSettings
 from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
 from mapserver.relocalizing.seenplaces import Sighting
+from mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapserver.upkeep import PREPARED_AT_ONCE, Upkeep
 from merge.graph.merged import MergedMap, Placement
 from merge.graph.posegraph import Measurement, solve_graph
@@ -224,9 +225,9 @@ def test_what_is_prepared_is_not_looked_for_when_somebody_asks() -> None:
     assert asked(nodes, joined(nodes), least_nodes=0).prepare(9) == 0
 
 
-@pytest.mark.parametrize("by_itself", [True, False])
+@pytest.mark.parametrize("schedule", [LiveSchedule, LockstepSchedule])
 def test_a_server_finds_out_by_itself_what_nodes_look_like(
-    by_itself: bool, monkeypatch: pytest.MonkeyPatch
+    schedule: type[Schedule], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes, looked = here_and_there(), list[int]()
 
@@ -236,17 +237,14 @@ def test_a_server_finds_out_by_itself_what_nodes_look_like(
 
     prepare = Relocalizer.prepare
     monkeypatch.setattr(Relocalizer, "prepare", noted)
-    upkeep = Upkeep(1.0, by_itself)
+    upkeep = Upkeep(schedule(), 1.0)
     upkeep.start()
     for k, one in enumerate(nodes):
         upkeep.take(Change(one.id.map, k + 1, 0, NodePut(one)))
     assert upkeep.settle(20.0)
-    if by_itself:
-        eventually(lambda: all(upkeep._merger.alike.knows(one) for one in nodes))
-    # Where nothing happens by itself, it is done when everything else is.
-    assert all(upkeep._merger.alike.knows(one) for one in nodes)
+    eventually(lambda: all(upkeep._merger.alike.knows(one) for one in nodes))
     upkeep.close()
-    assert max(looked) == (PREPARED_AT_ONCE if by_itself else len(nodes))
+    assert max(looked) == PREPARED_AT_ONCE
 
 
 def test_landmarks_without_depths_say_nothing_of_regions() -> None:

@@ -1,0 +1,104 @@
+"""Schedules: the same jobs in the same order, on threads or driven in lock-step."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from mapserver.schedule import OVERDUE, LiveSchedule, LockstepSchedule, Schedule
+from tests.waiting import eventually
+
+
+def ended(schedule: Schedule) -> None:
+    """Nothing that was posted stays undone."""
+    schedule.close()
+    schedule.close()
+
+
+@pytest.mark.parametrize("make", [LiveSchedule, LockstepSchedule])
+def test_posted_jobs_run_in_order_and_a_defect_in_one_ends_no_other(
+    make: type[Schedule], caplog: pytest.LogCaptureFixture
+) -> None:
+    schedule, done = make(), list[int]()
+
+    def fails() -> None:
+        raise ZeroDivisionError("a defect")
+
+    schedule.start()
+    for k in range(50):
+        schedule.post(lambda k=k: done.append(k))
+        schedule.post(fails)
+    ended(schedule)
+    assert done == list(range(50))
+    assert "a background job failed" in caplog.text
+
+
+@pytest.mark.parametrize("make", [LiveSchedule, LockstepSchedule])
+def test_idle_work_goes_on_until_nothing_is_left(make: type[Schedule]) -> None:
+    schedule, left = make(), [5]
+
+    def idle() -> float | None:
+        if not left[0]:
+            return None
+        left[0] -= 1
+        return 0.001
+
+    schedule.idle(idle)
+    schedule.start()
+    schedule.post(lambda: None)
+    schedule.catch_up()
+    eventually(lambda: left[0] == 0)
+    ended(schedule)
+
+
+def test_idle_work_is_not_put_off_for_ever_by_jobs_that_keep_coming() -> None:
+    schedule, ran, stop = LiveSchedule(), threading.Event(), threading.Event()
+    schedule.idle(ran.set)
+    schedule.start()
+
+    def flood() -> None:
+        if not stop.is_set():
+            time.sleep(0.002)
+            schedule.post(flood)
+
+    began = time.monotonic()
+    flood()
+    assert ran.wait(20.0)
+    assert time.monotonic() - began >= 0.9 * OVERDUE
+    stop.set()
+    ended(schedule)
+
+
+def test_periodic_jobs_do_not_wait_for_long_ones() -> None:
+    schedule, beats, go = LiveSchedule(), list[float](), threading.Event()
+    schedule.every(0.01, lambda: beats.append(schedule.monotonic()))
+    schedule.start()
+    schedule.post(lambda: go.wait(20.0) and None)
+    eventually(lambda: len(beats) >= 3)
+    go.set()
+    ended(schedule)
+    count = len(beats)
+    time.sleep(0.05)
+    assert len(beats) == count
+
+
+def test_in_lockstep_nothing_runs_until_somebody_asks_and_time_is_that_of_the_robots() -> None:
+    schedule, done = LockstepSchedule(), list[str]()
+    schedule.every(1.0, lambda: done.append("beat"))
+    schedule.start()
+    schedule.post(lambda: done.append("job"))
+    schedule.observe(900_000_000)
+    schedule.observe(100_000_000)
+    assert done == [] and schedule.monotonic() == pytest.approx(0.9)
+    with schedule.executor(4) as executor:
+        asked = executor.submit(lambda: [*done, "answer"])
+        assert asked.result(0) == ["job", "answer"]
+        schedule.observe(1_000_000_000)
+        failing = executor.submit(lambda: 1 // 0)
+        assert isinstance(failing.exception(0), ZeroDivisionError)
+    assert done == ["job", "beat"]
+    schedule.observe(1_900_000_000)
+    schedule.catch_up()
+    assert done == ["job", "beat"] and schedule.time_ns() == 1_900_000_000
