@@ -8,7 +8,7 @@ from itertools import islice
 
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeKind, MapId, Node, NodeId
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
 from hybridmap.recognising.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
@@ -248,7 +248,7 @@ class Merger:
         self._dirty = True
         gone = one.nodes.get(body.id) if isinstance(body, NodeRetired) else None
         for edge in one.dropped_by(body):
-            if edge.kind is not EdgeKind.DRIVEN:
+            if _makes_neighbours(edge):
                 self._pairs.disconnect(edge.a, edge.b)
         one.apply(body)
         match body:
@@ -259,9 +259,7 @@ class Merger:
                 self._forget(node_id)
                 self.index.remove(node_id, None if gone is None else gone.landmarks.codes)
             case EdgePut(edge):
-                # Nodes so near to each other on a robot's way are not compared: it tells nothing new. A
-                # later drive says nothing of that; it may lead from map to map.
-                if edge.kind is not EdgeKind.DRIVEN:
+                if _makes_neighbours(edge):
                     self._pairs.connect(edge.a, edge.b)
 
     def _verify(self, pairs: Iterable[Pair]) -> None:
@@ -285,3 +283,12 @@ class Merger:
         self._succession.drop(node_id)
         for other in self._known.pop(node_id, {}):
             del self._known[other][node_id]
+
+
+def _makes_neighbours(edge: Edge) -> bool:
+    """Whether an edge says that two nodes are near to each other on their robot's way.
+
+    These are not compared: it tells nothing new. A later drive says nothing of that, and nobody says it of
+    others' nodes.
+    """
+    return edge.kind is not EdgeKind.DRIVEN and edge.within
