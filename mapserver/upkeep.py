@@ -31,6 +31,8 @@ LOOK_AT_ONCE = 20
 """Nodes for which is looked what is like them, before what has come meanwhile is taken in."""
 PREPARED_AT_ONCE = 4
 """Nodes of which is found out what they look like, likewise."""
+LATEST = 2.0
+"""s after which it is merged although more comes: robots may put nodes many times a second."""
 MOST_WORDS = 1000
 """Characters of an event in a status message."""
 
@@ -86,7 +88,8 @@ class Upkeep:
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
-        self._plight = ""
+        self._plight, self._since = "", 0.0
+        self._merger.suspect(self._chronicle.set_apart)
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
         self._thread = threading.Thread(target=self._work, name="merge", daemon=True)
@@ -118,7 +121,10 @@ class Upkeep:
         """
         if self._by_itself and isinstance(change.body, NodePut):
             self._fresh[change.body.node.id] = change.body.node
-            self._merger.index.add(change.body.node)
+            try:
+                self._merger.index.add(change.body.node)
+            except Exception:  # it is tried once more when its turn comes
+                log.exception("change %s of %s cannot be found yet", change.sequence, change.map)
         self._put(change)
 
     def read(self, changes: Iterable[Change]) -> None:
@@ -163,7 +169,10 @@ class Upkeep:
 
     def _work(self) -> None:
         if self._keeper:
-            self._keeper.restore(self._merger)
+            try:
+                self._keeper.restore(self._merger)
+            except Exception:  # it can all be found out again
+                log.exception("what was found before cannot be read: nodes are compared anew")
         try:
             self._keep_up()
         finally:
@@ -171,29 +180,25 @@ class Upkeep:
 
     def _save(self, last: bool = False) -> None:
         if self._keeper:
-            self._keeper.save(self._merger, last)
+            try:
+                self._keeper.save(self._merger, last)
+            except Exception:  # the next start takes longer
+                log.exception("what was found is not kept")
 
     def _keep_up(self) -> None:
         rest_until = 0.0
         while True:
-            pause = max(rest_until - time.monotonic(), 0.0)
+            # What comes in pieces is merged when it is whole.
+            waits = (self._dirty or self._curious) and self._by_itself and not self._reading
+            now = time.monotonic()
+            pause = max(rest_until - now, 0.0) + 0.02 if waits else None
+            if waits and self._dirty and now >= max(self._since + LATEST, rest_until):
+                rest_until = self._work_a_turn()
+                continue
             try:
-                # What comes in pieces is merged when it is whole.
-                waits = (self._dirty or self._curious) and self._by_itself and not self._reading
-                change = self._changes.get(timeout=pause + 0.02 if waits else None)
+                change = self._changes.get(timeout=pause)
             except queue.Empty:
-                if self._merger.uncompared:
-                    self._look_around()
-                    continue
-                began = time.monotonic()
-                if self._dirty:
-                    self._merge()
-                else:
-                    self._prepare(PREPARED_AT_ONCE)
-                spent = time.monotonic() - began
-                rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
-                self._save()
-                self._deciding.begin()
+                rest_until = self._work_a_turn()
                 continue
             if change is None:
                 return
@@ -203,8 +208,9 @@ class Upkeep:
                 change.taken.set()
                 continue
             if isinstance(change, _Decided):
-                self._dirty |= change.well
-                if not change.well:
+                if change.well:
+                    self._soil()
+                else:
                     self._merger.give_up()
                 continue
             if isinstance(change, threading.Event):
@@ -219,15 +225,44 @@ class Upkeep:
                 self._merger.rule(change)
             elif isinstance(change, list):
                 self._read(change)
-            else:
+            elif not self._outdated(change):
                 self._apply(change)
                 if isinstance(change.body, NodePut):
                     # A newer one of the same place may wait already.
                     self._forget(change.body.node)
             self._applied += 1
-            self._dirty = True
-            if time.monotonic() > rest_until + 2.0:
-                rest_until = time.monotonic()
+            self._soil()
+
+    def _soil(self) -> None:
+        """There is something to merge."""
+        if not self._dirty:
+            self._since = time.monotonic()
+        self._dirty = True
+
+    def _work_a_turn(self) -> float:
+        """Merge, or what else is to be done; returns until when to rest (monotonic, s)."""
+        if self._merger.uncompared:
+            self._look_around()
+            return 0.0
+        began = time.monotonic()
+        if self._dirty:
+            self._merge()
+        else:
+            self._prepare(PREPARED_AT_ONCE)
+        ended = time.monotonic()
+        self._save()
+        try:
+            self._deciding.begin()
+        except Exception:  # steps go on from what stands
+            log.exception("nothing can be decided again")
+        return ended + (ended - began) * (1.0 / self._share - 1.0)
+
+    def _outdated(self, change: Change) -> bool:
+        """Whether a node is put that is put anew by what waits: the last one counts."""
+        if not isinstance(change.body, NodePut):
+            return False
+        newest = self._fresh.get(change.body.node.id)
+        return newest is not None and newest is not change.body.node
 
     def _forget(self, node: Node) -> None:
         if self._fresh.get(node.id) is node:
@@ -282,9 +317,10 @@ class Upkeep:
 
     def _merge(self) -> None:
         self._dirty = False
+        made: list[Answers] = []
         try:
-            merged = self._merger.merged()
-            self._answers = self._answers_from(merged)
+            merged = self._merger.merged(lambda merged: made.append(self._answers_from(merged)))
+            self._answers = made[-1] if made else self._answers_from(merged)
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("the merged map could not be made anew")
             self._plight = "the merged map could not be made anew: see the server's log"
