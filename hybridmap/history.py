@@ -14,6 +14,8 @@ class Kind(StrEnum):
     """What was one map is no longer; the words say what took its links away."""
     KEPT_APART = "kept apart"
     """Links between two maps were found, and refused: two robots cannot have been where they say."""
+    SET_APART = "set apart"
+    """The merge fails with a map, and is made without it; or it is taken in again."""
     RULED = "ruled"
     """A person has decided."""
     FAILED = "failed"

@@ -228,3 +228,8 @@ class Edge:
     kind: EdgeKind
     shared: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     evidence: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def within(self) -> bool:
+        """Whether it joins two nodes of the very map that tells it."""
+        return self.a[:2] == self.b[:2] == self.id[:2]

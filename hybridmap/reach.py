@@ -9,6 +9,7 @@ further off, and no more turned, than the servo manages from (docs/decisions/lif
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +70,7 @@ def reach_of(edge: Edge, a: Node, b: Node, settings: ReachSettings | None = None
         return Reach(True, -1, f"{edge.kind} by a robot: it can be driven")
     s = settings or ReachSettings()
     between = edge.a_from_b.mean
-    count = int(least_in_view(edge.shared, a, b, between, s.stops))
+    count = int(least_in_view(left(edge.shared, a, b), a, b, between, s.stops))
     distance, turn = between.distance(Pose2()), abs(between.heading)
     lacks = []
     if count < s.least:
@@ -96,6 +97,24 @@ def closed_edges(hybrid_map: HybridMap, settings: ReachSettings | None = None) -
         and edge.b in nodes
         and not reach_of(edge, nodes[edge.a], nodes[edge.b], settings).drivable
     }
+
+
+def left(
+    shared: NDArray[np.int64], a: Node, b: Node, gone: Sequence[NDArray[np.bool_] | None] = (None, None)
+) -> NDArray[np.int64]:
+    """(K, 2) of common landmarks those that both nodes have: one may have been put anew with fewer.
+
+    Args:
+        shared: landmarks of a and of b that are the same.
+        a: one node.
+        b: the other.
+        gone: which landmarks of a and of b are thought to be gone.
+    """
+    out: NDArray[np.int64] = shared[(shared < [len(a.landmarks), len(b.landmarks)]).all(axis=1)]
+    for side, mask in enumerate(gone):
+        if mask is not None:
+            out = out[~mask[out[:, side]]]
+    return out
 
 
 def least_in_view(shared: NDArray[np.int64], a: Node, b: Node, a_from_b: Pose2, stops: int = 9) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.node import Edge, EdgeId, Node
-from hybridmap.reach import Reach, ReachSettings, reach_of
+from hybridmap.reach import Reach, ReachSettings, left, reach_of
 
 
 class ReachBook:
@@ -36,11 +36,8 @@ class ReachBook:
         behind = (edge.a_from_b, a, b, *gone)
         known = self._known.get(edge.id)
         if known is None or any(one is not other for one, other in zip(known[0], behind, strict=True)):
-            left = np.ones(len(edge.shared), np.bool_)
-            for side, mask in enumerate(gone):
-                if mask is not None:
-                    left &= ~mask[edge.shared[:, side]]
-            known = behind, reach_of(replace(edge, shared=edge.shared[left]), a, b, self._settings)
+            seen = replace(edge, shared=left(edge.shared, a, b, gone))
+            known = behind, reach_of(seen, a, b, self._settings)
             self._known[edge.id] = known
         return known[1]
 

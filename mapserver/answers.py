@@ -33,6 +33,7 @@ class Answers:
     @classmethod
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
         """Answers from a merged map; nodes that are newer, of which `node_of` knows, lie nowhere yet."""
-        places = LivingPlaces(merger.index, node_of, merged)
+        set_apart = [node for one in merged.set_apart for node in merger.maps[one].nodes]
+        places = LivingPlaces(merger.index, node_of, merged, set_apart)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Known(merged))

@@ -67,9 +67,14 @@ class Chronicle:
         """Words of what last became of the maps; empty if nothing has."""
         return next((one.words for one in reversed(self.happenings) if one.kind is not Kind.FAILED), "")
 
+    @property
+    def set_apart(self) -> frozenset[MapId]:
+        """Maps that were set apart by the last merge that was followed, also of another process."""
+        return self._kept.set_apart
+
     def follow(self, merged: MergedMap) -> None:
         """Take note of what has changed with a merge, and keep it."""
-        if not merged.maps:
+        if not merged.maps and not merged.set_apart:
             return  # Nothing is read yet: what was one is no less so.
         before, now = self._kept.parts, tuple(joined_maps(merged))
         same = now == before
@@ -82,33 +87,42 @@ class Chronicle:
         new = [pair for pair in apart if pair not in still][: MOST_APART - len(still)]
         # Of what has just parted it is told already what stands between.
         held = [apart[a, b] for a, b in new if was_in.get(a, -1) != was_in.get(b, -2)]
-        for words in joined:
+        bad, before_bad = merged.set_apart, self._kept.set_apart
+        left_out = [f"map {one} is set apart: {bad[one]}" for one in sorted(bad.keys() - before_bad)]
+        taken_in = [f"map {one} is no longer set apart" for one in sorted(before_bad - bad.keys())]
+        for words in (*joined, *taken_in):
             log.info("%s", words)
-        for words in (*parted, *held):
+        for words in (*parted, *held, *left_out):
             log.warning("%s", words)
         # Of what happens at once, that something came apart is what people must see last.
         fresh = [
             *_briefly(Kind.JOINED, joined),
             *_briefly(Kind.KEPT_APART, held),
             *_briefly(Kind.PARTED, parted),
+            *_briefly(Kind.SET_APART, taken_in),
+            *_briefly(Kind.SET_APART, left_out),
         ]
         known = frozenset(still | set(new))
         self._links = merged.links
         if fresh or now != before or known != self._kept.apart:
-            self._keep(fresh, now, known)
+            self._keep(fresh, now, known, frozenset(bad))
 
     def failed(self, words: str) -> None:
         """Take note that something could not be done; the same twice is told once."""
         if not self._kept.happenings or self._kept.happenings[-1].words != words:
-            self._keep([(Kind.FAILED, words)], self._kept.parts, self._kept.apart)
+            self._keep([(Kind.FAILED, words)], self._kept.parts, self._kept.apart, self._kept.set_apart)
 
     def _keep(
-        self, fresh: list[tuple[Kind, str]], parts: tuple[frozenset[MapId], ...], apart: frozenset[Pair]
+        self,
+        fresh: list[tuple[Kind, str]],
+        parts: tuple[frozenset[MapId], ...],
+        apart: frozenset[Pair],
+        set_apart: frozenset[MapId],
     ) -> None:
         """Add to the record; it is on the disk when this returns, unless the disk does not take it."""
         now = self._clock()
         more = [Happening(now, kind, _one_line(words)) for kind, words in fresh]
-        kept = KeptHistory((*self._kept.happenings, *more)[-self._most :], parts, apart)
+        kept = KeptHistory((*self._kept.happenings, *more)[-self._most :], parts, apart, set_apart)
         with self._lock:
             self._kept = kept
         if self._store is None:

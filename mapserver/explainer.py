@@ -65,6 +65,10 @@ class RulingBook:
         """All of them, in order."""
         return self._rulings
 
+    def maps(self) -> list[MapId]:
+        """All maps of which the server has anything: they can be retired."""
+        return self._store.maps()
+
     def add(self, ruling: Ruling) -> None:
         """Enter a ruling; it is on the disk when this returns.
 
@@ -165,7 +169,7 @@ class Explainer:
     def _decree(self, payload: bytes) -> bytes:
         ruling = decode_ruling(payload)
         with self._turn:
-            check_ruling(self._answers().merged, self._book.rulings, ruling)
+            check_ruling(self._answers().merged, self._book.rulings, ruling, self._book.maps())
             self._book.add(ruling)
             self._rule(self._book.rulings)
         said = said_of(ruling)

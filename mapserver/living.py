@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from hybridmap.node import Node, NodeId
@@ -12,31 +12,37 @@ from merge.graph.merged import MergedMap
 
 
 class LivingPlaces:
-    """The place index without superseded nodes and retired maps, and nodes without what has faded.
+    """The place index without superseded nodes and maps that are retired or set apart, and nodes without what
+    has faded.
 
     It stands for one merged map; make another for the next. New nodes are compared with all of the index.
     """
 
     def __init__(
-        self, index: PlaceIndex, node_of: Callable[[NodeId], Node | None], merged: MergedMap
+        self,
+        index: PlaceIndex,
+        node_of: Callable[[NodeId], Node | None],
+        merged: MergedMap,
+        set_apart: Iterable[NodeId] = (),
     ) -> None:
         """Take what is known.
 
         Args:
             index: of all nodes, also of such as are not in the merged map yet.
             node_of: gives a node by its id as its robot told it.
-            merged: says what is superseded, retired or faded.
+            merged: says what is superseded, retired, set apart or faded.
+            set_apart: the nodes of maps that are set apart.
         """
         self._index, self._node_of, self._merged = index, node_of, merged
-        self._retired = frozenset(merged.rulings.retired)
-        retired = (node for one in self._retired if one in merged.maps for node in merged.maps[one].nodes)
-        self._hidden = frozenset((*merged.superseded, *retired))
+        self._left_out = frozenset((*merged.rulings.retired, *merged.set_apart))
+        retired = (node for one in self._left_out if one in merged.maps for node in merged.maps[one].nodes)
+        self._hidden = frozenset((*merged.superseded, *retired, *set_apart))
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
         """At most k living nodes with how much they look like a view, best first."""
         ranked = self._index.query(view, k, exclude=self._hidden)
         # A retired map's robot may have mapped on.
-        return [(node, score) for node, score in ranked if node.map not in self._retired]
+        return [(node, score) for node, score in ranked if node.map not in self._left_out]
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node with the landmarks that are thought to be there; None if it is gone."""

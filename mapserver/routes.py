@@ -111,7 +111,9 @@ class Router:
         for name, node in (("start", start), ("goal", goal)):
             if node not in self.merged.postures:
                 retired = self.merged.rulings.retired.get(node.map)
+                apart = self.merged.set_apart.get(node.map)
                 why = f": {reason_of(retired)}" if retired is not None else ""
+                why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")
                 return f"{name} {node} is not in the merged map{why}"
         if self.merged.component_of(start) != self.merged.component_of(goal):
             return f"{start} and {goal} are in parts of the map that nothing joins yet"

@@ -66,6 +66,7 @@ class Upkeep:
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
         self._plight = ""
+        self._merger.suspect(self._chronicle.set_apart)
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
         schedule.idle(self._idle)
@@ -92,9 +93,7 @@ class Upkeep:
 
     def start(self) -> None:
         """Begin to merge."""
-        if self._keeper:
-            keeper = self._keeper
-            self._schedule.post(lambda: keeper.restore(self._merger))
+        self._schedule.post(self._restore)
         self._schedule.start()
 
     def take(self, change: Change) -> None:
@@ -106,7 +105,10 @@ class Upkeep:
         self._schedule.observe(change.stamp_ns)
         if isinstance(change.body, NodePut):
             self._fresh[change.body.node.id] = change.body.node
-            self._merger.index.add(change.body.node)
+            try:
+                self._merger.index.add(change.body.node)
+            except Exception:  # it is tried once more when its turn comes
+                log.exception("change %s of %s cannot be found yet", change.sequence, change.map)
         self._post(lambda: self._take(change))
 
     def read(self, changes: Iterable[Change]) -> None:
@@ -158,9 +160,19 @@ class Upkeep:
 
         self._schedule.post(change)
 
+    def _restore(self) -> None:
+        if self._keeper:
+            try:
+                self._keeper.restore(self._merger)
+            except Exception:  # it can all be found out again
+                log.exception("what was found before cannot be read: nodes are compared again")
+
     def _save(self, last: bool = False) -> None:
         if self._keeper:
-            self._keeper.save(self._merger, last)
+            try:
+                self._keeper.save(self._merger, last)
+            except Exception:  # the next start takes longer
+                log.exception("what was found is not kept")
 
     def _idle(self) -> float | None:
         """A piece of the work that can wait: compare nodes, merge, prepare answers."""
@@ -177,7 +189,10 @@ class Upkeep:
             self._prepare(PREPARED_AT_ONCE)
         spent = self._schedule.monotonic() - began
         self._save()
-        self._deciding.begin()
+        try:
+            self._deciding.begin()
+        except Exception:  # steps go on from what stands
+            log.exception("nothing can be decided again")
         return spent * (1.0 / self._share - 1.0)
 
     def _settle(self, merged: threading.Event) -> None:
@@ -203,10 +218,14 @@ class Upkeep:
         self._schedule.post(take_up)
 
     def _take(self, change: Change) -> None:
-        self._apply(change)
         if isinstance(change.body, NodePut):
-            # A newer one of the same place may wait already.
+            newest = self._fresh.get(change.body.node.id)
+            if newest is not None and newest is not change.body.node:
+                return  # The same node is put again by a change that waits: the last one counts.
+            self._apply(change)
             self._forget(change.body.node)
+        else:
+            self._apply(change)
 
     def _forget(self, node: Node) -> None:
         if self._fresh.get(node.id) is node:
@@ -261,9 +280,10 @@ class Upkeep:
 
     def _merge(self) -> None:
         self._dirty = False
+        made: list[Answers] = []
         try:
-            merged = self._merger.merged()
-            self._answers = self._answers_from(merged)
+            merged = self._merger.merged(lambda merged: made.append(self._answers_from(merged)))
+            self._answers = made[-1] if made else self._answers_from(merged)
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("the merged map could not be made anew")
             self._plight = "the merged map could not be made anew: see the server's log"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybridmap.errors import InvalidFile
+from hybridmap.errors import InvalidFile, InvalidValue
 from hybridmap.history import Happening
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
@@ -104,6 +104,9 @@ def merge_parts(
         rulings: of people.
         progress: told how far it is.
         settings: how they are merged.
+
+    Raises:
+        InvalidValue: a map cannot be merged; nobody must lose it by writing the others.
     """
     merger = Merger(settings=MergerSettings(merging=settings or MergeSettings()))
     merger.rule(rulings)
@@ -111,4 +114,7 @@ def merge_parts(
     for k, (map_id, body) in enumerate(bodies):
         merger.apply(map_id, body)
         progress(k + 1, len(bodies))
-    return merger.merged()
+    merged = merger.merged()
+    for map_id, reason in merged.set_apart.items():
+        raise InvalidValue(f"map {map_id} cannot be merged: {reason}; leave its file out, or retire it")
+    return merged

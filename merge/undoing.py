@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
@@ -83,13 +83,16 @@ def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Ruling
     return Undone(left, tuple(kept), tuple(refused), maps, rulings)
 
 
-def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
+def check_ruling(
+    merged: MergedMap, rulings: Rulings, ruling: Ruling, known_maps: Container[MapId] = ()
+) -> None:
     """Refuse a ruling that would change nothing: it is meant otherwise.
 
     Args:
         merged: what it is made about.
         rulings: that were made before, merged already or not.
         ruling: the new one.
+        known_maps: that are there, in the merged map or not: any of them can be retired.
 
     Raises:
         InvalidValue: there is nothing to undo, or nothing to take back.
@@ -97,7 +100,9 @@ def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
     first, second = ruling.ends
     known = next((r for r in rulings.in_force if r.ends == ruling.ends), None)
     if ruling.retires is not None:
-        _check_retirement(merged, known, ruling, ruling.retires)
+        if ruling.retires not in known_maps:
+            merged.check(ruling.retires)
+        _check_retirement(known, ruling, ruling.retires)
         return
     if not ruling.apart:
         if known is None:
@@ -128,8 +133,7 @@ def check_ruling(merged: MergedMap, rulings: Rulings, ruling: Ruling) -> None:
     raise InvalidValue(f"no link joins {first} and {second}: there is nothing to undo")
 
 
-def _check_retirement(merged: MergedMap, known: Ruling | None, ruling: Ruling, which: MapId) -> None:
-    merged.check(which)
+def _check_retirement(known: Ruling | None, ruling: Ruling, which: MapId) -> None:
     if ruling.apart and known is not None:
         raise InvalidValue(f"map {which} is retired already: {reason_of(known)}")
     if not ruling.apart and known is None:

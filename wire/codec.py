@@ -3,7 +3,8 @@
 A change is an envelope (sequence number, stamp) around a *body*. The body alone is what a map file holds. Ids
 of the body's own map are written as a bare number, ids of other maps in full.
 
-Encoding rounds (see hybridmap.grid); what was decoded encodes to the same bytes again.
+Encoding rounds (see hybridmap.grid), and brings variances and evidence within their bounds; what was decoded
+encodes to the same bytes again.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from hybridmap.wake import Wake
 from wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
 from wire.landmarks_v1 import unpack_landmarks_v1
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
-from wire.posture_codec import pack_camera, pack_posture, unpack_camera, unpack_posture
+from wire.posture_codec import MAX_MEASURED, pack_camera, pack_posture, unpack_camera, unpack_posture
 from wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
 from wire.wake_codec import MAX_WAKE_BYTES, pack_wake, unpack_wake
 
@@ -36,6 +37,8 @@ SINGLE = struct.Struct("<f")
 NO_RANGES = Ranges()
 NO_WAKE = Wake()
 MAX_EVIDENCE = 64
+MOST_EVIDENCE = float(MAX_LANDMARKS)
+"""Greatest number among the evidence: most are counts of landmarks or less. More says nothing more."""
 
 NODE_PUT, NODE_RETIRED, EDGE_PUT, EDGE_RETIRED = 1, 2, 3, 4
 
@@ -148,7 +151,7 @@ def unwrap_body(data: bytes) -> tuple[int, int, bytes]:
 def _node_fields(node: Node) -> dict[str, object]:
     fields: dict[str, object] = {
         "t": node.stamp_ns,
-        "p": pack_posture(node.map_from_robot),
+        "p": pack_posture(node.map_from_robot, MAX_MEASURED),
         "c": pack_camera(node.camera),
         "m": pack_landmarks(node.landmarks, node.camera),
     }
@@ -175,7 +178,7 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
     return Node(
         id=element,
         stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
-        map_from_robot=unpack_posture(reader.binary("p", MAX_BODY_BYTES)),
+        map_from_robot=unpack_posture(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
         camera=camera,
         landmarks=_read_landmarks(reader, camera),
         clock=reader.name("z") if reader.has("z") else "",
@@ -196,7 +199,7 @@ def _edge_fields(edge: Edge) -> dict[str, object]:
     fields: dict[str, object] = {
         "a": _reference(edge.a, edge.id.map),
         "b": _reference(edge.b, edge.id.map),
-        "p": pack_posture(edge.a_from_b),
+        "p": pack_posture(edge.a_from_b, MAX_MEASURED),
         "w": EDGE_KINDS[edge.kind],
     }
     if len(edge.shared):
@@ -215,10 +218,12 @@ def _read_edge(reader: Reader, element: NodeId) -> Edge:
         id=element,
         a=a,
         b=b,
-        a_from_b=unpack_posture(reader.binary("p", MAX_BODY_BYTES)),
+        a_from_b=unpack_posture(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
         kind=KINDS_OF_EDGE[reader.integer("w", 1, len(EDGE_KINDS))],
         shared=_unpack_shared(reader.binary("h", 1 + 4 * MAX_SHARED) if reader.has("h") else b"\x01"),
-        evidence={name: reader.as_number(value, name, -1e30, 1e30) for name, value in evidence.items()},
+        evidence={
+            name: reader.as_number(value, name, 0.0, MOST_EVIDENCE) for name, value in evidence.items()
+        },
     )
 
 
@@ -234,15 +239,12 @@ def _read_reference(reader: Reader, name: str, home: MapId) -> NodeId:
 
 
 def _small(value: float) -> int | float:
-    """A whole number packs into one to five bytes, another one, rounded to float32, into five."""
-    try:
-        # Rounded first: what becomes whole by it must look the same when it is encoded again.
-        (number,) = SINGLE.unpack(SINGLE.pack(value))
-    except OverflowError:
-        raise InvalidValue(f"edge: {value:g} in its evidence is out of range") from None
-    if math.isfinite(number) and number == int(number) and abs(number) < 2**24:
-        return int(number)
-    return float(number)
+    """A whole number packs into one to three bytes, another one, rounded to float32, into five."""
+    if not math.isfinite(value):
+        raise InvalidValue(f"edge: {value:g} in its evidence is no number")
+    # Rounded first: what becomes whole by it must look the same when it is encoded again.
+    (number,) = SINGLE.unpack(SINGLE.pack(min(max(value, 0.0), MOST_EVIDENCE)))
+    return int(number) if number == int(number) else float(number)
 
 
 def _pack_shared(shared: NDArray[Any]) -> bytes:

@@ -25,11 +25,13 @@ class KeptHistory:
         happenings: in order.
         parts: maps that were one when it was written, each in one set.
         apart: two maps each of which it was told that they are kept apart.
+        set_apart: maps of which it was told that they are set apart.
     """
 
     happenings: tuple[Happening, ...] = ()
     parts: tuple[frozenset[MapId], ...] = ()
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
+    set_apart: frozenset[MapId] = frozenset()
 
 
 def encode_history(happenings: Sequence[Happening]) -> bytes:
@@ -50,6 +52,7 @@ def encode_kept_history(kept: KeptHistory) -> bytes:
             "h": [pack_happening(one) for one in kept.happenings],
             "p": [[list(one) for one in sorted(part)] for part in kept.parts],
             "a": [[list(one), list(two)] for one, two in sorted(kept.apart)],
+            "s": [list(one) for one in sorted(kept.set_apart)],
         }
     )
     return _checked(data)
@@ -64,6 +67,7 @@ def decode_kept_history(data: bytes) -> KeptHistory:
         _happenings(reader),
         tuple(frozenset(part) for part in parts),
         frozenset((pair[0], pair[1]) for pair in apart if len(pair) == 2),
+        frozenset(_maps(reader, reader.any("s"))) if reader.has("s") else frozenset(),
     )
 
 

@@ -8,14 +8,21 @@ import numpy as np
 
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.pose import Array, Pose2, PoseGaussian
 
 CAMERA = struct.Struct("<HH6d")
 POSTURE = struct.Struct("<9f")
 UPPER = np.triu_indices(3)
 
 MAX_POSITION = 1e6
-"""No robot drives farther from its start than this, m."""
+"""Of whatever a message places, m. What a merge places is the sum of what robots measured."""
+
+MAX_MEASURED = 1e5
+"""Of what a robot itself places, nodes and ends of edges, m: a day's drive at 1 m/s, where float32 still
+tells centimetres."""
+
+MAX_VARIANCE = 1e4
+"""Largest eigenvalue of a covariance, m^2 or rad^2: who is off by 100 m knows nothing."""
 
 
 def pack_camera(camera: Camera) -> bytes:
@@ -49,22 +56,38 @@ def unpack_camera(data: bytes) -> Camera:
         raise InvalidMessage(str(error)) from None
 
 
-def pack_posture(posture: PoseGaussian) -> bytes:
+def pack_posture(posture: PoseGaussian, farthest: float = MAX_POSITION) -> bytes:
     """Encode a posture: mean x, y, heading, then the covariance's upper triangle by rows, nine float32.
+
+    Greater variances become the greatest: that nothing is known can always be said.
 
     Raises:
         InvalidValue: a number is out of the range that `unpack_posture` accepts.
     """
     try:
-        data = POSTURE.pack(*posture.mean.vector, *posture.covariance[UPPER])
-        unpack_posture(data)
+        data = POSTURE.pack(*posture.mean.vector, *_limited(posture.covariance)[UPPER])
+        unpack_posture(data, farthest)
     except (OverflowError, InvalidMessage) as error:
         raise InvalidValue(f"posture: {error}") from None
     return data
 
 
-def unpack_posture(data: bytes) -> PoseGaussian:
+def _limited(covariance: Array) -> Array:
+    """(3, 3) with no eigenvalue above the greatest, the same where there is none."""
+    if covariance.trace() <= MAX_VARIANCE:
+        return covariance
+    values, vectors = np.linalg.eigh(covariance)
+    # Rounding to float32 may make it a little more.
+    limited: Array = vectors * np.clip(values, 0.0, MAX_VARIANCE * (1.0 - 1e-6)) @ vectors.T
+    return limited if values[-1] > MAX_VARIANCE else covariance
+
+
+def unpack_posture(data: bytes, farthest: float = MAX_POSITION) -> PoseGaussian:
     """Decode a posture.
+
+    Args:
+        data: nine float32.
+        farthest: greatest coordinate, m.
 
     Raises:
         InvalidMessage: wrong length, a number not finite or out of range, or no covariance.
@@ -73,11 +96,14 @@ def unpack_posture(data: bytes) -> PoseGaussian:
         raise InvalidMessage(f"posture: {len(data)} bytes instead of {POSTURE.size}")
     x, y, heading, *upper = POSTURE.unpack(data)
     # Written so that NaN fails.
-    near = abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION and abs(heading) <= MAX_POSITION
-    if not (near and all(abs(number) <= MAX_POSITION**2 for number in upper)):
-        raise InvalidMessage("posture: a number is not finite or out of range")
+    if not (abs(x) <= farthest and abs(y) <= farthest and abs(heading) <= MAX_POSITION):
+        raise InvalidMessage(f"posture: a number is not finite, or further away than {farthest:g} m")
+    if not all(abs(number) <= MAX_VARIANCE for number in upper):
+        raise InvalidMessage(f"posture: its covariance is not finite or beyond {MAX_VARIANCE:g} m^2 or rad^2")
     xx, xy, xh, yy, yh, hh = upper
     covariance = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    if xx + yy + hh > MAX_VARIANCE and np.linalg.eigvalsh(covariance)[-1] > MAX_VARIANCE:
+        raise InvalidMessage(f"posture: its covariance is beyond {MAX_VARIANCE:g} m^2 or rad^2")
     try:
         return PoseGaussian(Pose2(x, y, heading), covariance)
     except InvalidValue as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import zlib
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,8 @@ from mapserver.log.entry import Applied, Entry, Position, Traffic
 from wire.codec import decode_body, element_of, encode_body, unwrap_body
 from wire.database import Database
 from wire.log_messages import Refusal
+
+log = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x4D575354
 """'MWST' in the file's header."""
@@ -141,7 +144,7 @@ class Store:
         return Applied(tuple(changes), tuple(refusals), watermark)
 
     def replay(self, map_id: MapId) -> Iterator[Change]:
-        """Every change that was taken, in order.
+        """Every change that was taken, in order; without those that are out of bounds since then.
 
         Raises:
             InvalidFile: a change is damaged.
@@ -158,7 +161,8 @@ class Store:
                 try:
                     yield Change(map_id, last, stamp_ns, decode_body(body))
                 except InvalidMessage as error:
-                    raise InvalidFile(f"{self._database.path}: change {last} of {map_id}: {error}") from None
+                    # An older program took it. It stays on the disk; the map is made without it.
+                    log.warning("change %d of %s in the store is left out: %s", last, map_id, error)
 
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+import logging
+from collections.abc import Callable, Collection, Iterable, Mapping, Set
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
+import numpy as np
+
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeKind, MapId, Node, NodeId
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
 from hybridmap.recognising.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
 from mapserver.merging.findings import Findings, Recollection, print_of
+from mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapserver.merging.merger_counters import MergerCounters
 from mapserver.merging.succession import Succession
 from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.lookalikes import LookAlikes
 from merge.graph.candidates import CandidateSettings, Pair
-from merge.graph.links import Link
+from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
 from merge.graph.verification import VerificationSettings, verify
 from merge.incremental.islands import Islands
@@ -27,6 +32,9 @@ from merge.incremental.verdicts import Verdict, Verdicts
 from merge.life.fading import Fader, FadingSettings
 from merge.life.renewal import RenewalSettings, Renewer
 from merge.merging import MergeSettings
+from wire.posture_codec import MAX_POSITION
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,36 @@ class MergerSettings:
     merging: MergeSettings = field(default_factory=MergeSettings)
     renewal: RenewalSettings = field(default_factory=RenewalSettings)
     fading: FadingSettings = field(default_factory=FadingSettings)
+
+
+class Pipeline:
+    """From maps to a merged map: the merge, renewal and fading, with what each knows from the last one."""
+
+    def __init__(self, settings: MergerSettings, reaches: ReachBook) -> None:
+        """Nothing is merged yet."""
+        self.islands = Islands(settings.merging)
+        self._renewer = Renewer(settings.renewal, settings.verification, reaches)
+        self._fader = Fader(settings.fading)
+
+    def merged(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        touched: set[MapId],
+        rulings: Rulings,
+        past: Set[NodeId],
+    ) -> MergedMap:
+        """See `Islands.merge`.
+
+        Raises:
+            InvalidValue: a node lies where nobody could be told of it.
+        """
+        merged = self.islands.merge(maps, verdicts, touched, rulings, past)
+        for graph in merged.graphs:
+            # Written so that NaN fails.
+            if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():
+                raise InvalidValue(f"nodes joined with {graph.anchor} lie beyond {MAX_POSITION:g} m")
+        return self._fader.fade(self._renewer.renewed(merged))
 
 
 class Merger:
@@ -78,12 +116,12 @@ class Merger:
         self._uncompared: dict[NodeId, None] = {}
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._verdicts = Verdicts()
-        self._islands = Islands(self.settings.merging)
+        self._pipeline = Pipeline(self.settings, self.reaches)
+        self._isolation = Isolation()
+        self._suspects: frozenset[MapId] = frozenset()
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
         self._changed: set[MapId] = set()
-        self._renewer = Renewer(self.settings.renewal, self.settings.verification, self.reaches)
-        self._fader = Fader(self.settings.fading)
         self._rulings = Rulings()
         self._merged = MergedMap.empty()
         self._dirty = False
@@ -117,7 +155,7 @@ class Merger:
             self._prints[node_id] = known if known and same else (node, print_of(node))
         prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
-        return Findings(prints, self._pairs.overlaps(), verdicts, self._islands.decisions())
+        return Findings(prints, self._pairs.overlaps(), verdicts, self._pipeline.islands.decisions())
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -172,12 +210,25 @@ class Merger:
 
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others."""
+        ruled = {*rulings.in_force} ^ {*self._rulings.in_force}
+        # A map that is retired harms nobody, and is no longer set apart.
+        self._isolation.release(one.retires for one in ruled if one.retires is not None)
         self._rulings = rulings
         self._dirty = True
 
-    def merged(self) -> MergedMap:
-        """The merged map of all that has come; made anew only if something has changed, and where it has."""
-        if self._dirty or self._islands.decided:
+    def suspect(self, maps: Iterable[MapId]) -> None:
+        """Maps that another process has set apart: where it is this one or another, it is this one."""
+        self._suspects = frozenset(maps)
+
+    def merged(self, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
+        """The merged map of all that has come; made anew only if something has changed, and where it has.
+
+        A map with which it fails is set apart: it is merged without it, until that has changed.
+
+        Args:
+            use: what is made of a merged map that is new; a map with which that fails is set apart as well.
+        """
+        if self._dirty or self._pipeline.islands.decided:
             self.look_around()
             self._take_over()
             changed = self._pairs.changed()
@@ -192,34 +243,79 @@ class Merger:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
-            merged = self._islands.merge(
-                self._kept, self._verdicts, self._touched, self._rulings, self._succession.past
-            )
-            renewed = self._renewer.renewed(merged)
-            self._succession.follow(renewed.superseded)
-            self._merged = self._fader.fade(renewed)
+            self._isolation.changed(self._changed)
+            maps = [one for one in self._kept if one not in self._isolation]
+            try:
+                merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
+            except Exception as error:  # whatever it is, it is one map's or a few maps' and not everybody's
+                log.exception("the merge fails; looking for the map with which it does")
+                merged = self._made_without_bad(maps, error, use)
+            self._succession.follow(merged.superseded)
+            self._merged = merged
             self.counters.merges += 1
             self._touched, self._changed = set(), set()
             self._dirty = False
         return self._merged
 
+    def _made(
+        self,
+        pipeline: Pipeline,
+        verdicts: Verdicts,
+        maps: Collection[MapId],
+        touched: set[MapId],
+        use: Callable[[MergedMap], object] | None,
+    ) -> MergedMap:
+        kept = {one: self._kept[one] for one in maps}
+        merged = pipeline.merged(kept, verdicts, touched, self._rulings, self._succession.past)
+        merged = replace(merged, set_apart=self._isolation.reasons)
+        if use is not None:
+            use(merged)
+        return merged
+
+    def _made_without_bad(
+        self, maps: Collection[MapId], first: Exception, use: Callable[[MergedMap], object] | None
+    ) -> MergedMap:
+        """Merge as many maps as it works with, from nothing: nobody knows what a failure has left behind."""
+
+        def attempt(some: Collection[MapId]) -> Pipeline:
+            pipeline = Pipeline(self.settings, self.reaches)
+            self._made(pipeline, self._verdicts.copy(), some, set(some), use)
+            return pipeline
+
+        # Those that are suspected before and the small ones last: they are rather set apart than others.
+        trusted = sorted(maps, key=lambda one: (self._suspicion(one), -len(self._kept[one].nodes), one))
+        pipeline, bad = leave_out(trusted, attempt)
+        for one, error in bad.items():
+            self._isolation.add(one, reason_of(error))
+        if not bad:
+            log.warning("the merge fails with what it knew (%s) and not without it: begun anew", first)
+        self._pipeline = pipeline
+        self._verdicts.news()
+        return self._made(pipeline, self._verdicts, [one for one in maps if one not in bad], set(), use)
+
+    def _suspicion(self, one: MapId) -> int:
+        return self._isolation.suspicion(one) + (one in self._suspects)
+
     def again(self) -> Callable[[], None] | None:
         """What should be decided again as a whole, by any thread; the next merge takes it up."""
-        task = self._islands.again(self._kept, self._verdicts)
+        task = self._pipeline.islands.again(self._kept, self._verdicts)
         return None if task is None else task.run
 
     def give_up(self) -> None:
         """What was to be decided again could not be."""
-        self._islands.give_up()
+        self._pipeline.islands.give_up()
 
     def look_around(self, most: int | None = None) -> None:
         """Look for what is like the nodes that were read, or like so many of them."""
         for node_id in list(islice(self._uncompared, most)):
+            del self._uncompared[node_id]
             if (node := self.node(node_id)) is not None:
                 before = self._before
                 source = before if before is not None and before.knows(node) else self.index
-                self._pairs.put(node_id, source.overlaps(node, self.node))
-            del self._uncompared[node_id]
+                try:
+                    self._pairs.put(node_id, source.overlaps(node, self.node))
+                except Exception:  # a defect with one node must not hold up all others
+                    log.exception("nobody can say which nodes are like %s: it is compared with none", node_id)
 
     def _take_over(self) -> None:
         """Take over all verdicts of before, once nodes are read; whatever comes now is found anew."""
@@ -228,13 +324,21 @@ class Merger:
             for pair, verdict in self._before.verdicts(self.node):
                 if pair[1] not in self._known.get(pair[0], {}):
                     self._judge(pair, verdict)
-            self._islands.resume(self._before.decided)
+            self._pipeline.islands.resume(self._before.decided)
             self._before = None
 
     def apart(self) -> MergedMap:
-        """The merged map if nobody had compared any two maps: a component for each part of each map."""
+        """The merged map if nobody had compared any two maps: a component for each part of each map.
+
+        Without those with which it fails: the merge says which they are.
+        """
         kept = {map_id: HybridMap(one.contents()) for map_id, one in self.maps.items()}
-        return Islands(self.settings.merging).merge(kept, Verdicts(), set(kept), self._rulings)
+
+        def attempt(some: Collection[MapId]) -> MergedMap:
+            inside = {one: kept[one] for one in some}
+            return Islands(self.settings.merging).merge(inside, Verdicts(), set(inside), self._rulings)
+
+        return leave_out(sorted(kept), attempt)[0]
 
     def status(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 2 refused`."""
@@ -248,7 +352,7 @@ class Merger:
         self._dirty = True
         gone = one.nodes.get(body.id) if isinstance(body, NodeRetired) else None
         for edge in one.dropped_by(body):
-            if edge.kind is not EdgeKind.DRIVEN:
+            if _makes_neighbours(edge):
                 self._pairs.disconnect(edge.a, edge.b)
         one.apply(body)
         match body:
@@ -259,9 +363,7 @@ class Merger:
                 self._forget(node_id)
                 self.index.remove(node_id, None if gone is None else gone.landmarks.codes)
             case EdgePut(edge):
-                # Nodes so near to each other on a robot's way are not compared: it tells nothing new. A
-                # later drive says nothing of that; it may lead from map to map.
-                if edge.kind is not EdgeKind.DRIVEN:
+                if _makes_neighbours(edge):
                     self._pairs.connect(edge.a, edge.b)
 
     def _verify(self, pairs: Iterable[Pair]) -> None:
@@ -269,7 +371,12 @@ class Merger:
             a, b = self.node(pair[0]), self.node(pair[1])
             if pair[1] in self._known.get(pair[0], {}) or a is None or b is None:
                 continue
-            verdict = verify(a, b, self.settings.verification)
+            verdict: Verdict
+            try:
+                verdict = verify(a, b, self.settings.verification)
+            except Exception as error:  # a defect with two nodes must not hold up all others
+                log.exception("%s and %s cannot be compared", a.id, b.id)
+                verdict = RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})")
             self._judge(pair, verdict)
             self.counters.verified += 1
             self.counters.recognised += isinstance(verdict, Link)
@@ -285,3 +392,12 @@ class Merger:
         self._succession.drop(node_id)
         for other in self._known.pop(node_id, {}):
             del self._known[other][node_id]
+
+
+def _makes_neighbours(edge: Edge) -> bool:
+    """Whether an edge says that two nodes are near to each other on their robot's way.
+
+    These are not compared: it tells nothing new. A later drive says nothing of that, and nobody says it of
+    others' nodes.
+    """
+    return edge.kind is not EdgeKind.DRIVEN and edge.within

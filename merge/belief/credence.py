@@ -28,7 +28,7 @@ from hybridmap.pose import Array, Pose2, PoseGaussian
 from merge.belief.consistency import ConsistencySettings
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
-from merge.graph.posegraph import LEAST_SIGMAS, PoseGraph
+from merge.graph.posegraph import PoseGraph, believable
 
 AT_ONCE = 64
 """Links whose covariances are solved for together: all at once would take memory by the square."""
@@ -112,7 +112,7 @@ def standpoints(links: Sequence[Link], graph: PoseGraph, *, kept: bool) -> list[
 
 def _standpoint(link: Link, merged: PoseGaussian, area: float, huber: float | None) -> Standpoint:
     off = (link.a_from_b.mean.inverse() @ merged.mean).vector
-    own = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2)
+    own = believable(link.a_from_b.covariance)
     strain2 = float(off @ np.linalg.solve(own, off))
     rest, moved = merged.covariance, off
     if huber is not None:

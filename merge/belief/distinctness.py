@@ -74,7 +74,9 @@ def weigh(
         Links that do not tell their landmarks stay as they are. The order has no say.
     """
     c, s = consistency or ConsistencySettings(), settings or DistinctnessSettings()
-    claims = [link_of(e) for one in maps.values() for e in one.edges.values() if e.kind is EdgeKind.LOOP]
+    # What a robot says of nodes of others it did not see: they would lose their links by it.
+    own = (e for one in maps.values() for e in one.edges.values() if e.within)
+    claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
     told = (link for link in (*links, *claims) if len(link.shared))
     known = [link for link in told if link.a in by_node and link.b in by_node]
     doubles: set[Landmark] = set()
@@ -237,7 +239,7 @@ def _followed(
 def _next_to(node: NodeId, loops: Iterable[Link], one: HybridMap) -> dict[int, list[Landmark]]:
     """Which landmarks of other nodes show the same things as a node's own."""
     edges = (one.edges[key] for _, _, key in one.graph.edges(node, keys=True))
-    ways = [link_of(edge) for edge in edges if edge.kind in FOLLOWED]
+    ways = [link_of(edge) for edge in edges if edge.kind in FOLLOWED and edge.within]
     table: dict[int, list[Landmark]] = defaultdict(list)
     for way in (*(way if way.a == node else way.turned() for way in ways), *loops):
         for i, j in way.shared.tolist():

@@ -18,6 +18,10 @@ from merge.belief.consistency import ConsistencySettings
 from merge.graph.links import RefusedLink, refuse_edge
 from merge.graph.posegraph import PoseGraph
 
+VAGUE = np.array([0.6, 0.6, 0.2])
+"""m, m, rad: a drive known no better tells not even that the servo got there. Four of these are as far as it
+gets, see `hybridmap.reach.ReachSettings`. Robots tell none above 0.1 m."""
+
 
 def refuse_drives(
     maps: Mapping[MapId, HybridMap], graphs: Sequence[PoseGraph], s: ConsistencySettings
@@ -30,8 +34,8 @@ def refuse_drives(
         s: when measurements agree.
 
     Returns:
-        Those that lead to nodes that are not there, that join what is not joined, or that measured what the
-        merged map contradicts.
+        Those that lead to nodes that are not there, that join what is not joined, that measured what the
+        merged map contradicts, or hardly anything.
     """
     refusals = []
     for map_id, one in sorted(maps.items()):
@@ -47,6 +51,8 @@ def _objection(edge: Edge, graphs: Sequence[PoseGraph], s: ConsistencySettings) 
     if graph is None:
         placed = {node for graph in graphs for node in (edge.a, edge.b) if node in graph.rows}
         return "joins maps that nothing else joins" if len(placed) == 2 else "leads to a node that is gone"
+    if (np.diag(edge.a_from_b.covariance) > VAGUE**2).any():
+        return f"measured no better than {VAGUE[0]:g} m and {VAGUE[2]:g} rad"
     merged = graph.relative([edge.a], [edge.b])
     floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
     spread = edge.a_from_b.covariance + merged.covariances[0] + floor

@@ -16,7 +16,7 @@ from merge.belief.consistency import ConsistencySettings, Sorted
 from merge.belief.graduated import wrong_measurements
 from merge.graph.fragments import Fragment, fragment_by_node
 from merge.graph.links import Link, RefusedLink, refuse
-from merge.graph.posegraph import HUBER, LEAST_SIGMAS, Measurement, PoseGraph, solve_graph
+from merge.graph.posegraph import HUBER, Measurement, PoseGraph, believable, solve_graph
 
 Groups = Mapping[tuple[NodeId, NodeId], Sorted]
 """Sorted links by the names of the two fragments between which they are."""
@@ -213,7 +213,7 @@ def _strains(links: Sequence[Link], solved: Sequence[PoseGraph]) -> Array:
     a, b = (means[[rows[node] for node in nodes]] for nodes in zip(*(x.pair for x in links), strict=True))
     measured = PoseGaussians(
         np.stack([link.a_from_b.mean.vector for link in links]),
-        np.stack([link.a_from_b.covariance for link in links]) + np.diag(LEAST_SIGMAS**2),
+        believable(np.stack([link.a_from_b.covariance for link in links])),
     )
     off = compose_poses(inverse_poses(measured.means), compose_poses(inverse_poses(a), b))
     out: Array = (off * np.linalg.solve(measured.covariances, off[:, :, None])[:, :, 0]).sum(axis=1)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hybridmap.node import Edge, EdgeKind, NodeId
-from hybridmap.reach import RECOGNISED, reach_of
+from hybridmap.reach import RECOGNISED, left, reach_of
 from merge.belief.claims import CLAIMS
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
@@ -89,12 +89,8 @@ def consequences(merged: MergedMap, link: Link | None, a: NodeId, b: NodeId) -> 
 
 def reach_words(merged: MergedMap, edge: Edge) -> str:
     """Whether routes may use an edge; landmarks that have faded hold no servo."""
-    left = np.ones(len(edge.shared), np.bool_)
-    for side, node in enumerate((edge.a, edge.b)):
-        gone = merged.faded.get(node)
-        if gone is not None:
-            left &= ~gone[edge.shared[:, side]]
     a, b = (merged.maps[node.map].nodes[node] for node in (edge.a, edge.b))
-    words = reach_of(replace(edge, shared=edge.shared[left]), a, b).reason
-    faded = len(left) - int(left.sum())
+    there = left(edge.shared, a, b, (merged.faded.get(edge.a), merged.faded.get(edge.b)))
+    words = reach_of(replace(edge, shared=there), a, b).reason
+    faded = len(left(edge.shared, a, b)) - len(there)
     return f"{words} ({faded} more have faded)" if faded else words

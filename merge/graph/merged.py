@@ -103,6 +103,7 @@ class MergedMap:
             tying postures; questions are answered from the others.
         faded: (N,) of nodes, which of their landmarks are thought to be gone, see merge.life.fading. Nodes
             where none is are left out.
+        set_apart: maps that are not among these, because the merge fails with them, and why.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -114,6 +115,7 @@ class MergedMap:
     rulings: Rulings = field(default_factory=Rulings)
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
+    set_apart: Mapping[MapId, str] = field(default_factory=dict)
 
     @staticmethod
     def empty() -> MergedMap:
@@ -149,6 +151,8 @@ class MergedMap:
         """
         which = MapId(*end[:2])
         one = self.maps.get(which)
+        if which in self.set_apart:
+            raise InvalidValue(f"map {which} is set apart: {self.set_apart[which]}")
         if one is None:
             known = [str(other) for other in self.maps]
             some = ", ".join(known[:MOST_NAMES]) or "none"
@@ -212,6 +216,10 @@ class MergedMap:
             *([(loops, "loop")] if loops else []),
         )
         words = [f"{count} {word}{'' if count == 1 else 's'}" for count, word in counts]
-        more = ((len(self.superseded), "superseded"), (len(self.rulings.retired), "retired"))
+        more = (
+            (len(self.superseded), "superseded"),
+            (len(self.rulings.retired), "retired"),
+            (len(self.set_apart), "set apart"),
+        )
         words += [f"{refused} refused", *(f"{count} {word}" for count, word in more if count)]
         return ", ".join(words)

@@ -22,6 +22,10 @@ from hybridmap.recognising.pose_arrays import PoseGaussians, adjoints, compose_p
 LEAST_SIGMAS = np.array([1e-3, 1e-3, 2e-4])
 """No measurement is better than this, m, m, rad: it keeps the graph well conditioned."""
 
+LEAST_SHARE = 2e-6
+"""Nor is any direction better known than by this share of the covariance's trace: what is told of it may be
+off by half as much (`hybridmap.pose`), and nothing smaller comes through the solver."""
+
 ANCHOR_SIGMA = 1e-5
 
 HUBER = 2.0
@@ -56,8 +60,15 @@ class Measurement:
     @property
     def covariance(self) -> Array:
         """(3, 3), not better than is believable."""
-        out: Array = self.a_from_b.covariance + np.diag(LEAST_SIGMAS**2)
-        return out
+        return believable(self.a_from_b.covariance)
+
+
+def believable(covariances: Array) -> Array:
+    """(..., 3, 3) covariances of measurements, each made as large as is believable."""
+    share = LEAST_SHARE * np.trace(covariances, axis1=-2, axis2=-1)
+    least = np.maximum(LEAST_SIGMAS**2, share[..., None])
+    out: Array = covariances + least[..., None] * np.eye(3)
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,10 +79,10 @@ class Verdicts:
         ]
 
     def across(self, island_of: Mapping[MapId, frozenset[MapId]]) -> list[Verdict]:
-        """Of all pairs of which the two maps are in different islands."""
+        """Of all pairs of which the two maps are in different islands; maps that are in none are left out."""
         return [
             verdict
             for (one, other), known in self._between.items()
-            if island_of[one] is not island_of[other]
+            if one in island_of and other in island_of and island_of[one] is not island_of[other]
             for verdict in known.values()
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.reach import ReachSettings, closed_edges, least_in_view, reach_of
+from hybridmap.reach_book import ReachBook
 
 
 def pair(
@@ -108,3 +110,17 @@ def test_closed_edges_of_a_map() -> None:
     closed = Edge(NodeId("merge", 0, 2), c.id, d.id, other.a_from_b, EdgeKind.LOOP, other.shared)
     one = HybridMap([NodePut(a), NodePut(b), NodePut(c), NodePut(d), EdgePut(edge), EdgePut(closed)])
     assert closed_edges(one) == {closed.id}
+
+
+def test_landmarks_that_a_node_put_anew_lacks_are_not_in_view() -> None:
+    rng = np.random.default_rng(2)
+    edge, a, b = pair(Pose2(0.4, 0.1, 0.1), wall(60, rng), rng)
+    whole, kept = reach_of(edge, a, b), 9
+    fewer = replace(b, landmarks=b.landmarks.take(np.arange(kept)))
+    known = ReachBook().reach(edge, a, fewer, (None, None))
+    assert known.in_view <= kept < whole.in_view
+    trimmed = replace(edge, shared=edge.shared[edge.shared[:, 1] < kept])
+    assert known == reach_of(edge, a, fewer) == reach_of(trimmed, a, fewer)
+    gone = np.arange(kept) < 4
+    assert ReachBook().reach(edge, a, fewer, (None, gone)).in_view <= 5
+    assert not reach_of(edge, a, replace(b, landmarks=Landmarks.empty())).drivable

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,10 +28,10 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     entered, go = threading.Event(), threading.Event()
     real = Merger.merged
 
-    def held(merger: Merger) -> MergedMap:
+    def held(merger: Merger, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
         entered.set()
         assert go.wait(20)
-        return real(merger)
+        return real(merger, use)
 
     monkeypatch.setattr(Merger, "merged", held)
     upkeep = Upkeep(LiveSchedule(), 1.0)
@@ -104,10 +105,10 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
     view, _ = take_view(world, tour[1], np.random.default_rng(3))
     entered, go, real = threading.Event(), threading.Event(), Merger.merged
 
-    def held(merger: Merger) -> MergedMap:
+    def held(merger: Merger, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
         entered.set()
         assert go.wait(20)
-        return real(merger)
+        return real(merger, use)
 
     monkeypatch.setattr(Merger, "merged", held)
     upkeep = Upkeep(LiveSchedule(), 1.0)

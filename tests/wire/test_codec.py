@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -190,8 +191,7 @@ def bad_landmarks(count: int = 1, pixel: float = 10.0, depth: float = 1.0, sigma
         {"id": NodeId("r0", 1, -1)},
         {"id": NodeId("r0", -1, 1)},
         {"id": NodeId("R0!", 1, 1)},
-        {"map_from_robot": PoseGaussian(Pose2(1e7, 0, 0), np.eye(3))},
-        {"map_from_robot": PoseGaussian(Pose2(), 1e39 * np.eye(3))},
+        {"map_from_robot": PoseGaussian(Pose2(1.01e5, 0, 0), np.eye(3))},
         {"camera": Camera(320, 240, 1e300, 277, 160, 120, 0.2)},
     ],
 )
@@ -221,6 +221,28 @@ def test_an_edge_that_cannot_be_sent_is_refused_before(some: SimpleNamespace) ->
         with pytest.raises(InvalidValue):
             encode_body(edge(**new))
     encode_body(edge())
+
+
+@given(seed=st.integers(0, 2**32 - 1), largest=st.floats(4.01, 10.0))
+def test_greater_variances_become_the_greatest(some: SimpleNamespace, seed: int, largest: float) -> None:
+    """Directions stay, and what is known well stays so: NumPy's eigenvectors of what comes out."""
+    axes = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    covariance = axes * [10.0**largest, 1e3, 1e4] @ axes.T
+    body = NodePut(replaced(some.node(), map_from_robot=PoseGaussian(Pose2(), covariance)))
+    encoded = encode_body(body)
+    back = decode_body(encoded)
+    assert isinstance(back, NodePut) and encode_body(back) == encoded
+    expected = axes * [1e4, 1e3, 1e4] @ axes.T
+    assert np.allclose(back.node.map_from_robot.covariance, expected, atol=0.02)
+    nothing_known = replaced(some.node(), map_from_robot=PoseGaussian(Pose2(), 1e38 * axes @ axes.T))
+    encode_body(NodePut(nothing_known))
+
+
+def test_evidence_is_brought_within_its_bounds(some: SimpleNamespace) -> None:
+    edge = replace(some.edge(), evidence={"inliers": 9e29, "there": -1.0, "rms_px": 0.5})
+    back = decode_body(encode_body(EdgePut(edge)))
+    assert isinstance(back, EdgePut)
+    assert back.edge.evidence == {"inliers": 2000.0, "there": 0.0, "rms_px": 0.5}
 
 
 def test_a_change_must_be_about_its_own_map(some: SimpleNamespace) -> None:
@@ -269,6 +291,12 @@ FORGERIES: list[tuple[str, dict[str, Any], str]] = [
     ("edge", {"x": {"inliers": math.nan}}, "inliers must be a number"),
     ("edge", {"x": {"a\nb": 1.0}}, "printable"),
     ("edge", {"x": [1]}, "x must be a map"),
+    ("edge", {"x": {"inliers": 9e29}}, "inliers must be a number in 0..2000"),
+    ("edge", {"x": {"inliers": -1.0}}, "inliers must be a number in 0..2000"),
+    ("edge", {"p": struct.pack("<9f", 1.1e5, 0, 0, 1, 0, 0, 1, 0, 1)}, "further away than 100000 m"),
+    ("node", {"p": struct.pack("<9f", 0, -1.1e5, 0, 1, 0, 0, 1, 0, 1)}, "further away than 100000 m"),
+    ("edge", {"p": struct.pack("<9f", 0, 0, 0, 1e10, 0, 0, 0, 0, 0)}, "covariance is .* beyond 10000"),
+    ("node", {"p": struct.pack("<9f", 0, 0, 0, *[6e3] * 6)}, "covariance is beyond 10000"),
 ]
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import sqlite3
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -248,3 +250,22 @@ def test_a_damaged_change_is_found(path: Path, store: Store) -> None:
     with pytest.raises(InvalidFile, match=r"change 2 of r0\.1 is damaged"):
         next(replay)
     store.close()
+
+
+def test_what_an_older_program_took_and_is_out_of_bounds_now_is_left_out(
+    path: Path, store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    store.apply(MAP, 5, [entry(1, node_put(1)), entry(2, edge_put(3, 1, 2)), entry(3, node_put(2))])
+    store.close()
+    # The edge's evidence, as version 0.9 took it.
+    fields = msgpack.unpackb(encode_body(edge_put(3, 1, 2))) | {"x": {"inliers": 9e29}}
+    body = msgpack.packb(fields)
+    rows = sqlite3.connect(path)
+    with rows:
+        rows.execute("UPDATE change SET body = ?, crc = ? WHERE sequence = 2", (body, zlib.crc32(body)))
+    rows.close()
+    again = Store(path)
+    assert [change.sequence for change in again.replay(MAP)] == [1, 3]
+    assert again.watermark(MAP) == 3
+    assert "change 2 of r0.1 in the store is left out" in caplog.text and "inliers" in caplog.text
+    again.close()

@@ -39,10 +39,10 @@ class Scene:
         verdicts = [verify(i, j) for i in nodes[0] for j in nodes[1]] if linked else []
         return merge_maps(self.maps, [verdict for verdict in verdicts if isinstance(verdict, Link)])
 
-    def drive(self, a: NodeId, b: NodeId, shift: float = 0.0) -> EdgeId:
+    def drive(self, a: NodeId, b: NodeId, shift: float = 0.0, sigmas: np.ndarray = SIGMAS) -> EdgeId:
         """The guest notes that it got from a to b."""
         edge_id = EdgeId("guest", 1, 1 + len(self.maps[GUEST].edges))
-        measured = PoseGaussian(self.truth[a].inverse() @ self.truth[b] @ Pose2(shift), np.diag(SIGMAS**2))
+        measured = PoseGaussian(self.truth[a].inverse() @ self.truth[b] @ Pose2(shift), np.diag(sigmas**2))
         evidence = {"there": 1.0, "back": 0.0, "inliers": 12.0}
         self.maps[GUEST].apply(EdgePut(Edge(edge_id, a, b, measured, EdgeKind.DRIVEN, evidence=evidence)))
         return edge_id
@@ -108,3 +108,18 @@ def test_the_server_still_compares_nodes_between_which_somebody_has_driven(scene
     for body in scene.maps[GUEST].contents():
         merger.apply(GUEST, body)
     assert [link.pair for link in merger.merged().links] == links
+
+
+@pytest.mark.parametrize("sigmas", [(100.0, 100.0, 3.0), (0.02, 0.02, 0.5), (1.0, 0.02, 0.01)])
+def test_a_drive_that_measured_hardly_anything_opens_no_way(
+    scene: Scene, sigmas: tuple[float, float, float]
+) -> None:
+    """Nothing could contradict it: it would lead through walls."""
+    a, b = scene.a[0], scene.b[-1]
+    edge = scene.drive(a, b, 0.0, np.array(sigmas))
+    merged = scene.merged()
+    assert edge not in merged.union().edges
+    assert [r.reason for r in merged.refused if r.edge == edge] == [
+        "a drive measured no better than 0.6 m and 0.2 rad"
+    ]
+    assert all(leg.kind is not EdgeKind.DRIVEN for leg in Router(merged).route(a, b).legs)

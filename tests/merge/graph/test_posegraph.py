@@ -143,3 +143,18 @@ def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch: pytest.M
     for k, node in enumerate(IDS):
         assert np.allclose(found[node].covariance, joint[k, :, k, :], rtol=1e-9, atol=1e-14)
         assert np.array_equal(found[node].mean.vector, graph.means[k])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_covariance_that_is_hardly_one_makes_a_graph_all_the_same(seed: int) -> None:
+    """Of any rank, with the greatest variance there is, and an eigenvalue that rounding made negative."""
+    rng = np.random.default_rng(seed)
+    measurements = []
+    for k in range(7):
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        covariance = axes * [1e4, 1e4 * rng.integers(0, 2), -3e-3 * rng.integers(0, 2)] @ axes.T
+        step = PoseGaussian(Pose2(*rng.uniform(-5, 5, 3)), covariance)
+        measurements.append(Measurement(IDS[k], IDS[k + 1], step))
+        assert np.linalg.eigvalsh(measurements[-1].covariance)[0] > 0.0
+    graph = solve_graph(IDS[0], Pose2(), [*measurements, measurements[0]])
+    assert all(np.isfinite(posture.covariance).all() for posture in graph.postures().values())

@@ -1,0 +1,112 @@
+"""Isolation: maps with which the merge fails are set apart, so that all others are merged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from hybridmap.node import MapId
+
+MAX_REASON = 200
+"""Characters."""
+T = TypeVar("T")
+
+
+@dataclass
+class _Failure:
+    """Of one map.
+
+    Attributes:
+        reason: in words.
+        count: how often the merge has failed with it.
+        wait: changes of it that are still waited for.
+    """
+
+    reason: str
+    count: int
+    wait: int
+
+
+class Isolation:
+    """Which maps are set apart. One is tried again when it has changed: once, twice, four times ... .
+
+    To find out with which map a merge fails takes many merges, so who breaks it again and again waits longer.
+    """
+
+    def __init__(self) -> None:
+        """None is set apart."""
+        self._failures: dict[MapId, _Failure] = {}
+        self._apart: set[MapId] = set()
+
+    @property
+    def reasons(self) -> Mapping[MapId, str]:
+        """Maps that are set apart, and why."""
+        return {one: self._failures[one].reason for one in sorted(self._apart)}
+
+    def __contains__(self, one: MapId) -> bool:
+        """Whether a map is set apart."""
+        return one in self._apart
+
+    def add(self, one: MapId, reason: str) -> None:
+        """Set a map apart."""
+        count = self._failures[one].count + 1 if one in self._failures else 1
+        self._failures[one] = _Failure(reason, count, 2 ** (count - 1))
+        self._apart.add(one)
+
+    def changed(self, maps: Iterable[MapId]) -> None:
+        """Take in again, of maps that have changed, those that are to be tried again."""
+        for one in self._apart & set(maps):
+            self._failures[one].wait -= 1
+            if self._failures[one].wait <= 0:
+                self._apart.discard(one)
+
+    def release(self, maps: Iterable[MapId]) -> None:
+        """Take these in again at once."""
+        self._apart -= set(maps)
+
+    def suspicion(self, one: MapId) -> int:
+        """How often the merge has failed with a map."""
+        return self._failures[one].count if one in self._failures else 0
+
+
+def leave_out(
+    maps: Sequence[MapId], attempt: Callable[[Collection[MapId]], T]
+) -> tuple[T, dict[MapId, Exception]]:
+    """Do something with as many maps as it works with.
+
+    All together first, else the first half and then the second, each with what works already. Of two maps
+    with which it fails together the later one is left out. One bad map of N takes about 2 log2 N attempts.
+
+    Args:
+        maps: the most trusted first.
+        attempt: fails by any exception.
+
+    Returns:
+        What came of it, and the maps that were left out.
+
+    Raises:
+        Exception: it fails with no map at all.
+    """
+    kept: list[MapId] = []
+    left_out: dict[MapId, Exception] = {}
+    found: list[T] = []
+    waiting = [list(maps)]
+    while waiting:
+        block = waiting.pop()
+        try:
+            found = [attempt([*kept, *block])]
+        except Exception as error:  # noqa: BLE001 - whatever it is, it is one map's and goes to whoever asked
+            if len(block) > 1:
+                waiting += [block[len(block) // 2 :], block[: len(block) // 2]]
+            elif block:
+                left_out[block[0]] = error
+        else:
+            kept += block
+    return found[0] if found else attempt(kept), left_out
+
+
+def reason_of(error: Exception) -> str:
+    """One line for people."""
+    words = " ".join(str(error).split())
+    return f"the merge fails with it ({type(error).__name__}: {words})"[:MAX_REASON]

@@ -1,0 +1,66 @@
+"""What a robot says of the nodes of others has no say in how these are merged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic import room, take_map
+from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut
+from hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from mapserver.merging.merger import Merger
+from merge.graph.merged import MergedMap
+
+Log = list[tuple[MapId, ChangeBody]]
+LIAR = MapId("liar", 1)
+
+
+@pytest.fixture(scope="module")
+def sound() -> Log:
+    """Two robots that have mapped one room."""
+    rng = np.random.default_rng(1)
+    world = room(0, 0, 5, 4, 600, rng)
+    tour = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
+    log: Log = []
+    for agent in ("r0", "r1"):
+        nodes, edges = take_map(world, MapId(agent, 1), tour, rng)
+        log += [(MapId(agent, 1), body) for body in (*map(NodePut, nodes), *map(EdgePut, edges))]
+    return log
+
+
+def said(merged: MergedMap) -> tuple[object, ...]:
+    """All that a merge has decided of the sound robots."""
+    links = [(link.pair, link.weight) for link in merged.links]
+    return links, [(r.pair, r.reason) for r in merged.refused if r.edge is None], [
+        (node, merged.pose(node)) for node in sorted(merged.postures)
+    ]  # fmt: skip
+
+
+def claims(log: Log, kind: EdgeKind, landmarks: int) -> Log:
+    """Edges of somebody else between all of their nodes, as wrong as can be."""
+    nodes = [body.node for _, body in log if isinstance(body, NodePut)]
+    pairs = [(a, b) for k, a in enumerate(nodes) for b in nodes[:k]]
+    shared = np.repeat(np.arange(landmarks)[:, None], 2, axis=1)
+    far = PoseGaussian.from_sigmas(Pose2(40.0, 0.0, 1.0), 0.01, 0.01)
+    return [
+        (LIAR, EdgePut(Edge(NodeId(*LIAR, k), a.id, b.id, far, kind, shared)))
+        for k, (a, b) in enumerate(pairs)
+    ]
+
+
+@pytest.mark.parametrize("kind", list(EdgeKind))
+@pytest.mark.parametrize("when", ["before", "after", "taken back"])
+def test_edges_between_the_nodes_of_others_change_nothing(sound: Log, kind: EdgeKind, when: str) -> None:
+    merger = Merger()
+    merger.read(sound)
+    alone = merger.merged()
+    assert len(alone.links) > 2
+    lies = claims(sound, kind, 50)
+    merger = Merger()
+    merger.read([*lies, *sound] if when == "before" else [*sound, *lies])
+    if when == "taken back":
+        merger.read([(LIAR, EdgeRetired(NodeId(*LIAR, k))) for k in range(len(lies))])
+    merged = merger.merged()
+    assert said(merged) == said(alone)
+    assert not any(edge.id.map == LIAR for edge in merged.union().edges.values())
