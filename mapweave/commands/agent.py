@@ -6,10 +6,8 @@ import argparse
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from agent.drivers.robot import Robot
-from hybridmap.node import check_name
 from mapweave.commands.network import (
     add_network,
     connect,
@@ -18,6 +16,9 @@ from mapweave.commands.network import (
     stop_on_signals,
     tell_if_alone,
 )
+
+if TYPE_CHECKING:
+    from agent.drivers.robot import Robot
 
 
 def add_to(commands: Any) -> None:
@@ -55,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
     from agent.drivers.remote import RemoteRobot
     from agent.mission import Carried, Explore, Idle, Mission
+    from hybridmap.node import check_name
     from mapweave.agent_process import AgentOptions, run_agent
     from wire.keys import check_epoch
 
