@@ -1,8 +1,12 @@
 # Two commands for a first user: `make demo` and `make test`. Both set up what they need.
-PYTHON ?= python3
+# The simulator, pybullet, has wheels up to Python 3.11 and for x86-64 alone.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+# What is installed: `make EXTRA=test test` leaves out the simulator and skips the tests that need it.
+EXTRA ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+STAMP := $(VENV)/.installed-$(EXTRA)
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: setup demo test check bench slow scenarios clean
 
@@ -13,7 +17,12 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "Mapweave needs Python 3.11 or newer; try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV), 1.5 GB (a minute or two) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+ifeq ($(EXTRA),dev)
+	@$(PIP) --only-binary :all: pybullet 2>/dev/null || \
+	  echo "there is no wheel of pybullet for $$($(BIN)/python -V) on $$(uname -m): compiling it takes ten minutes" \
+	  "or more; with python3.11 on x86-64 it takes seconds, and make EXTRA=test does without the simulator"
+endif
+	@$(PIP) -e '.[$(EXTRA)]'
 	@$(BIN)/python -c 'from agent.ekf import kernels; kernels.load()'  # compiles the filters once, not in the first drive
 	@touch $(STAMP)
 

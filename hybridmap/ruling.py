@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from hybridmap.errors import InvalidValue
 from hybridmap.node import NUMBER, MapId, NodeId, check_name
@@ -15,6 +16,8 @@ EXAMPLE = "two nodes look like r0.1.17 r1.1.5, two maps like r0.1 r1.1"
 
 MOST_WORDS = 300
 """Characters of a reason."""
+
+NANOSECONDS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +96,17 @@ class Rulings:
         maps = [one.map if isinstance(one, NodeId) else one for one in (first, second)]
         ends += [_ordered(*maps), *((one, one) for one in maps)]
         return tuple(ruling for ruling in self.made if ruling.ends in ends)
+
+
+def reason_of(ruling: Ruling) -> str:
+    """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
+    when = datetime.fromtimestamp(ruling.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    first, second = ruling.ends
+    what = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
+    why = f': "{ruling.because}"' if ruling.because else ""
+    if ruling.retires is not None:
+        return f"map {ruling.retires} is retired by {ruling.who or 'somebody'} on {when}{why}"
+    return f"undone{what} by {ruling.who or 'somebody'} on {when}{why}"
 
 
 def read_ends(first: str, second: str) -> Ends:

@@ -10,18 +10,19 @@ from typing import TypeVar
 
 from hybridmap.errors import InvalidFile, InvalidMessage
 from hybridmap.explanation import Explanation, MapsExplanation, PairExplanation, RouteExplanation
-from hybridmap.history import Happening, Kind
+from hybridmap.history import Happening
 from hybridmap.node import MapId, NodeId
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.answers import Answers
 from mapserver.desk import Desk
 from mapserver.log.store import Store
 from mapserver.route_explaining import explain_route
+from mapserver.ruling_history import said_of, with_rulings
 from mapserver.services import guarded
 from merge.belief.consistency import ConsistencySettings
 from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
-from merge.undoing import check_ruling, reason_of
+from merge.undoing import check_ruling
 from wire.bus import Bus, Closing, Request
 from wire.explanation_messages import (
     MAX_MAPS_TOLD,
@@ -180,19 +181,3 @@ class Explainer:
 def _still(told: Told, settled: bool) -> Told:
     """What was not found yet is not said to be missing."""
     return told if settled else replace(told, reason=f"{told.reason} (still merging: ask again)")
-
-
-def with_rulings(happenings: Iterable[Happening], rulings: Rulings) -> tuple[Happening, ...]:
-    """What has happened by itself and what people have ruled, in order."""
-    ruled = [Happening(ruling.stamp_ns, Kind.RULED, said_of(ruling)) for ruling in rulings.made]
-    return tuple(sorted([*ruled, *happenings], key=lambda one: one.stamp_ns))
-
-
-def said_of(ruling: Ruling) -> str:
-    """What has come of a ruling, in one sentence."""
-    first, second = ruling.ends
-    who = ruling.who or "somebody"
-    if ruling.retires is not None:
-        return reason_of(ruling) if ruling.apart else f"map {ruling.retires} is in use again, says {who}"
-    words = reason_of(ruling) if ruling.apart else f"may be linked again, says {who}"
-    return f"{first} and {second}: {words}"

@@ -15,10 +15,10 @@ from hybridmap.query import RouteAnswer, RouteLeg
 from hybridmap.reach import RECOGNISED
 from hybridmap.reach_book import ReachBook
 from hybridmap.route import Route, RouteSettings, Ways
+from hybridmap.ruling import reason_of
 from mapserver.living import without_faded
 from mapserver.roadmap import Roadmap
 from merge.graph.merged import MergedMap
-from merge.undoing import reason_of
 
 ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""

@@ -5,20 +5,45 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from hybridmap.errors import MapweaveError
 from mapweave.commands import agent, demo, evaluate, map_file, relocalize, replay, server, sim
+from mapweave.extras import MissingExtra, extra_of
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help."
+MISSING_EXTRA = 3
+"""Exit status of a command whose libraries are not installed."""
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose arguments name the command that was given, as `command`."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Make a parser; those of its commands are of this class, too."""
+        super().__init__(*args, **kwargs)
+        self.set_defaults(command=self.prog)
+
+
+class PrintVersion(argparse.Action):
+    """Print the version and exit; it is looked up only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print it."""
+        from importlib.metadata import version
+
+        print(f"mapweave {version('mapweave')}")
+        parser.exit()
 
 
 def parser() -> argparse.ArgumentParser:
     """All commands with their arguments."""
-    top = argparse.ArgumentParser(
+    top = CommandParser(
         prog="mapweave",
         description="Small robots with one camera each map a building together over Zenoh.",
         epilog=EPILOG,
     )
+    top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (demo, server, sim, agent, map_file, replay, relocalize, evaluate):
         command.add_to(commands)
@@ -29,11 +54,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Returns:
-        0 if it did what was asked, 1 if it could not (one line on stderr says why), 130 if interrupted.
+        0 if it did what was asked, 1 if it could not (one line on stderr says why), 3 if it needs an extra
+        that is not installed, 130 if interrupted. What 2 means is in the command's own help.
     """
     arguments = parser().parse_args(argv)
     try:
         return int(arguments.run(arguments))
+    except MissingExtra as error:
+        print(f"{arguments.command} {error}", file=sys.stderr)
+        return MISSING_EXTRA
+    except ModuleNotFoundError as error:
+        extra = extra_of(error.name)
+        if extra is None:
+            raise
+        print(f"{arguments.command} {MissingExtra([extra])}", file=sys.stderr)
+        return MISSING_EXTRA
     except MapweaveError as error:
         print(f"mapweave: {error}", file=sys.stderr)
         return 1

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 
 from hybridmap.change import EdgePut
 from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import Ruling, Rulings
+from hybridmap.node import MapId
+from hybridmap.ruling import Ruling, Rulings, reason_of
 from merge.belief.claims import CLAIMS
 from merge.graph.links import Link, RefusedLink, refuse, refuse_edge
 from merge.graph.merged import MergedMap
-
-NANOSECONDS = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +135,3 @@ def _check_retirement(known: Ruling | None, ruling: Ruling, which: MapId) -> Non
         raise InvalidValue(f"map {which} is retired already: {reason_of(known)}")
     if not ruling.apart and known is None:
         raise InvalidValue(f"map {which} is not retired")
-
-
-def reason_of(ruling: Ruling) -> str:
-    """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
-    when = datetime.fromtimestamp(ruling.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    first, second = ruling.ends
-    what = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
-    why = f': "{ruling.because}"' if ruling.because else ""
-    if ruling.retires is not None:
-        return f"map {ruling.retires} is retired by {ruling.who or 'somebody'} on {when}{why}"
-    return f"undone{what} by {ruling.who or 'somebody'} on {when}{why}"

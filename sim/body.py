@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,11 @@ from hybridmap.pose import Array, Pose2
 from sim import surface
 from sim.camera import check_range
 from sim.floorplan import Rectangle
-from sim.physics import Physics
 from sim.texture import Texture
 from sim.world import Block, PanelSet, block_panels
+
+if TYPE_CHECKING:
+    from sim.physics import Physics
 
 WHEEL_RADIUS = 0.05
 """Nominal, m: what the robot believes."""

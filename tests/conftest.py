@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 
 # numpy reads it when it is imported, and cv2 imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -11,6 +12,8 @@ import cv2
 import pytest
 from hypothesis import settings
 
+from tests.simulator import INSTALLED, SkipWithoutSimulator
+
 # What these modules assert is told in full, as in tests.
 pytest.register_assert_rewrite("tests.waiting", "tests.mapweave.command_line", "tests.sim.measured_world")
 
@@ -18,3 +21,6 @@ pytest.register_assert_rewrite("tests.waiting", "tests.mapweave.command_line", "
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 cv2.setNumThreads(1)
+
+if not INSTALLED:
+    sys.meta_path.insert(0, SkipWithoutSimulator())

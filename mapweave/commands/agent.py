@@ -6,11 +6,8 @@ import argparse
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from agent.drivers.robot import Robot
-from agent.synchronization import Synchronization
-from hybridmap.node import check_name
 from mapweave.commands.network import (
     add_network,
     connect,
@@ -19,7 +16,11 @@ from mapweave.commands.network import (
     stop_on_signals,
     tell_if_alone,
 )
-from wire.bus import Bus
+
+if TYPE_CHECKING:
+    from agent.drivers.robot import Robot
+    from agent.synchronization import Synchronization
+    from wire.bus import Bus
 
 
 def add_to(commands: Any) -> None:
@@ -56,6 +57,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
     from agent.mission import Carried, Explore, Idle, Mission
+    from hybridmap.node import check_name
     from mapweave.agent_process import AgentOptions, run_agent
     from wire.keys import check_epoch
 

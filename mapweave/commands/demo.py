@@ -29,6 +29,9 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo and print what came of it."""
+    from mapweave.extras import TRIAL, need
+
+    need(*TRIAL)
     from rich.console import Console
 
     from mapweave.demo.options import DemoOptions

@@ -96,6 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def run_merge(arguments: argparse.Namespace) -> int:
     """Cut, map, merge and print."""
+    from mapweave.extras import need
+
+    need("server", "viz")
     from rich.console import Console
     from rich.table import Table
 

@@ -12,6 +12,8 @@ from mapweave.commands.network import add_network
 if TYPE_CHECKING:
     from hybridmap.explanation import MapsExplanation, PairExplanation
     from hybridmap.node import MapId, NodeId
+    from merge.graph.merged import MergedMap
+    from merge.merging import MergeSettings
 
 
 def add_to(actions: Any) -> None:
@@ -40,7 +42,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapserver.people.explanation_json import explanation_record
     from mapweave.commands.map_ends import ends_of
     from mapweave.explained import maps_words, pair_words
+    from mapweave.extras import need
 
+    if arguments.draw is not None:
+        need("viz")
     ends = ends_of(arguments.ends) if arguments.ends else None
     first, second = ends or (None, None)
     if isinstance(first, NodeId) and isinstance(second, NodeId):
@@ -65,39 +70,42 @@ def run(arguments: argparse.Namespace) -> int:
 
 def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> PairExplanation:
     """Two nodes of a map file, or of what a server has."""
-    from mapserver.mapfiles import merged_of
     from mapweave.commands.map_ends import ask
-    from mapweave.commands.network import settings_of
-    from mapweave.settings import merge_settings
-    from merge.explaining.explanation import explain_nodes
     from wire.explanation_messages import ExplainRequest, decode_pair, encode_explain_request
     from wire.keys import Keys
-    from wire.mapfile import read_map_file
 
-    if arguments.map is not None:
-        settings = merge_settings(settings_of(arguments), arguments.settings)
-        merged = merged_of(read_map_file(arguments.map), settings)
-        return explain_nodes(merged, a, b, None, settings.consistency)
-    request = encode_explain_request(ExplainRequest((a, b)))
-    return decode_pair(ask(arguments, Keys.any_explain, request)[0].payload)
+    if arguments.map is None:
+        request = encode_explain_request(ExplainRequest((a, b)))
+        return decode_pair(ask(arguments, Keys.any_explain, request)[0].payload)
+    from merge.explaining.explanation import explain_nodes
+
+    merged, settings = _merged(arguments)
+    return explain_nodes(merged, a, b, None, settings.consistency)
 
 
 def explained_maps(
     arguments: argparse.Namespace, ends: tuple[MapId, MapId] | None
 ) -> tuple[MapsExplanation, ...]:
     """Two maps of a map file, or of what a server has; each two of them without ends."""
-    from mapserver.mapfiles import merged_of
     from mapweave.commands.map_ends import ask
-    from mapweave.commands.network import settings_of
-    from mapweave.settings import merge_settings
-    from merge.explaining.maps import explain_fleet, explain_maps
     from wire.explanation_messages import MAX_MAPS_TOLD, ExplainRequest, decode_maps, encode_explain_request
     from wire.keys import Keys
-    from wire.mapfile import read_map_file
 
     if arguments.map is None:
         request = encode_explain_request(ExplainRequest(ends))
         return decode_maps(ask(arguments, Keys.any_explain, request)[0].payload)
-    settings = merge_settings(settings_of(arguments), arguments.settings)
-    merged = merged_of(read_map_file(arguments.map), settings)
+    from merge.explaining.maps import explain_fleet, explain_maps
+
+    merged, _ = _merged(arguments)
     return explain_fleet(merged, MAX_MAPS_TOLD) if ends is None else (explain_maps(merged, *ends),)
+
+
+def _merged(arguments: argparse.Namespace) -> tuple[MergedMap, MergeSettings]:
+    """The merged map of a file, and the settings with which it is explained."""
+    from mapserver.mapfiles import merged_of
+    from mapweave.commands.network import settings_of
+    from mapweave.settings import merge_settings
+    from wire.mapfile import read_map_file
+
+    settings = merge_settings(settings_of(arguments), arguments.settings)
+    return merged_of(read_map_file(arguments.map), settings), settings

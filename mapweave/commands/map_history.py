@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _history(arguments: argparse.Namespace) -> tuple[Happening, ...]:
     from hybridmap.ruling import Rulings
-    from mapserver.explainer import with_rulings
+    from mapserver.ruling_history import with_rulings
     from mapweave.commands.map_ends import ask
     from wire.history_codec import decode_history
     from wire.keys import Keys

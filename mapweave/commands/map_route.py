@@ -44,7 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapserver.people.explanation_json import route_values
     from mapweave.commands.map_ends import node_of
     from mapweave.explained import route_words
+    from mapweave.extras import need
 
+    if arguments.draw is not None:
+        need("viz")
     start, goal = node_of(arguments.start), node_of(arguments.goal)
     blocked = tuple((node_of(a), node_of(b)) for a, b in arguments.blocked)
     told = explained_route(arguments, start, goal, blocked)
@@ -87,21 +90,22 @@ def explained_route(
     arguments: argparse.Namespace, start: NodeId, goal: NodeId, blocked: tuple[tuple[NodeId, NodeId], ...]
 ) -> RouteExplanation:
     """A route through a map file, or through what a server has."""
-    from mapserver.mapfiles import merged_of
-    from mapserver.route_explaining import explain_route
-    from mapserver.routes import Router
     from mapweave.commands.map_ends import ask
-    from mapweave.commands.network import settings_of
-    from mapweave.settings import merge_settings
     from wire.explanation_messages import ExplainRequest, encode_explain_request
     from wire.keys import Keys
-    from wire.mapfile import read_map_file
     from wire.route_explanation import decode_route_explanation
 
     if arguments.map is None:
         request = ExplainRequest((start, goal), True, blocked)
         replies = ask(arguments, Keys.any_explain, encode_explain_request(request))
         return decode_route_explanation(replies[0].payload)
+    from mapserver.mapfiles import merged_of
+    from mapserver.route_explaining import explain_route
+    from mapserver.routes import Router
+    from mapweave.commands.network import settings_of
+    from mapweave.settings import merge_settings
+    from wire.mapfile import read_map_file
+
     settings = merge_settings(settings_of(arguments), arguments.settings)
     router = Router(merged_of(read_map_file(arguments.map), settings))
     return explain_route(router, start, goal, blocked)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,19 @@ def run(arguments: argparse.Namespace) -> int:
     from hybridmap.hybrid_map import HybridMap
     from hybridmap.node import EdgeKind
     from hybridmap.ruling import Rulings
+    from mapweave.extras import MissingExtra, need
     from mapweave.picture import MapPicture, draw_map
     from wire.mapfile import read_map_file
 
+    if not arguments.no_picture:
+        try:
+            need("viz")
+        except MissingExtra as missing:
+            if arguments.out is not None:
+                raise
+            # The summary is what most want to know: it needs nothing.
+            print(f"mapweave: the picture {missing}", file=sys.stderr)
+            arguments.no_picture = True
     content = read_map_file(arguments.file)
     hybrid = HybridMap(content.changes)
     if content.postures:

@@ -8,12 +8,12 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mapweave import lifeline
-from mapweave.settings import NetworkSettings, Settings, load_settings
-from wire.bus_settings import BusSettings
-from wire.keys import Keys
-from wire.zenoh_bus import ZenohBus
+if TYPE_CHECKING:
+    from mapweave.settings import NetworkSettings, Settings
+    from wire.keys import Keys
+    from wire.zenoh_bus import ZenohBus
 
 SOON = 2.0
 """s; a router that is there is found sooner."""
@@ -35,11 +35,15 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The settings file with the command line over it."""
+    from mapweave.settings import load_settings
+
     return load_settings(arguments.settings)
 
 
 def network_of(arguments: argparse.Namespace, settings: Settings) -> NetworkSettings:
     """Where the fleet is: the command line over the settings."""
+    from mapweave.settings import NetworkSettings
+
     given = settings.network
     return NetworkSettings(
         fleet=arguments.fleet or given.fleet,
@@ -50,6 +54,10 @@ def network_of(arguments: argparse.Namespace, settings: Settings) -> NetworkSett
 
 def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
     """A client connection; it opens in the background and survives a router that comes and goes."""
+    from wire.bus_settings import BusSettings
+    from wire.keys import Keys
+    from wire.zenoh_bus import ZenohBus
+
     return ZenohBus(BusSettings(mode="client", endpoints=network.endpoints)), Keys(network.fleet)
 
 
@@ -68,6 +76,8 @@ def tell_if_alone(bus: ZenohBus, who: str) -> None:
 
 def stop_on_signals() -> threading.Event:
     """An event that SIGTERM, Ctrl-C and a parent's end set, so that a process can end in order."""
+    from mapweave import lifeline
+
     stop = threading.Event()
     lifeline.hold(stop)
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -121,6 +121,9 @@ def run_list(arguments: argparse.Namespace) -> int:
 
 def run_one(arguments: argparse.Namespace) -> int:
     """Run one trial and print what came of it."""
+    from mapweave.extras import TRIAL, need
+
+    need(*TRIAL)
     from rich.console import Console
 
     from mapweave.trial.run import TrialOptions, run_trial
@@ -157,6 +160,9 @@ def run_one(arguments: argparse.Namespace) -> int:
 
 def run_batch(arguments: argparse.Namespace) -> int:
     """Run many trials and print the table."""
+    from mapweave.extras import TRIAL, need
+
+    need(*TRIAL)
     from mapweave.output_folder import check_output
     from mapweave.trial.batch import BatchOptions, run_batch_of_trials
     from mapweave.trial.scenario import load_scenario, scenario_path

@@ -21,7 +21,6 @@ from mapweave.trial.recording import Recording, RobotRecord, Trajectory
 from mapweave.trial.scenario import Scenario
 from mapweave.trial.score import score
 from mapweave.trial.show import Show
-from mapweave.trial.trajectories import require_evo
 from sim.places import starting_places
 
 OWN = ".mapweave-trial"
@@ -89,7 +88,6 @@ def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
     """
     from mapweave.trial.folder import write_folder
 
-    require_evo()
     # A world that cannot be built shall be one line, before anything has been started.
     starting_places(scenario.world(options.seed), scenario.robots, options.seed)
     _make_room(options.out)

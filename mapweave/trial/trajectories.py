@@ -6,14 +6,13 @@ does not.
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue, SettingsError
+from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2
 from mapweave.scoring import align
 from mapweave.trial.recording import Trajectory
@@ -45,18 +44,6 @@ class TrajectoryScore:
     errors: Array
 
 
-def require_evo() -> None:
-    """Find out whether evo is there, before anything takes minutes.
-
-    Raises:
-        SettingsError: it is not installed.
-    """
-    try:
-        importlib.import_module("evo.core")
-    except ImportError:
-        raise SettingsError("scoring needs evo: pip install 'mapweave[eval]'") from None
-
-
 def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore:
     """Compare one map's trajectory with the truth.
 
@@ -69,9 +56,7 @@ def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore
 
     Raises:
         InvalidValue: no time that both know.
-        SettingsError: evo is not installed.
     """
-    require_evo()
     from evo.core import filters, metrics, sync
 
     try:

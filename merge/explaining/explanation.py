@@ -13,6 +13,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2
 from hybridmap.recognising.matching import match
+from hybridmap.ruling import reason_of
 from merge.belief.claims import CLAIMS
 from merge.belief.consistency import ConsistencySettings, group_links, loop_distances2
 from merge.belief.credence import prior_odds, probability, standpoints
@@ -22,7 +23,7 @@ from merge.graph.fragments import fragment_by_node
 from merge.graph.links import Link, RefusedLink, link_of
 from merge.graph.merged import MergedMap
 from merge.graph.verification import VerificationSettings, examine, verify
-from merge.undoing import reason_of, undo
+from merge.undoing import undo
 
 
 def explain_nodes(

@@ -8,9 +8,9 @@ from collections.abc import Collection, Iterable
 import networkx as nx
 
 from hybridmap.node import MapId
+from hybridmap.ruling import reason_of
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
-from merge.undoing import reason_of
 
 MOST_NAMED = 4
 """Maps that are named one by one."""

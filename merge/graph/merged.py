@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,9 @@ from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ruling import Rulings
 from hybridmap.superseded import Superseded
 from merge.graph.links import Link, RefusedLink
-from merge.graph.posegraph import PoseGraph
+
+if TYPE_CHECKING:
+    from merge.graph.posegraph import PoseGraph
 
 MOST_NAMES = 20
 """Maps that are named where one is mistyped."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import replace
 
 from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import Rulings
+from hybridmap.ruling import Rulings, reason_of
 from merge.belief.consistency import ConsistencySettings
 from merge.belief.distinctness import weigh
 from merge.graph.candidates import Pair
@@ -15,7 +15,6 @@ from merge.graph.links import Link, RefusedLink, refuse
 from merge.graph.merged import MergedMap
 from merge.incremental.sheets import Bundle, MapPair, Sheet
 from merge.incremental.verdicts import Verdicts
-from merge.undoing import reason_of
 
 PAST = "others stand for a node of it since another day: it is heard again when all is decided again"
 

@@ -17,9 +17,9 @@ from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 from hybridmap.ruling import Ruling, Rulings
 from mapserver.chronicle import BODIES, MOST_AT_ONCE, Chronicle
-from mapserver.explainer import with_rulings
 from mapserver.log.store import Store
 from mapserver.merging.merger import Merger
+from mapserver.ruling_history import with_rulings
 from merge.bodies.clash import Clash
 from merge.graph.links import refuse
 from merge.graph.merged import MergedMap

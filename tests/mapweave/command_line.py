@@ -1,10 +1,13 @@
-"""The command line as tests use it: what a command that fails says."""
+"""The command line as tests use it: what a command that fails says, and which commands there are."""
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Iterator
+
 import pytest
 
-from mapweave.cli import main
+from mapweave.cli import main, parser
 
 CAMERA = "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
 
@@ -17,3 +20,21 @@ def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     assert said[0].startswith("mapweave: ")
     assert len(said[0]) < 400
     return said[0]
+
+
+def commands(runnable: bool = False) -> list[str]:
+    """Every command that the parser has, as words: `map`, `map show` ...
+
+    Args:
+        runnable: only those that do something; not `map`, which has actions of its own.
+    """
+
+    def walk(words: list[str], at: argparse.ArgumentParser) -> Iterator[list[str]]:
+        inner = [action for action in at._actions if isinstance(action, argparse._SubParsersAction)]
+        if words and not (inner and runnable):
+            yield words
+        for action in inner:
+            for name, choice in action.choices.items():
+                yield from walk([*words, name], choice)
+
+    return [" ".join(words) for words in walk([], parser())]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.mapweave.command_line import complaint
+from tests.simulator import needs_simulator
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.usefixtures("signals", "simulator")
@@ -95,9 +96,12 @@ def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_p
     ("command", "hints"),
     [
         (["agent", "r0"], {"r0: waits for its body", "r0 finds no router: start `mapweave server`"}),
-        (["sim", "serve", "office"], {"the simulator finds no router: start `mapweave server`"}),
+        pytest.param(
+            ["sim", "serve", "office"], {"the simulator finds no router: start `mapweave server`"},
+            marks=needs_simulator,
+        ),
     ],
-)
+)  # fmt: skip
 def test_who_waits_says_what_for(command, hints, nobody, tmp_path):
     data = ["--data", str(tmp_path)] if command[0] == "agent" else []
     whole = [sys.executable, "-m", "mapweave", *command, "--connect", nobody, *data]

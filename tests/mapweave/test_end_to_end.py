@@ -19,6 +19,7 @@ from mapweave.scoring import posture_error, score_map
 from mapweave.trial.children import Children, free_port
 from mapweave.trial.reports import Reports
 from sim.control import SimControl
+from tests.simulator import needs_simulator
 from wire.bus_settings import BusSettings
 from wire.keys import Keys
 from wire.mapfile import read_map_file, unpack_map_file
@@ -37,6 +38,7 @@ def wait_for(condition, seconds, children, what):
         time.sleep(0.05)
 
 
+@needs_simulator
 @pytest.mark.timeout(420)
 def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
     """Map for a minute, then carry a robot to another place of its room: it must find itself and park."""
@@ -117,6 +119,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
 
 
 @pytest.mark.slow
+@needs_simulator
 @pytest.mark.timeout(420)
 def test_the_demo_of_another_seed(tmp_path):
     """`mapweave demo` with a world that no other test uses, against what the README promises."""

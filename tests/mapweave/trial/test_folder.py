@@ -186,11 +186,3 @@ def test_scoring_writes_nothing_at_home_and_says_nothing(tmp_path):
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_without_evo_one_line_says_how_to_get_it(staged, monkeypatch):
-    from hybridmap.errors import SettingsError
-
-    monkeypatch.setitem(sys.modules, "evo.core", None)
-    with pytest.raises(SettingsError, match=re.escape("pip install 'mapweave[eval]'")):
-        score(staged.recording())

@@ -16,7 +16,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.recognising.recognition import RecognitionSettings
-from hybridmap.ruling import Ruling, Rulings
+from hybridmap.ruling import Ruling, Rulings, reason_of
 from mapserver.merging.merger import Merger
 from merge.belief.consistency import ConsistencySettings
 from merge.belief.credence import FLOOR, LEAST_AREA, credences, prior_odds, standpoints
@@ -29,7 +29,6 @@ from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import LEAST_SIGMAS, Measurement, solve_graph
 from merge.graph.verification import VerificationSettings
-from merge.undoing import reason_of
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 

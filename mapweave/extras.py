@@ -1,0 +1,55 @@
+"""The extras of the package: libraries that a plain installation leaves out, and who needs them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from hybridmap.errors import MapweaveError
+
+MODULES = {
+    "server": ("faiss", "gtsam", "numba", "scipy"),
+    "sim": ("pybullet",),
+    "eval": ("evo",),
+    "viz": ("matplotlib",),
+}
+"""What each extra installs, by the names that are imported. No command needs `fast` or `gym`."""
+TRIAL = ("server", "sim", "eval", "viz")
+"""What a scenario with a whole fleet needs, its report included."""
+TRIAL = ("server", "sim", "eval", "viz")
+"""What a scenario with a whole fleet needs, its report included."""
+
+
+class MissingExtra(MapweaveError):
+    """A command needs libraries that are not installed."""
+
+    def __init__(self, extras: Sequence[str]) -> None:
+        """Name the extras and how to install them.
+
+        Args:
+            extras: at least one.
+        """
+        *first, last = (f'"{extra}"' for extra in extras)
+        names = f"{', '.join(first)} and {last}" if first else last
+        super().__init__(
+            f"needs the extra{'s' * (len(extras) > 1)} {names}: pip install 'mapweave[{','.join(extras)}]'"
+        )
+
+
+def need(*extras: str) -> None:
+    """Check that extras are installed, for a command that needs several, or one of them only late.
+
+    A command that needs a single extra at once does without: `cli.main` reads it off the import that fails.
+
+    Raises:
+        MissingExtra: some are not.
+    """
+    missing = [extra for extra in extras if any(find_spec(module) is None for module in MODULES[extra])]
+    if missing:
+        raise MissingExtra(missing)
+
+
+def extra_of(module: str | None) -> str | None:
+    """The extra that installs a module, as a failed import names it; None if none does."""
+    root = (module or "").split(".")[0]
+    return next((extra for extra, modules in MODULES.items() if root in modules), None)

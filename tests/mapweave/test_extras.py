@@ -1,0 +1,190 @@
+"""An installation without extras: each command works, or names in one line the extra that it needs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterable
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic import room, take_map
+from hybridmap.change import EdgePut, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId
+from hybridmap.pose import Pose2
+from hybridmap.ruling import Rulings
+from mapserver.mapfiles import map_file_of
+from mapweave.cli import MISSING_EXTRA, main
+from mapweave.extras import MODULES
+from mapweave.offline import merge_parts
+from merge.graph.merged import MergedMap
+from tests.mapweave.command_line import commands
+from tests.simulator import needs_simulator
+from wire.mapfile import MapFile, write_map_file
+
+ROOT = Path(__file__).parents[2]
+
+TRIAL = 'needs the extras "server", "sim", "eval" and "viz"'
+SIM, SERVER, VIZ = 'needs the extra "sim"', 'needs the extra "server"', 'needs the extra "viz"'
+WITHOUT_SERVER = "no router at"
+"""What is said where a running server would have to be asked: nothing is missing to do so."""
+
+CASES: list[tuple[str, str, str]] = [
+    # command, its arguments, what it says without extras
+    ("demo", "--out {tmp}", TRIAL),
+    ("sim list", "", "warehouse"),
+    ("sim run", "office --out {tmp}", TRIAL),
+    ("sim batch", "office --out {tmp}", TRIAL),
+    ("sim serve", "office --connect {nobody}", SIM),
+    ("server", "--listen {nobody} --data {tmp}", SERVER),
+    ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its body
+    ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
+    ("relocalize", "{recording}/images/0.png --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("eval relocalize", "{recording}", SERVER),
+    ("eval merge", "{recording}", 'needs the extras "server" and "viz"'),
+    ("map show", "{own}", "nodes"),
+    ("map show", "{own}", VIZ),  # the picture is left out, and that is said
+    ("map show", "{own} --out {tmp}/own.png", VIZ),
+    ("map explain", "--connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map explain", "r0.1.1 r1.1.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map explain", "--map {merged}", SERVER),
+    ("map explain", "{link} --map {merged} --draw {tmp}/link.png", VIZ),
+    ("map route", "r0.1.1 r0.1.3 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map route", "r0.1.1 r0.1.3 --map {merged}", SERVER),
+    ("map route", "r0.1.1 r0.1.3 --map {merged} --draw {tmp}/way.png", VIZ),
+    ("map history", "--connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map history", "--map {merged}", "nothing has joined"),
+    ("map unmerge", "r0.1 r1.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map unmerge", "r0.1 r1.1 --map {merged} --out {tmp}/apart.mapweave", SERVER),
+    ("map retire", "r0.1 --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
+    ("map retire", "r0.1 --map {merged} --out {tmp}/less.mapweave", SERVER),
+    ("map merge", "{own} -o {tmp}/out.mapweave", SERVER),
+    ("map export", "{merged} --to g2o -o {tmp}/out.g2o", SERVER),
+    ("map import", "{tmp}/out.g2o -o {tmp}/optimum.g2o", SERVER),
+]
+
+
+@pytest.fixture(scope="module")
+def merged() -> MergedMap:
+    """Two robots in one room."""
+    rng = np.random.default_rng(8)
+    here = room(0, 0, 5, 4, 700, rng)
+    stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
+    maps = {}
+    for name in ("r0", "r1"):
+        nodes, edges = take_map(here, MapId(name, 1), stops, rng)
+        maps[MapId(name, 1)] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
+    return merge_parts(maps, Rulings())
+
+
+@pytest.fixture
+def filled(merged: MergedMap, recording: Path, nobody: str, tmp_path: Path) -> dict[str, object]:
+    """What stands for the braces in CASES."""
+    own, whole = tmp_path / "own.mapweave", tmp_path / "merged.mapweave"
+    write_map_file(own, MapFile("agent", "r0.1", tuple(merged.maps[MapId("r0", 1)].contents())))
+    write_map_file(whole, map_file_of(merged))
+    link = next(link for link in merged.links if not link.within)
+    return {
+        "tmp": tmp_path, "nobody": nobody, "recording": recording, "own": own, "merged": whole,
+        "link": f"{link.a} {link.b}",
+    }  # fmt: skip
+
+
+Outcome = tuple[int | None, str, str]
+
+
+def outcomes(without: Iterable[str], lines: Iterable[str]) -> list[Outcome]:
+    """What becomes of commands in a process that lacks the libraries of some extras."""
+    missing = sorted({module for extra in without for module in MODULES[extra]})
+    ran = subprocess.run(
+        [sys.executable, "-m", "tests.mapweave.without_libraries", *missing],
+        input=json.dumps([line.split() for line in lines]),
+        capture_output=True, text=True, check=True, cwd=ROOT, timeout=120,
+    )  # fmt: skip
+    return [(status, out, err) for status, out, err in json.loads(ran.stdout)]
+
+
+def test_every_command_is_tried() -> None:
+    assert {command for command, _, _ in CASES} == set(commands(runnable=True))
+
+
+def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str, object]) -> None:
+    lines = [f"{command} {arguments}".format(**filled) for command, arguments, _ in CASES]
+    for (command, arguments, words), (status, out, err) in zip(CASES, outcomes(MODULES, lines), strict=True):
+        what = f"{command} {arguments}: {status}\n{out}{err}"
+        assert words in out + err, what
+        assert "Traceback" not in err, what
+        if status != 0:
+            assert status in (1, MISSING_EXTRA) and not out and len(err.splitlines()) == 1, what
+        if words.startswith("needs") and status != 0:
+            extras = ",".join(extra for extra in MODULES if f'"{extra}"' in words)
+            assert err == f"mapweave {command} {words}: pip install 'mapweave[{extras}]'\n", what
+            assert status == MISSING_EXTRA, what
+
+
+def test_each_extra_is_enough_for_what_asks_for_it(filled: dict[str, object]) -> None:
+    """With the server's libraries alone every command works that asks for no more."""
+    lines = [f"{command} {arguments}".format(**filled) for command, arguments, words in CASES
+             if words == SERVER and "map" in command]  # fmt: skip
+    others = [extra for extra in MODULES if extra != "server"]
+    for line, (status, out, err) in zip(lines, outcomes(others, lines), strict=True):
+        assert status == 0 and out and not err, f"{line}: {status}\n{out}{err}"
+
+
+@needs_simulator
+def test_a_trial_names_only_what_is_missing(tmp_path: Path) -> None:
+    """Before it starts: figures and pictures are made at its end."""
+    (outcome,) = outcomes(["eval", "viz"], [f"sim run office --out {tmp_path}"])
+    words = 'mapweave sim run needs the extras "eval" and "viz": pip install \'mapweave[eval,viz]\'\n'
+    assert outcome == (MISSING_EXTRA, "", words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_extras_are_those_of_the_package() -> None:
+    package = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    installed = packages_distributions()
+    for extra, modules in MODULES.items():
+        named = {requirement.split(">")[0] for requirement in package[extra]}
+        present = [module for module in modules if module in installed]
+        assert {installed[module][0] for module in present} <= named, extra
+        assert len(named) == len(modules), extra
+
+
+HELP = """
+import contextlib, io, json, sys
+before = {name.split(".")[0] for name in sys.modules}
+from mapweave.cli import main
+for words in json.load(sys.stdin):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        try:
+            main(words)
+        except SystemExit:
+            pass
+print(*({name.split(".")[0] for name in sys.modules} - before - sys.stdlib_module_names))
+"""
+
+
+def test_help_wrong_use_and_version_import_no_library() -> None:
+    """All that takes time to import is left until a command runs."""
+    asked = [[*command.split(), "--help"] for command in commands()]
+    wrong = [[*command.split(), "--no-such-option"] for command in commands()]
+    ran = subprocess.run(
+        [sys.executable, "-c", HELP],
+        input=json.dumps([[], ["--help"], ["--version"], ["fly"], *asked, *wrong]),
+        capture_output=True, text=True, check=True, cwd=ROOT, timeout=60,
+    )  # fmt: skip
+    assert set(ran.stdout.split()) == {"mapweave", "hybridmap"}
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"mapweave {project['version']}\n"
