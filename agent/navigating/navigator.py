@@ -131,13 +131,21 @@ class Navigator:
         """Whether the robot is parked at the goal."""
         return self.stage == Stage.ARRIVED
 
-    def step(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
-        """One tick: returns what the wheels shall do and what to ask the fleet's map."""
+    def step(
+        self, observation: Observation, answers: tuple[Answer, ...], standing: bool = False
+    ) -> tuple[Command, list[Question]]:
+        """One tick: returns what the wheels shall do and what to ask the fleet's map.
+
+        Args:
+            observation: what the robot senses now.
+            answers: that have come.
+            standing: the robot must not move; the behaviour waits, and where the robot is is kept up.
+        """
         self._helm.take_in(observation, answers)
         self._detour.see(observation)
-        if self.fix is not None and not self._following:
+        if self.fix is not None and (standing or not self._following):
             self.fix.follow(observation, self._description)
-        command = next(self._behaviour)
+        command = Command() if standing else next(self._behaviour)
         known = None if self._searching else self.fix
         self.traverse = self._surveyor.see(known, observation)
         self.refined = self._refinement.see(None if self.arrived else known)

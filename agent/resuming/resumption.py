@@ -140,13 +140,18 @@ class Resumption:
         """Where the wheels have brought the robot since it began to look."""
         return self._helm.odom_from_robot
 
-    def step(self, observation: Observation) -> Command:
-        """One tick: returns what the wheels shall do. Once `found` is set there is nothing more to do."""
+    def step(self, observation: Observation, standing: bool = False) -> Command:
+        """One tick: returns what the wheels shall do. Once `found` is set there is nothing more to do.
+
+        Args:
+            observation: what the robot senses now.
+            standing: the robot must not move; the behaviour waits.
+        """
         self._helm.take_in(observation, ())
         odometry = observation.odometry
         self._way, self._turned = self._way + abs(odometry.forward), self._turned + abs(odometry.turn)
         self.seen.append((self.odom_from_robot, observation.proximity))
-        return next(self._behaviour)
+        return Command() if standing else next(self._behaviour)
 
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 

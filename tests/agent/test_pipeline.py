@@ -82,7 +82,7 @@ def test_the_map_is_the_replay_of_the_changes(explored):
 def test_a_robot_without_a_camera_stands_still_and_says_why(mission):
     pipeline = on(mission)
     for tick in range(40):
-        step = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), None))
+        step = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), None, rangers(Pose2())))
         assert step.changes == step.questions == ()
         if not isinstance(mission, GoTo):
             assert step.command == Command()
