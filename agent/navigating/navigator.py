@@ -211,7 +211,7 @@ class Navigator:
             leg = follower.leg
             command = follower.step(self._helm.observation)
             self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
-            self.tally = self.tally.passed(_distances(route, leg, follower.leg, follower.fix))
+            self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._vain_looks = 0
             if follower.progress not in (Progress.DRIVING, Progress.PARKING):
@@ -221,7 +221,7 @@ class Navigator:
         match follower.progress:
             case Progress.ARRIVED:
                 self.tally = self.tally.passed([0.0])
-            case Progress.BLOCKED if not self._parked_anew and self._only_parking(route, follower.fix):
+            case Progress.BLOCKED if not self._parked_anew and self._only_parking(follower):
                 # Nothing keeps it from its goal but its own precision: that is no block for anybody.
                 self.detail, self._parked_anew = "parking came to no end: once more", True
             case Progress.BLOCKED:
@@ -281,21 +281,6 @@ class Navigator:
                 return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
         return ""
 
-    def _only_parking(self, route: tuple[RouteLeg, ...], fix: Fix) -> bool:
+    def _only_parking(self, follower: Follower) -> bool:
         """Whether the robot is about at the route's last node, with nothing in its way."""
-        distance = _distances(route, len(route) - 1, len(route), fix)[0]
-        return distance <= self._settings.follower.near and not self._in_the_way()
-
-
-def _distances(route: tuple[RouteLeg, ...], before: int, after: int, fix: Fix) -> list[float]:
-    """Of the robot from the route's nodes that it has passed in one tick, m."""
-    reference = next((k for k, leg in enumerate(route) if leg.node.id == fix.node), 0)
-    distances = []
-    for leg in range(before, after):
-        between = Pose2()
-        for hop in route[min(leg, reference) + 1 : max(leg, reference) + 1]:
-            between = between @ hop.previous_from_node.mean
-        leg_from_reference = between if leg <= reference else between.inverse()
-        here = leg_from_reference @ fix.node_from_robot.mean
-        distances.append(math.hypot(here.x, here.y))
-    return distances
+        return follower.to_goal <= self._settings.follower.near and not self._in_the_way()
