@@ -2,7 +2,7 @@ r"""One robot's whole pipeline: observation in, command and map changes out. Rea
 
     image, odometry, proximity -> mapper (tracks, EKF, nodes) -> changes
                                -> floor                        \
-    lost on the own map ------> resumption (recall) -> mapper   |
+    lost on the own map ------> global localization -> mapper   |
     mission ------------------> explorer | passenger | navigator -> guard -> command
 
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
@@ -19,12 +19,13 @@ from agent.exploring.explorer import Explorer
 from agent.exploring.passenger import Passenger, PassengerSettings
 from agent.exploring.wanderer import Wanderer
 from agent.floor import Floor, FloorSettings
+from agent.global_localization.resumption import Resumption
+from agent.global_localization.settings import ResumptionSettings
 from agent.mapping.mapper import Mapper, MapperSettings
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
 from agent.navigating.navigator import Navigator, NavigatorSettings
 from agent.observation import Command, Observation, RobotDescription
 from agent.ranger_monitor import RangerMonitor
-from agent.resuming.resumption import Resumption, ResumptionSettings
 from agent.servo.proximity import guard
 from agent.tally import Tally
 from agent.vision.lens import Lens

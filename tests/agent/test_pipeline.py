@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from agent.global_localization.pose_consistency import ConsistencySettings
+from agent.global_localization.settings import ResumptionSettings
 from agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
 from agent.observation import Command, Observation, Odometry
 from agent.pipeline import Pipeline, PipelineSettings, Step
-from agent.resuming.agreement import AgreementSettings
-from agent.resuming.resumption import ResumptionSettings
 from hybridmap.change import NodePut
 from hybridmap.node import Edge, EdgeKind, NodeId
 from hybridmap.pose import Pose2
@@ -255,7 +255,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
     Returns:
         The pipeline, what was in its map before, and the steps since.
     """
-    near = ResumptionSettings(agreement=AgreementSettings(way=0.2))
+    near = ResumptionSettings(consistency=ConsistencySettings(way=0.2))
     pipeline, before = on(Carried(), PipelineSettings(resumption=near)), Pose2(-1.0)
     for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
         pipeline.step(walls.observe(before, Pose2(x), tick))
