@@ -2,7 +2,7 @@ r"""One robot's whole pipeline: observation in, command and map changes out. Rea
 
     image, odometry, proximity -> mapper (tracks, EKF, nodes) -> changes
                                -> floor                        \
-    lost on the own map ------> resumption (recall) -> mapper   |
+    lost on the own map ------> global localization -> mapper   |
     mission ------------------> explorer | passenger | navigator -> guard -> command
 
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
@@ -19,11 +19,13 @@ from agent.exploring.explorer import Explorer
 from agent.exploring.passenger import Passenger, PassengerSettings
 from agent.exploring.wanderer import Wanderer
 from agent.floor import Floor, FloorSettings
+from agent.global_localization.resumption import Resumption
+from agent.global_localization.settings import ResumptionSettings
 from agent.mapping.mapper import Mapper, MapperSettings
 from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
 from agent.navigating.navigator import Navigator, NavigatorSettings
 from agent.observation import Command, Observation, RobotDescription
-from agent.resuming.resumption import Resumption, ResumptionSettings
+from agent.ranger_monitor import RangerMonitor
 from agent.servo.proximity import guard
 from agent.tally import Tally
 from agent.vision.lens import Lens
@@ -132,6 +134,7 @@ class Pipeline:
         self._sift = Sift(lens, self._settings.mapper.sift)
         self._mapper = Mapper(map_id, description, self._settings.mapper, contents, next_number)
         self._floor = Floor(description, self._settings.floor)
+        self._rangers = RangerMonitor(description)
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
         self._passenger: Passenger | None = None
@@ -187,6 +190,7 @@ class Pipeline:
             answers: to questions of earlier steps.
         """
         command, changes, questions = Command(), list[ChangeBody](), list[Question]()
+        self._rangers.see(observation.proximity)
         match self._mission:
             case Idle() if self._mapper.started:
                 # Whoever goes on mapping later needs to know what the wheels did meanwhile.
@@ -196,7 +200,7 @@ class Pipeline:
             case Explore() | Carried():
                 command, changes, questions = self._map(observation, answers)
             case GoTo() if self._navigator is not None:
-                command, questions = self._navigator.step(observation, answers)
+                command, questions = self._navigator.step(observation, answers, bool(self._blind))
                 changes = self._mapper.drove(self._navigator.traverse, self._navigator.refined)
         safe, warning = guard(command, observation.proximity, self._description)
         if observation.bumped and safe.forward * self._direction > 0:
@@ -204,6 +208,11 @@ class Pipeline:
         elif not observation.bumped and safe.forward:
             self._direction = math.copysign(1.0, safe.forward)
         return Step(safe, tuple(changes), tuple(questions), self._status(warning))
+
+    @property
+    def _blind(self) -> str:
+        """Why a robot that drives by itself must stand, by its rangers; empty if it may drive."""
+        return self._rangers.fault if isinstance(self._mission, Explore | GoTo) else ""
 
     def _new_explorer(self) -> Explorer:
         settings, parts = self._settings, (self._map_id, self._description, self._mapper, self._floor)
@@ -221,7 +230,7 @@ class Pipeline:
         self, observation: Observation, answers: tuple[Answer, ...]
     ) -> tuple[Command, list[ChangeBody], list[Question]]:
         self._keep_up(observation)
-        if self._mapper.doubtful or self._mapper.astray:
+        if self._mapper.doubtful or self._mapper.astray or self._blind:
             return Command(), [], []
         if isinstance(self._mission, Carried):
             assert self._passenger is not None
@@ -237,7 +246,7 @@ class Pipeline:
             self._resumption = Resumption(
                 self._description, self._sift, self.map, drives, settings.resumption, settings.seed
             )
-        command = self._resumption.step(observation)
+        command = self._resumption.step(observation, bool(self._blind))
         found, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
         if found is None:
             return command
@@ -275,6 +284,8 @@ class Pipeline:
             case GoTo() if self._navigator is not None:
                 doing, detail = str(self._navigator.stage), self._navigator.detail
                 finished = self._navigator.arrived
+        if self._blind:
+            doing, detail = "standing still", self._blind
         mapping = isinstance(self._mission, Explore | Carried) and not self._mapper.doubtful
         for more in (self._mapper.health if mapping else "", warning):
             detail = "; ".join(part for part in (detail, more) if part)

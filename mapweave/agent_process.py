@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,17 +18,22 @@ from agent.mission import Idle, Mission
 from agent.observation import Observation, RobotDescription
 from agent.pipeline import Pipeline, PipelineSettings, Step
 from agent.runner import Runner
+from agent.sharing.epochs import newest_on_server, next_epoch
 from agent.sharing.journal import Journal
 from agent.sharing.kept import Kept
 from agent.sharing.merged_postures import MergedPostures
 from agent.sharing.replication import Replicator
 from agent.synchronization import FreeRunning, Synchronization
-from hybridmap.node import MapId
+from hybridmap.errors import InvalidFile, InvalidValue
+from hybridmap.node import NUMBER, MapId
 from wire.bus import Bus
 from wire.keys import Keys
 from wire.mapfile import MapFile, write_map_file
 from wire.metered import MeteredBus
 from wire.zenoh_bus import ZenohBus
+
+FIRST_PATIENCE = 3.0
+"""How long a robot that remembers no map asks the server for the number of its next one, s."""
 
 SILENCE = 2.0
 """s; who waits longer for its body says so."""
@@ -42,8 +46,9 @@ class AgentOptions:
     Attributes:
         name: in the fleet.
         data: folder for its journal and its map file.
-        epoch: number of the map if one is begun; None takes the clock's seconds, which only grow.
+        epoch: least number of the map if one is begun; None asks the server which one is next.
         fresh: begin a new map even if the journal holds one.
+        resume: the map of the journal that goes on; None takes the newest.
         mission: at the start.
         seed: of the random choices in exploration.
         synchronization: what the loop waits for between ticks.
@@ -56,6 +61,7 @@ class AgentOptions:
     data: Path
     epoch: int | None = None
     fresh: bool = False
+    resume: MapId | None = None
     mission: Mission = field(default_factory=Idle)
     seed: int = 0
     synchronization: Synchronization = field(default_factory=FreeRunning)
@@ -68,7 +74,8 @@ class Agent:
     """Mind, disk and link of one robot; whoever has its body calls `tick` and `exchange`.
 
     It takes up the newest map of its journal. When the pipeline cannot find itself on that map, a fresh map
-    begins in a new epoch; the old one stays.
+    begins in a new epoch; the old one stays. Each map has a file of its own, written when another map begins
+    and at the end.
     """
 
     def __init__(
@@ -106,9 +113,12 @@ class Agent:
         try:
             self._description = describe()
             maps = self.journal.maps()
-            if maps and not options.fresh:
-                self._resume(maps[-1])
+            if options.resume is not None or (maps and not options.fresh):
+                self._resume(self._chosen(maps))
             else:
+                for left in maps[-1:]:
+                    # An agent that was killed has written no file.
+                    self._write(left, Kept.of(self.journal, left))
                 self._begin()
         except BaseException:
             self.journal.close()
@@ -116,10 +126,18 @@ class Agent:
 
     def _begin(self) -> None:
         """A fresh map, whose number no map of this robot has had."""
-        newest = max((one.epoch for one in self.journal.maps()), default=None)
-        given = self._options.epoch
-        wanted = int(time.time()) if given is None else given
-        epoch = wanted if newest is None else max(wanted, newest + 1)
+        options = self._options
+        taken = [one.epoch for one in self.journal.maps()]
+        taken += epochs_of_files(options.data, options.name)
+        if options.epoch is not None:
+            epoch = max([options.epoch, *(used + 1 for used in taken)])
+        else:
+            # A session may take a moment to find its router; a disk that remembers maps needs no server.
+            patience = 0.0 if taken else FIRST_PATIENCE
+            stored = None
+            if options.patience > 0.0:
+                stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
+            epoch = next_epoch(taken, stored)
         map_id = self.journal.open_map(epoch)
         self._start(map_id, Pipeline(map_id, self._description, self._settings))
 
@@ -131,7 +149,18 @@ class Agent:
         self._say(f"{self._options.name}: takes up map {map_id} with {nodes} nodes")
         if kept.complaint:
             self._say(f"{self._options.name}: {kept.complaint}")
+            self._set_aside(map_id)
         self._start(map_id, pipeline)
+
+    def _chosen(self, maps: list[MapId]) -> MapId:
+        """The map that goes on."""
+        chosen = self._options.resume
+        if chosen is None:
+            return maps[-1]
+        if chosen not in maps:
+            held = ", ".join(map(str, maps)) or "none"
+            raise InvalidValue(f"the journal of {self._options.name} has no map {chosen}; it has {held}")
+        return chosen
 
     def _start(self, map_id: MapId, pipeline: Pipeline, mission: Mission | None = None) -> None:
         options = self._options
@@ -154,6 +183,11 @@ class Agent:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
         mission, old = self.pipeline.mission, self.map_id
         self._leave()
+        try:
+            self.write_map()
+        except InvalidFile as error:
+            # The journal has it all.
+            self._say(f"{self._options.name}: {error}")
         self._begin()
         self.pipeline.set_mission(mission)
         self._say(
@@ -178,10 +212,24 @@ class Agent:
 
     def write_map(self) -> Path:
         """Write the map that it makes to its map file; returns where."""
-        path = self._options.data / f"{self._options.name}.mapweave"
-        contents = tuple(self.pipeline.map.contents())
-        write_map_file(path, MapFile("agent", str(self.map_id), contents, {}))
+        path = map_path(self._options.data, self.map_id)
+        write_map_file(path, MapFile("agent", str(self.map_id), tuple(self.pipeline.map.contents())))
         return path
+
+    def _write(self, left: MapId, kept: Kept) -> None:
+        """Write a map that is left to its map file, as the journal has it."""
+        if kept.complaint:
+            self._set_aside(left)
+        if kept.contents:
+            write_map_file(map_path(self._options.data, left), MapFile("agent", str(left), kept.contents))
+
+    def _set_aside(self, map_id: MapId) -> None:
+        """The journal has lost something of a map: its file, which may hold that, is not written over."""
+        path = map_path(self._options.data, map_id)
+        aside = path.with_name(f"{map_id}.before-damage{path.suffix}")
+        if path.exists() and not aside.exists():
+            path.rename(aside)
+            self._say(f"{self._options.name}: the map file written before is kept as {aside}")
 
     def _placed(self) -> int:
         return self.merged_postures.count(self.map_id)
@@ -196,6 +244,17 @@ class Agent:
         """Commit what was mapped and leave the fleet. The bus stays open."""
         self._leave()
         self.journal.close()
+
+
+def map_path(folder: Path, map_id: MapId) -> Path:
+    """Where an agent writes a map: one file a map, for example `r0.3.mapweave`."""
+    return folder / f"{map_id}.mapweave"
+
+
+def epochs_of_files(folder: Path, agent: str) -> list[int]:
+    """Numbers of the maps of an agent that have a file in a folder."""
+    numbers = (path.name.split(".")[1] for path in folder.glob(f"{agent}.*.mapweave"))
+    return [int(number) for number in numbers if NUMBER.fullmatch(number)]
 
 
 def run_agent(

@@ -6,7 +6,7 @@
     mapweave/1/<fleet>/agent/<agent>/alive/<epoch>    liveliness
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
-    mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk
+    mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
     mapweave/1/<fleet>/server/<server>/postures/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, rule, history
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
@@ -104,6 +104,10 @@ class Keys:
     def ack(self, server: str, agent: str) -> str:
         """Where a server says what of an agent's log is on its disk."""
         return f"{self.root}/server/{check_name(server)}/ack/{check_name(agent)}"
+
+    def all_acks(self, server: str) -> str:
+        """Pattern: what a server says to every agent; a question: the newest map that it has of one."""
+        return f"{self.root}/server/{check_name(server)}/ack/*"
 
     def acks(self, agent: str) -> str:
         """Pattern: what any server says to an agent."""

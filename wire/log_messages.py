@@ -131,6 +131,26 @@ class Ack:
 
 
 @dataclass(frozen=True, slots=True)
+class NewestMap:
+    """A server's answer to an agent that is about to begin a map: the highest epoch that it has of it.
+
+    Attributes:
+        epoch: 0 if it has no map of this agent.
+    """
+
+    epoch: int
+
+    def encode(self) -> bytes:
+        """Encode."""
+        return pack({"e": self.epoch})
+
+    @staticmethod
+    def decode(data: bytes) -> NewestMap:
+        """Decode; raises InvalidMessage."""
+        return NewestMap(Reader(data, "newest map", MAX_SMALL_BYTES).integer("e", 0, MAX_NUMBER))
+
+
+@dataclass(frozen=True, slots=True)
 class LogRequest:
     """A server asks for the changes first to last, both included."""
 

@@ -33,7 +33,12 @@ MAX_SMALL_BYTES = 16384
 """Longest message without an image."""
 
 FARTHEST = 1e4
-"""No ranger reaches farther and no robot drives farther between two observations, m."""
+"""No ranger reaches farther, m."""
+MOST_WAY = 10.0
+"""No robot drives farther between two observations, m: 3 m/s over the longest silence before a question is
+asked again."""
+MOST_TURN = 20.0
+"""Nor does it turn by more, rad: a turn a second over the same time."""
 FASTEST = 1e3
 """No robot drives or turns faster, m/s and rad/s."""
 
@@ -100,6 +105,8 @@ def decode_observation(data: bytes) -> Observation:
     """
     reader = Reader(data, "observation", MAX_IMAGE_BYTES + MAX_SMALL_BYTES)
     forward, turn = _numbers(reader, "u", 2, 2, -FARTHEST, FARTHEST)
+    if abs(forward) > MOST_WAY or abs(turn) > MOST_TURN:
+        raise reader.error(f"odometry of {forward:g} m and {turn:g} rad in one step is out of range")
     bumped = reader.any("b")
     if type(bumped) is not bool:
         raise reader.error("b must be true or false")
@@ -110,6 +117,21 @@ def decode_observation(data: bytes) -> Observation:
         proximity=np.array(_numbers(reader, "r", 0, MAX_RANGERS, 0.0, FARTHEST)),
         bumped=bumped,
     )
+
+
+def check_image(observation: Observation, description: RobotDescription) -> None:
+    """Hold an observation's image against the camera that the body has described.
+
+    Raises:
+        InvalidMessage: it has another size.
+    """
+    camera, image = description.camera, observation.image
+    if image is not None and image.shape != (camera.height, camera.width):
+        height, width = image.shape
+        raise InvalidMessage(
+            f"observation: an image of {width}x{height} px from a camera described as "
+            f"{camera.width}x{camera.height} px"
+        )
 
 
 def encode_description(description: RobotDescription) -> bytes:

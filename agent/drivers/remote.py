@@ -13,6 +13,7 @@ from agent.drivers.messages import (
     AGAIN,
     ENDED,
     StepRequest,
+    check_image,
     decode_description,
     decode_observation,
     encode_step,
@@ -100,7 +101,14 @@ class RemoteRobot:
             return None
         # Counted when it is answered: a step that failed is asked again under its own number.
         step = StepRequest(self._sequence + 1, self._command)
-        observation = self._ask(self._step_key, encode_step(step), decode_observation)
+        description = self.describe()
+
+        def decode(data: bytes) -> Observation:
+            observation = decode_observation(data)
+            check_image(observation, description)
+            return observation
+
+        observation = self._ask(self._step_key, encode_step(step), decode)
         self._sequence += 1
         return observation
 
@@ -123,9 +131,13 @@ class RemoteRobot:
         self._alive.close()
 
     def _ask(self, key: str, payload: bytes, decode: Callable[[bytes], _T]) -> _T | None:
-        """Ask until there is an answer; None if there will be none, or this robot was closed."""
+        """Ask until there is an answer; None if there will be none, or this robot was closed.
+
+        An answer that is not valid is asked for once more: it may have been damaged on its way.
+        """
         end = time.monotonic() + self._patience
         reason = "nobody answers"
+        asked_again = False
         while True:
             # A short patience still gives every question time for its answer.
             replies = self._bus.ask(key, payload, min(ASK_TIMEOUT, max(end - time.monotonic(), PAUSE)))
@@ -136,7 +148,10 @@ class RemoteRobot:
                 try:
                     return decode(answers[0])
                 except InvalidMessage as error:
-                    raise DeviceError(f"{key}: {error}") from error
+                    if asked_again:
+                        raise DeviceError(f"{key}: {error}") from error
+                    asked_again = True
+                    continue
             for reply in replies:
                 reason = reply.error
                 if reason == ENDED:

@@ -93,6 +93,8 @@ class Detour:
         """(N, 2) m in odom, points of the way around; none if the straight way is free."""
         s, room = self._settings, self._floor.room()
         least, wished = (self._description.radius + extra for extra in (s.least, s.wished))
+        # The robot stands in the middle of the grid; what lies beyond its border nobody has seen.
+        goal = start + (goal - start) * min(1.0, 0.5 * s.floor.side / max(np.abs(goal - start).max(), 1e-9))
         count = int(np.hypot(*(goal - start)) / (0.5 * s.floor.cell)) + 2
         line = self._floor.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start))
         if (room[line[:, 0], line[:, 1]] >= 0.5 * (least + wished)).all():

@@ -26,6 +26,9 @@ from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from hybridmap.query import RouteLeg
 
+MOST_LOOKED_FOR = 8
+"""Nodes tried in one image: a route may put any number of them into one place."""
+
 
 class Progress(StrEnum):
     """How far a follower is."""
@@ -79,6 +82,9 @@ class Follower:
         self._description = description
         self._lookout = Lookout(description, lens, sift, settings.lookout, rng)
         self._route = route
+        self._start_from_leg = [Pose2()]
+        for hop in route[1:]:
+            self._start_from_leg.append(self._start_from_leg[-1] @ hop.previous_from_node.mean)
         self._detour = detour
         self._settings = settings
         # A landmark without a depth has one for the rest of the drive once the way has told it.
@@ -107,6 +113,16 @@ class Follower:
         """The pair of nodes between which the robot is, or is stuck."""
         before = self._route[self.leg - 1].node.id if self.leg else self._start
         return before, self._route[self.leg].node.id
+
+    @property
+    def to_goal(self) -> float:
+        """How far the robot is from the last node, m."""
+        return self.distance(self._last)
+
+    def distance(self, leg: int) -> float:
+        """How far the robot is from a leg's node, m."""
+        there = self._from_reference(leg) @ self.fix.node_from_robot.mean
+        return math.hypot(there.x, there.y)
 
     def step(self, observation: Observation) -> Command:
         """One tick; `progress` says whether it is the last one."""
@@ -215,10 +231,7 @@ class Follower:
             self.leg = self._reference
         if self._reference == self.leg < self._last and self._off_reference() < 2 * self._settings.passed:
             self.leg += 1
-        while self.leg < self._last:
-            target = self._target()
-            if math.hypot(target.x, target.y) >= self._settings.passed:
-                break
+        while self.leg < self._last and self.distance(self.leg) < self._settings.passed:
             self.leg += 1
         if self.leg != before:
             self._progressed = Headway()
@@ -237,8 +250,10 @@ class Follower:
         """Nodes whose landmarks may be in view, furthest first."""
         s = self._settings
         first = self._reference + 1 if self.fix.in_sight else 0
-        wanted = []
+        wanted: list[Expected] = []
         for index in range(min(self.leg + s.skip, self._last), first - 1, -1):
+            if len(wanted) == MOST_LOOKED_FOR:
+                break
             expected = self._expected(index)
             there = expected.node_from_robot
             if math.hypot(there.x, there.y) < s.sight_reach and abs(wrap_angle(there.heading)) < s.sight_turn:
@@ -262,10 +277,7 @@ class Follower:
 
     def _from_reference(self, target: int) -> Pose2:
         """`target_from_reference` along the route's relative postures."""
-        pose = Pose2()
-        for leg in self._route[min(self._reference, target) + 1 : max(self._reference, target) + 1]:
-            pose = pose @ leg.previous_from_node.mean
-        return pose.inverse() if target >= self._reference else pose
+        return self._start_from_leg[target].inverse() @ self._start_from_leg[self._reference]
 
     def _off_reference(self) -> float:
         return math.hypot(self.fix.node_from_robot.mean.x, self.fix.node_from_robot.mean.y)

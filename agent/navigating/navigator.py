@@ -9,15 +9,18 @@ from enum import StrEnum
 
 import numpy as np
 
+from agent.global_localization.candidates import Candidate, FleetMap, OwnMap
+from agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
+from agent.global_localization.settings import GlobalLocalizationSettings
 from agent.localizing.fix import Fix
+from agent.localizing.localizer import Localizer, LocalizerSettings
 from agent.mission import Answer, Question, WhichWay
+from agent.motion_primitives import Behaviour, MotionPrimitives
 from agent.navigating.blocks import Blocks, BlockSettings
 from agent.navigating.detour import Detour, DetourSettings
 from agent.navigating.follower import Follower, Progress
 from agent.navigating.follower_settings import FollowerSettings
-from agent.navigating.helm import Behaviour, Helm
 from agent.navigating.own_route import own_route
-from agent.navigating.search import Search, SearchSettings
 from agent.observation import Command, Observation, RobotDescription
 from agent.surveying.refinement import Refinement, RefinementSettings
 from agent.surveying.surveyor import Surveyor, SurveyorSettings, Traverse
@@ -38,7 +41,8 @@ class NavigatorSettings:
     """How the robot navigates.
 
     Attributes:
-        search: while it is lost.
+        localization: while it is lost.
+        localizer: tracking and filtering of the landmarks of the place that it has found.
         follower: along a route.
         detour: between nodes.
         blocks: how long it remembers where it could not get through.
@@ -52,7 +56,8 @@ class NavigatorSettings:
         looks: so often in a row; then it is lost.
     """
 
-    search: SearchSettings = field(default_factory=SearchSettings)
+    localization: GlobalLocalizationSettings = field(default_factory=GlobalLocalizationSettings)
+    localizer: LocalizerSettings = field(default_factory=LocalizerSettings)
     follower: FollowerSettings = field(default_factory=FollowerSettings)
     detour: DetourSettings = field(default_factory=DetourSettings)
     blocks: BlockSettings = field(default_factory=BlockSettings)
@@ -115,8 +120,11 @@ class Navigator:
         self._settings = s = settings or NavigatorSettings()
         self._rng = np.random.default_rng(seed)
         self._detour = Detour(description, s.detour)
-        self._helm = Helm(description, s.answer_patience)
-        self._search = Search(description, lens, sift, own_map, self._helm, s.search, self._rng)
+        self._motion = MotionPrimitives(description, s.answer_patience)
+        self._localization = GlobalLocalization(
+            description, sift, self._motion, OwnMap(own_map, self._rng), FleetMap(self._motion),
+            s.localization,
+        )  # fmt: skip
         self._blocks = Blocks(s.blocks)
         self._surveyor = Surveyor(description, s.surveyor)
         self._refinement = Refinement(own_map, s.refinement)
@@ -131,19 +139,27 @@ class Navigator:
         """Whether the robot is parked at the goal."""
         return self.stage == Stage.ARRIVED
 
-    def step(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
-        """One tick: returns what the wheels shall do and what to ask the fleet's map."""
-        self._helm.take_in(observation, answers)
+    def step(
+        self, observation: Observation, answers: tuple[Answer, ...], standing: bool = False
+    ) -> tuple[Command, list[Question]]:
+        """One tick: returns what the wheels shall do and what to ask the fleet's map.
+
+        Args:
+            observation: what the robot senses now.
+            answers: that have come.
+            standing: the robot must not move; the behaviour waits, and where the robot is is kept up.
+        """
+        self._motion.take_in(observation, answers)
         self._detour.see(observation)
-        if self.fix is not None and not self._following:
+        if self.fix is not None and (standing or not self._following):
             self.fix.follow(observation, self._description)
-        command = next(self._behaviour)
+        command = Command() if standing else next(self._behaviour)
         known = None if self._searching else self.fix
         self.traverse = self._surveyor.see(known, observation)
         self.refined = self._refinement.see(None if self.arrived else known)
         if self._searching:
-            self.detail = self._search.detail
-        return command, self._helm.questions()
+            self.detail = self._localization.detail
+        return command, self._motion.questions()
 
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
 
@@ -163,20 +179,30 @@ class Navigator:
     def _find(self) -> Behaviour:
         self.stage, self._searching, self._goal_hidden = Stage.LOST, True, False
         believed, self._believed = self._believed, None
-        self.fix = yield from self._search.look_around(believed)
-        self._found()
+        place = yield from self._localization.search(believed)
+        self._found(place)
 
-    def _found(self) -> None:
-        self._searching, self.detail = False, self._search.detail
-        if self.fix is not None:
-            self.tally = self.tally.found()
+    def _found(self, place: Candidate | None) -> None:
+        """Go on from the place that was found, if one was."""
+        self._searching, self.detail, self.fix = False, self._localization.detail, None
+        if place is None:
+            return
+        self.tally = self.tally.found()
+        if (seen := place.recognized) is None:
+            self.fix = Fix(place.node, place.node_from_robot)
+        else:
+            localizer = Localizer(
+                self._description, self._lens, seen.node, seen.image, seen.features, seen.recognition,
+                self._settings.localizer,
+            )  # fmt: skip
+            self.fix = Fix.of(localizer)
 
     def _get_route(self, fix: Fix) -> Generator[Command, None, tuple[RouteLeg, ...]]:
         """Ask the fleet's map; where nobody answers, the own map must do."""
         self.stage = Stage.ASKING
-        here, blocked = fix.node_from_robot.mean, self._blocks.at(self._helm.now)
-        question = WhichWay(self._helm.number(), fix.node, self.goal, here, blocked)
-        answer = yield from self._helm.ask(question)
+        here, blocked = fix.node_from_robot.mean, self._blocks.at(self._motion.now)
+        question = WhichWay(self._motion.number(), fix.node, self.goal, here, blocked)
+        answer = yield from self._motion.ask(question)
         content, trouble = answer.content, ""
         if not isinstance(content, RouteAnswer):
             trouble = f"{answer.error or 'no answer'}; "
@@ -188,9 +214,9 @@ class Navigator:
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: what is in the way may go; without that the robot may not be where it thinks."""
         self.stage = Stage.WAITING
-        if not self._blocks.at(self._helm.now):
+        if not self._blocks.at(self._motion.now):
             self.fix = None
-        yield from self._helm.stand(self._settings.pause)
+        yield from self._motion.stand(self._settings.pause)
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
         """Follow a route until it is driven, or blocked, or the robot does not know where it is."""
@@ -201,9 +227,9 @@ class Navigator:
         self._following = True
         while True:
             leg = follower.leg
-            command = follower.step(self._helm.observation)
+            command = follower.step(self._motion.observation)
             self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
-            self.tally = self.tally.passed(_distances(route, leg, follower.leg, follower.fix))
+            self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._vain_looks = 0
             if follower.progress not in (Progress.DRIVING, Progress.PARKING):
@@ -213,7 +239,7 @@ class Navigator:
         match follower.progress:
             case Progress.ARRIVED:
                 self.tally = self.tally.passed([0.0])
-            case Progress.BLOCKED if not self._parked_anew and self._only_parking(route, follower.fix):
+            case Progress.BLOCKED if not self._parked_anew and self._only_parking(follower):
                 # Nothing keeps it from its goal but its own precision: that is no block for anybody.
                 self.detail, self._parked_anew = "parking came to no end: once more", True
             case Progress.BLOCKED:
@@ -231,29 +257,29 @@ class Navigator:
 
     def _meet_block(self, a: NodeId, b: NodeId) -> Behaviour:
         """Something is in the way: say what, give it time to go, then let another way be found."""
-        self._blocks.add(a, b, self._helm.now)
+        self._blocks.add(a, b, self._motion.now)
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
         self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way() or NOTHING_NEAR}"
-        yield from self._helm.stand(self._settings.pause)
+        yield from self._motion.stand(self._settings.pause)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > self._settings.trusted:
             self.fix, self._believed = None, self._on_own_map(self.fix)
 
     def _make_sure(self) -> Behaviour:
         """No landmark was in sight for a while: one look from here; if in vain, on by wheels a little."""
-        self._searching, self._search.detail = True, self.detail
-        yield from self._helm.stand(self._settings.search.still)
+        self._searching, self._localization.detail = True, self.detail
+        yield from self._motion.stand(STILL)
         before, s = self.fix, self._settings
-        self.fix = yield from self._search.look(s.search.lenient)
-        if self.fix is None and before is not None and self._vain_looks < s.looks:
+        place = yield from self._localization.look(LENIENT)
+        if place is None and before is not None and self._vain_looks < s.looks:
             self._vain_looks, self._searching = self._vain_looks + 1, False
             blind = max(s.follower.blind - s.further, 0.0)
             self.fix = Fix(before.node, before.node_from_robot, None, blind)
             return
-        if self.fix is None:
+        if place is None:
             self._believed = self._on_own_map(before)
         self._vain_looks = 0
-        self._found()
+        self._found(place)
 
     def _on_own_map(self, fix: Fix | None) -> Pose2 | None:
         """`map_from_robot` in the own map, if the fix is on one of its nodes."""
@@ -264,7 +290,7 @@ class Navigator:
 
     def _in_the_way(self) -> str:
         """What keeps the robot from getting on; empty if nothing is near."""
-        ranges = self._helm.observation.proximity
+        ranges = self._motion.observation.proximity
         bearings = self._description.ranger_bearings
         if len(ranges) == len(bearings) and len(bearings):
             nearest = int(np.argmin(ranges))
@@ -273,21 +299,6 @@ class Navigator:
                 return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
         return ""
 
-    def _only_parking(self, route: tuple[RouteLeg, ...], fix: Fix) -> bool:
+    def _only_parking(self, follower: Follower) -> bool:
         """Whether the robot is about at the route's last node, with nothing in its way."""
-        distance = _distances(route, len(route) - 1, len(route), fix)[0]
-        return distance <= self._settings.follower.near and not self._in_the_way()
-
-
-def _distances(route: tuple[RouteLeg, ...], before: int, after: int, fix: Fix) -> list[float]:
-    """Of the robot from the route's nodes that it has passed in one tick, m."""
-    reference = next((k for k, leg in enumerate(route) if leg.node.id == fix.node), 0)
-    distances = []
-    for leg in range(before, after):
-        between = Pose2()
-        for hop in route[min(leg, reference) + 1 : max(leg, reference) + 1]:
-            between = between @ hop.previous_from_node.mean
-        leg_from_reference = between if leg <= reference else between.inverse()
-        here = leg_from_reference @ fix.node_from_robot.mean
-        distances.append(math.hypot(here.x, here.y))
-    return distances
+        return follower.to_goal <= self._settings.follower.near and not self._in_the_way()

@@ -18,6 +18,10 @@ from agent.servo.plan import Leg, Plan, Price, Surroundings, sample
 from hybridmap.pose import Array, Pose2, wrap_angle
 
 _FIRST_OCTANT = ((1, 0), (3, 1), (2, 1), (3, 2))
+FARTHEST = 5.0
+"""m; the grid covers start and goal, and its size grows with the square of their distance. The servo is given
+nodes within 1.4 m (`FollowerSettings.sight_reach`), and parks in `benchmarks.servo` from up to 2.5 m."""
+
 _BORDER = 3
 _BINS = 72
 
@@ -57,14 +61,18 @@ def lattice(
         room: m of floor around start and goal that is searched.
 
     Returns:
-        The plan, or None if the lattice knows no way.
+        The plan, or None if the lattice knows no way, or the start is further away than FARTHEST.
     """
+    if not math.hypot(start.x, start.y) <= FARTHEST:
+        return None
     low = np.floor((np.minimum([start.x, start.y], 0.0) - room) / cell).astype(int)
     high = np.ceil((np.maximum([start.x, start.y], 0.0) + room) / cell).astype(int)
     x, y = np.meshgrid(
         cell * np.arange(low[0], high[0] + 1), cell * np.arange(low[1], high[1] + 1), indexing="ij"
     )
-    allowed = surroundings.field.slack_table(x, y, _HEADINGS) >= margin
+    # Row by row: all cells, headings and landmarks at once would take hundreds of megabytes.
+    slack = surroundings.field.slack_table
+    allowed = np.stack([slack(*row, _HEADINGS) >= margin for row in zip(x, y, strict=True)], axis=1)
     free = _free_half_cells(surroundings, start, low, high, cell)
     allowed &= free[::2, ::2]
     goal = (0, int(-low[0]), int(-low[1]))
@@ -93,8 +101,8 @@ def _free_half_cells(
     )
     near = np.minimum(np.hypot(x, y), np.hypot(x - start.x, y - start.y)) < 1.5 * cell
     wanted = surroundings.clearance + np.where(near, 0.0, 0.2 * cell)
-    free: NDArray[np.bool_] = surroundings.distance(np.stack([x, y], axis=-1)) >= wanted
-    return free
+    rows = zip(np.stack([x, y], axis=-1), wanted, strict=True)
+    return np.stack([surroundings.distance(points) >= enough for points, enough in rows])
 
 
 def _nearest(

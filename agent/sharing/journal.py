@@ -81,22 +81,30 @@ class Journal:
     nothing that the map still needs is ever dropped.
     """
 
-    def __init__(self, path: Path, agent: str) -> None:
+    def __init__(self, path: Path, agent: str | None = None) -> None:
         """Open the journal, or begin one.
 
+        Args:
+            path: of the file.
+            agent: whose; None takes whose it is, and begins none.
+
         Raises:
-            InvalidFile: damaged, of another kind, another agent's, or in use.
+            InvalidFile: damaged, of another kind, another agent's, nobody's, or in use.
         """
-        self.agent = check_name(agent)
+        if agent is not None:
+            check_name(agent)
         self._lock = threading.RLock()
         self._database = Database(path, "agent journal", APPLICATION_ID, VERSION, SCHEMA)
         try:
             with self._database.transaction() as rows:
                 owner = rows.execute("SELECT agent FROM owner").fetchone()
-                if owner is None:
+                if owner is None and agent is not None:
                     rows.execute("INSERT INTO owner VALUES (?)", (agent,))
-                elif owner[0] != agent:
+                elif owner is None:
+                    raise InvalidFile(f"{path}: is nobody's journal")
+                elif agent not in (None, owner[0]):
                     raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
+            self.agent = str(owner[0]) if agent is None else agent
         except BaseException:
             self._database.close()
             raise

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 from agent.mission import Question, WhatIsKnown, WhereAmI
+from hybridmap.errors import InvalidMessage
+from hybridmap.pose import Pose2
 from hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer
 from wire.keys import Keys
 from wire.messages import (
@@ -15,6 +19,10 @@ from wire.messages import (
     encode_route_request,
     encode_view,
 )
+
+FARTHEST = 100.0
+"""m; no robot sees a node, or drives from one node to the next, from further away. Nodes of recordings from
+cars lie up to ten metres apart."""
 
 
 def encode_question(keys: Keys, question: Question) -> tuple[str, bytes]:
@@ -40,10 +48,24 @@ def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | Rout
     """What a server says to a question.
 
     Raises:
-        InvalidMessage: it is no answer to it.
+        InvalidMessage: it is no answer to it, or one that no robot can act on.
     """
     if isinstance(question, WhereAmI):
-        return decode_relocalize_answer(payload)
+        found = decode_relocalize_answer(payload)
+        for best in found.candidates[:1]:
+            _check_near(best.node_from_robot.mean, f"whereabouts: the robot, seen from node {best.node},")
+        return found
     if isinstance(question, WhatIsKnown):
         return decode_known_answer(payload)
-    return decode_route_answer(payload)
+    route = decode_route_answer(payload)
+    for leg in route.legs:
+        _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
+    if route.legs and route.legs[-1].node.id != question.goal:
+        raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {question.goal}")
+    return route
+
+
+def _check_near(posture: Pose2, what: str) -> None:
+    distance = math.hypot(posture.x, posture.y)
+    if distance > FARTHEST:
+        raise InvalidMessage(f"{what} is {distance:.0f} m away, more than {FARTHEST:g} m")

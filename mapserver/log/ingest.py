@@ -25,10 +25,10 @@ from mapserver.log.agent_log import NEVER, AgentLog, PullSettings
 from mapserver.log.entry import Entry
 from mapserver.log.ingest_counters import IngestCounters
 from mapserver.log.store import Store
-from wire.bus import Bus, Closing, Reply, Sample
+from wire.bus import Bus, Closing, Reply, Request, Sample
 from wire.codec import MAX_CHANGE_BYTES
 from wire.keys import Keys
-from wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, Refusal
+from wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, Refusal
 
 log = logging.getLogger(__name__)
 
@@ -121,6 +121,7 @@ class Ingest:
         self._declared = [
             self._bus.subscribe(self._keys.changes(), self._work.put),
             self._bus.subscribe(self._keys.heads(), self._work.put),
+            self._bus.serve(self._keys.all_acks(self._name), self._tell_newest),
         ]
 
     def counters(self) -> IngestCounters:
@@ -296,6 +297,12 @@ class Ingest:
     def _acknowledge(self, one: AgentLog) -> None:
         ack = Ack(one.map, one.log_id, one.watermark, one.refusals)
         self._bus.publish(self._keys.ack(self._name, one.map.agent), ack.encode())
+
+    def _tell_newest(self, request: Request) -> None:
+        """Which numbers an agent must not give to a new map: it may have lost its disk."""
+        _, agent = self._keys.parse_ack(request.key)
+        epochs = (stored.epoch for stored in self._store.maps() if stored.agent == agent)
+        request.reply(NewestMap(max(epochs, default=0)).encode())
 
     def _pull(self, map_id: MapId, asked: LogRequest) -> None:
         """Ask for a piece of a log; in a thread of its own, because an agent may be slow."""

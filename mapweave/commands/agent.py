@@ -39,10 +39,14 @@ def add_to(commands: Any) -> None:
         "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
     )
     parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
-    parser.add_argument("--epoch", type=int, help="number of a new map (default: from the clock)")
     parser.add_argument(
+        "--epoch", type=int, help="least number of a new map (default: the next one, as the server knows it)"
+    )
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
         "--fresh", action="store_true", help="begin a new map; else the newest map of the journal goes on"
     )
+    which.add_argument("--resume", metavar="MAP", help="go on with this map of the journal, for example r0.3")
     parser.add_argument(
         "--body", metavar="ENDPOINT", help="Zenoh endpoint of the robot's body (default: the fleet's)"
     )
@@ -57,13 +61,18 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
     from agent.mission import Carried, Explore, Idle, Mission
+    from hybridmap.errors import InvalidValue
     from hybridmap.node import check_name
     from mapweave.agent_process import AgentOptions, run_agent
+    from mapweave.commands.map_ends import map_of
     from wire.keys import check_epoch
 
     name = check_name(arguments.name)
     if arguments.epoch is not None:
         check_epoch(arguments.epoch)
+    resume = None if arguments.resume is None else map_of(arguments.resume)
+    if resume is not None and not (arguments.data / f"{name}.sqlite").exists():
+        raise InvalidValue(f"{arguments.data}: there is no journal of {name} with a map to resume")
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     stop = stop_on_signals()
@@ -82,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
             data=arguments.data,
             epoch=arguments.epoch,
             fresh=arguments.fresh,
+            resume=resume,
             mission=missions[arguments.mission],
             seed=arguments.seed,
             synchronization=synchronization,

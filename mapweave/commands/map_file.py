@@ -8,6 +8,7 @@ from typing import Any
 from mapweave.commands import (
     map_explain,
     map_export,
+    map_extract,
     map_history,
     map_import,
     map_merge,
@@ -21,11 +22,11 @@ from mapweave.commands import (
 def add_to(commands: Any) -> None:
     """Declare the command and its actions."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        "map", help="look into maps, ask why they are one, merge, export"
+        "map", help="look into maps, ask why they are one, merge, export, extract"
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (
         map_show, map_explain, map_route, map_history, map_unmerge, map_retire,
-        map_merge, map_export, map_import,
+        map_merge, map_export, map_extract, map_import,
     ):  # fmt: skip
         action.add_to(actions)

@@ -28,8 +28,7 @@ def run_demo(options: DemoOptions) -> Report:
         TrialOptions(seed=options.seed, out=options.out, quiet=options.quiet, film_every=options.film_every),
     )
     report = Report.of(trial)
-    for robot in report.agents:
-        own = options.out / "agents" / f"{robot}.mapweave"
+    for own in (options.out / "agents").glob("*.mapweave"):
         shutil.copyfile(own, options.out / own.name)
     write_report(options.out, report)
     return report

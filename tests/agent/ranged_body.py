@@ -62,4 +62,6 @@ def essence(step: Step) -> tuple[object, ...]:
 
 def still(walls, pose=None, tick=0, **other) -> Observation:
     """What a robot senses that has not moved."""
-    return Observation(tick * 100_000_000, Odometry(0.0, 0.0), walls.render(pose or Pose2()), **other)
+    pose = pose or Pose2()
+    other = {"proximity": rangers(pose)} | other
+    return Observation(tick * 100_000_000, Odometry(0.0, 0.0), walls.render(pose), **other)

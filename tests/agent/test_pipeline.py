@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from agent.global_localization.pose_consistency import ConsistencySettings
+from agent.global_localization.settings import ResumptionSettings
 from agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
 from agent.observation import Command, Observation, Odometry
 from agent.pipeline import Pipeline, PipelineSettings, Step
-from agent.resuming.agreement import AgreementSettings
-from agent.resuming.resumption import ResumptionSettings
 from hybridmap.change import NodePut
 from hybridmap.node import Edge, EdgeKind, NodeId
 from hybridmap.pose import Pose2
@@ -82,7 +82,7 @@ def test_the_map_is_the_replay_of_the_changes(explored):
 def test_a_robot_without_a_camera_stands_still_and_says_why(mission):
     pipeline = on(mission)
     for tick in range(40):
-        step = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), None))
+        step = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), None, rangers(Pose2())))
         assert step.changes == step.questions == ()
         if not isinstance(mission, GoTo):
             assert step.command == Command()
@@ -255,7 +255,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
     Returns:
         The pipeline, what was in its map before, and the steps since.
     """
-    near = ResumptionSettings(agreement=AgreementSettings(way=0.2))
+    near = ResumptionSettings(consistency=ConsistencySettings(way=0.2))
     pipeline, before = on(Carried(), PipelineSettings(resumption=near)), Pose2(-1.0)
     for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
         pipeline.step(walls.observe(before, Pose2(x), tick))

@@ -65,7 +65,7 @@ reals = st.floats(-1e3, 1e3)
 
 @given(
     st.integers(0, 2**63 - 1),
-    st.tuples(reals, reals),
+    st.tuples(st.floats(-10, 10), st.floats(-20, 20)),
     st.one_of(st.none(), st.tuples(st.integers(1, 40), st.integers(1, 40))),
     st.lists(st.floats(0, 1e4), max_size=32),
     st.booleans(),
@@ -126,7 +126,8 @@ def test_a_compressed_image_is_decoded(encoding: str, suffix: str, error: int) -
     "fields",
     [
         {"v": 99}, {"t": -1}, {"t": 2**63}, {"t": 1.0}, {"u": [0.0]}, {"u": [0.0, float("nan")]},
-        {"u": [0.0, 0.0, 0.0]}, {"u": [float("inf"), 0.0]}, {"r": [-0.1]}, {"r": [float("nan")]},
+        {"u": [0.0, 0.0, 0.0]}, {"u": [float("inf"), 0.0]}, {"u": [10.1, 0.0]},
+        {"u": [0.0, -20.1]}, {"r": [-0.1]}, {"r": [float("nan")]},
         {"r": [0.0] * 257}, {"r": "far"}, {"b": 1}, {"s": [10, 11]}, {"s": [10]}, {"s": [0, 0]},
         {"s": [10, 10, 1]}, {"s": [-10, -10]}, {"i": b"x" * 99}, {"i": "text"}, {"encoding": "tiff"},
         {"encoding": "png"}, {"encoding": "jpeg"}, {"encoding": "png", "i": b""}, {"encoding": 1},
@@ -276,9 +277,39 @@ def test_the_end_of_the_simulation_is_no_failure(body: Body, bus: MemoryBus) -> 
 
 
 def test_a_broken_answer_is_a_device_error(body: Body, bus: MemoryBus) -> None:
-    body.answers = [lambda r: r.reply(b"\x80")]
+    body.answers = [lambda r: r.reply(b"\x80")] * 2
     with pytest.raises(DeviceError, match="robot/r0/step: observation: v is missing"):
         RemoteRobot(bus, "test", "r0").sense()
+
+
+def wrong_image(request: Request) -> None:
+    request.reply(encode_observation(an_observation(np.zeros((1, 1), np.uint8))))
+
+
+def far_away(request: Request) -> None:
+    request.reply(changed(encode_observation(an_observation()), u=[1e4, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (wrong_image, "an image of 1x1 px from a camera described as 320x240 px"),
+        (far_away, "odometry of 10000 m and 0 rad in one step"),
+    ],
+)
+def test_an_impossible_observation_is_asked_once_more_and_then_refused_in_one_line(
+    body: Body, bus: MemoryBus, answer: Callable[[Request], None], reason: str
+) -> None:
+    robot = RemoteRobot(bus, "test", "r0")
+    body.answers = [answer, reply]
+    observation = robot.sense()
+    assert observation is not None
+    assert same(observation, an_observation())
+    body.answers = [answer, answer]
+    with pytest.raises(DeviceError, match=reason) as error:
+        robot.sense()
+    assert "\n" not in str(error.value)
+    assert [step.sequence for step in body.steps] == [1, 1, 2, 2]
 
 
 def test_nobody_there_is_one_clear_line(bus: MemoryBus) -> None:

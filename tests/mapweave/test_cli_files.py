@@ -63,7 +63,7 @@ def test_an_image_of_a_recording_that_is_broken(tmp_path, capfd, recording):
     assert "1.png: not an image that can be read" in line
     assert said[-1] == line
     assert not any("Traceback" in line for line in said)
-    assert (tmp_path / "data" / "walk.mapweave").exists(), "what was mapped before is kept"
+    assert (tmp_path / "data" / "walk.1.mapweave").exists(), "what was mapped before is kept"
 
 
 def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
@@ -102,5 +102,5 @@ def test_a_recording_without_a_server_is_mapped_all_the_same(recording, tmp_path
     arguments = ["replay", recording, "--data", data, "--name", "r0", "--epoch", 1, "--offline"]
     assert main([str(a) for a in arguments]) == 0
     assert "0 nodes and 0 edges" in " ".join(capfd.readouterr().err.split())
-    assert main(["map", "show", str(data / "r0.mapweave"), "--json"]) == 0
+    assert main(["map", "show", str(data / "r0.1.mapweave"), "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["nodes"] == 0

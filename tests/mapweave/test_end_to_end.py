@@ -112,7 +112,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
                 children.end(name)
             reports.close()
         for name in ("r0", "r1"):
-            content = read_map_file(tmp_path / f"{name}.mapweave", "agent")
+            content = read_map_file(tmp_path / f"{name}.1.mapweave", "agent")
             assert {n.agent for n in HybridMap(content.changes).nodes} == {name}
     finally:
         bus.close()
@@ -135,5 +135,5 @@ def test_the_demo_of_another_seed(tmp_path):
     assert report.collisions == 0
     assert report.wall_s < 360
     assert json.loads((tmp_path / "report.json").read_text()) == report.as_dict()
-    for name in ("map.png", "merged.mapweave", "r0.mapweave", "film.webm", "report.md"):
+    for name in ("map.png", "merged.mapweave", "r0.1.mapweave", "film.webm", "report.md"):
         assert (tmp_path / name).stat().st_size > 1000

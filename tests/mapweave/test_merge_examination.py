@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from agent.drivers.replay import Replay
+from agent.global_localization.settings import ResumptionSettings
 from agent.pipeline import PipelineSettings
-from agent.resuming.resumption import ResumptionSettings
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -162,3 +163,26 @@ def test_the_clearance_of_drawn_scenes_is_what_a_distance_transform_says():
     solid = scene.room(GRID) <= -ROBOT.radius + 1e-9
     other = STEP * distance_transform_edt(~solid) - ROBOT.radius
     assert np.abs(other - scene.room(GRID))[~solid].max() < 1.5 * STEP
+
+
+def test_a_target_far_beyond_the_grid_costs_no_more_than_one_at_its_border():
+    """A leg of a million metres once made a line of forty million points: 15 s and 2.8 GB."""
+    scene, rng = Scene([[1.0, -0.6, 1.2, 0.6]], []), np.random.default_rng(0)
+    for wanted in (Pose2(3.2, 0.0, 0.0), Pose2(1e6, 0.0, 0.0), Pose2(1e6, -1e6, 0.0)):
+        detour = Detour(ROBOT)
+        detour.see(Observation(0, Odometry(0.0, 0.0), None, scene.ranges(Pose2(), rng)))
+        tracemalloc.start()
+        command = detour.toward(wanted)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 20e6
+        assert math.copysign(1.0, command.forward) > 0 or command.turn, "it goes there all the same"
+        assert detour.around == (wanted.y == 0.0), "the box stands straight ahead, not aside"
+
+
+def test_a_far_target_is_steered_to_along_the_line_to_it():
+    detour = Detour(ROBOT)
+    detour.see(Observation(0, Odometry(0.0, 0.0), None, np.full(16, ROBOT.ranger_reach)))
+    near, far = (detour.toward(Pose2(3.0 * scale, 1.0 * scale, 0.0)) for scale in (1.0, 1e5))
+    assert near.forward == far.forward
+    assert near.turn == pytest.approx(far.turn, abs=0.03)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from agent.localizing.fix import Fix
 from agent.localizing.lookout import Expected, Lookout, LookoutSettings
 from agent.navigating.detour import Detour
-from agent.navigating.follower import Follower, Progress
+from agent.navigating.follower import MOST_LOOKED_FOR, Follower, Progress
 from agent.navigating.follower_settings import FollowerSettings
 from agent.navigating.headway import Headway
 from agent.navigating.node_servo import NodeServo
@@ -136,3 +136,19 @@ def test_headway_counts_since_the_robot_came_nearer(distances):
             best, since = distance, 0
         assert headway.stood == pytest.approx(0.1 * since)
         assert headway.best == best
+
+
+def test_a_route_with_a_thousand_nodes_in_one_place_costs_a_few_looks(node, monkeypatch):
+    tried = []
+    monkeypatch.setattr(Lookout, "find", lambda self, image, wanted: tried.append(len(wanted)))
+    lens = Lens(ROBOT)
+    ahead = PoseGaussian(Pose2(0.5), np.zeros((3, 3)))
+    route = (RouteLeg(node, HERE, None), *[RouteLeg(node, ahead, None)], *[RouteLeg(node, HERE, None)] * 1000)
+    follower = Follower(
+        ROBOT, lens, Sift(lens), route, Fix(node.id, HERE), Detour(ROBOT), FollowerSettings(),
+        np.random.default_rng(0),
+    )  # fmt: skip
+    for tick in range(8):
+        follower.step(Observation(tick, Odometry(0.0, 0.0), np.zeros((240, 320), np.uint8)))
+    assert tried
+    assert max(tried) <= MOST_LOOKED_FOR + 1

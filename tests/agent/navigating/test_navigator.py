@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from agent.mission import Answer, Question, WhereAmI, WhichWay
+from agent.motion_primitives import NO_ANSWER
 from agent.navigating.blocks import Blocks, BlockSettings
 from agent.navigating.follower_settings import FollowerSettings
-from agent.navigating.helm import NO_ANSWER
 from agent.navigating.navigator import NavigatorSettings, Stage
 from agent.navigating.own_route import own_route
 from agent.tally import Tally

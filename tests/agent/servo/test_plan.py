@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from agent.observation import RobotDescription
 from agent.servo.field import Field
-from agent.servo.lattice import lattice
+from agent.servo.lattice import FARTHEST, lattice
 from agent.servo.plan import Plan, Price, Surroundings
 from agent.servo.settings import ServoSettings
 from agent.servo.way import thorough_plan
@@ -105,3 +106,18 @@ def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -
     assert plan is not None
     assert [leg.direction for leg in plan.legs] == [-1.0]
     assert plan.length == pytest.approx(0.5)
+
+
+def test_the_lattice_is_bounded(robot: RobotDescription) -> None:
+    """Ten metres once took 13 s and 1.4 GB, and there was no end to it."""
+    rng = np.random.default_rng(1)
+    points = np.array([[4.0, y, 0.3] for y in np.linspace(-2.0, 2.0, 24)])
+    walls = np.column_stack([rng.uniform(-5.0, 3.0, 400), rng.uniform(1.0, 5.0, 400)])
+    around = Surroundings(Field(points, robot.camera), walls, 0.2)
+    for far in (Pose2(-1e6, 0.0, 0.0), Pose2(0.0, -FARTHEST - 0.1, 0.0)):
+        assert lattice(around, far, 0.02, Price()) is None
+    tracemalloc.start()
+    lattice(around, Pose2(-FARTHEST + 0.1, 0.0, 0.0), 0.02, Price(), 0.06, 1.5)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6

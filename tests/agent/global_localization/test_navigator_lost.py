@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agent.global_localization.candidates import FleetMap, OwnMap
+from agent.global_localization.global_localization import GlobalLocalization
 from agent.mission import Answer, Question, WhereAmI, WhichWay
-from agent.navigating.helm import NO_ANSWER, Helm
-from agent.navigating.search import Search, SearchSettings
+from agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from agent.observation import Observation, Odometry
 from agent.tally import Tally
-from agent.vision.lens import Lens
 from benchmarks.synthetic import take_map
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
@@ -134,22 +134,21 @@ def test_a_robot_that_has_lost_sight_of_everything_looks_where_nodes_nearby_have
     """It stands at a node, turned away from what that shows: one turn finds it, not a turn all around."""
     turned = 2.4
     eyes = Eyes(home, TOUR[1] @ Pose2(0.05, 0.0, turned))
-    helm = Helm(BODY, 50)
-    search = Search(
-        BODY, Lens(BODY), eyes, own_map, helm, SearchSettings(), np.random.default_rng(0)  # type: ignore[arg-type]
-    )  # fmt: skip
+    motion = MotionPrimitives(BODY, 50)
+    own = OwnMap(own_map, np.random.default_rng(0))
+    lost = GlobalLocalization(BODY, eyes, motion, own, FleetMap(motion))  # type: ignore[arg-type]
     # The wheels' belief is off by a little.
     believed = TOUR[0].inverse() @ TOUR[1] @ Pose2(0.1, -0.05, turned + 0.08)
-    behaviour, moved, way, fix = search.look_around(believed), Odometry(0.0, 0.0), 0.0, None
+    behaviour, moved, way, fix = lost.search(believed), Odometry(0.0, 0.0), 0.0, None
     answers: tuple[Answer, ...] = ()
     for tick in range(200):
-        helm.take_in(Observation(tick * 100_000_000, moved, IMAGE, FREE), answers)
+        motion.take_in(Observation(tick * 100_000_000, moved, IMAGE, FREE), answers)
         try:
             command = next(behaviour)
         except StopIteration as stop:
             fix = stop.value
             break
-        answers = tuple(map(found, helm.questions()))
+        answers = tuple(map(found, motion.questions()))
         moved, way = Odometry(0.0, command.turn * BODY.tick), way + command.turn * BODY.tick
         eyes.pose = eyes.pose @ moved.motion()
     assert fix is not None

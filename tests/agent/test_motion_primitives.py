@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from agent.mission import Answer, Question, WhichWay
-from agent.navigating.helm import NO_ANSWER, Helm
+from agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from agent.observation import Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.node import NodeId
@@ -21,19 +21,19 @@ HERE, THERE = NodeId("r0", 1, 1), NodeId("r1", 1, 1)
 
 def ask(fleet: Callable[[int, Question], Answer | None], patience: int = 100) -> tuple[Answer, list[float]]:
     """Ask a way of a fleet that answers the n-th question (from 0) within a tick; when it was asked, s."""
-    helm = Helm(BODY, patience)
-    behaviour = helm.ask(WhichWay(helm.number(), HERE, THERE))
+    motion = MotionPrimitives(BODY, patience)
+    behaviour = motion.ask(WhichWay(motion.number(), HERE, THERE))
     asked: list[float] = []
     answers: tuple[Answer, ...] = ()
     while True:
-        helm.take_in(Observation(0, Odometry(0.0, 0.0), None), answers)
+        motion.take_in(Observation(0, Odometry(0.0, 0.0), None), answers)
         try:
             next(behaviour)
         except StopIteration as end:
             return end.value, asked
         answers = ()
-        for question in helm.questions():
-            asked.append(helm.now)
+        for question in motion.questions():
+            asked.append(motion.now)
             answer = fleet(len(asked) - 1, question)
             answers = answers if answer is None else (answer,)
 
@@ -78,21 +78,21 @@ BEARINGS = tuple(np.linspace(-math.pi, math.pi, 8, endpoint=False).tolist())
     ],
 )
 def test_it_goes_where_there_is_most_room_or_enough(readings, most, freest) -> None:
-    helm = Helm(RobotDescription(BODY.camera, ranger_bearings=BEARINGS, ranger_reach=3.0))
-    helm.take_in(Observation(0, Odometry(0.0, 0.0), None, np.array(readings, dtype=float)), ())
-    way, direction = helm.freest(most)
+    motion = MotionPrimitives(RobotDescription(BODY.camera, ranger_bearings=BEARINGS, ranger_reach=3.0))
+    motion.take_in(Observation(0, Odometry(0.0, 0.0), None, np.array(readings, dtype=float)), ())
+    way, direction = motion.freest(most)
     assert direction == BEARINGS[freest]
-    assert way == min(helm.room(direction), most)
-    assert all(min(helm.room(bearing), most) <= way for bearing in BEARINGS)
+    assert way == min(motion.room(direction), most)
+    assert all(min(motion.room(bearing), most) <= way for bearing in BEARINGS)
 
 
 def test_without_rangers_there_is_no_room() -> None:
-    helm = Helm(BODY)
-    helm.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
-    assert helm.freest() == (0.0, 0.0)
+    motion = MotionPrimitives(BODY)
+    motion.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
+    assert motion.freest() == (0.0, 0.0)
 
 
 def test_a_robot_that_cannot_turn_gives_up() -> None:
-    helm = Helm(BODY)
-    helm.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
-    assert len(list(helm.turn(0.6, 0.6))) <= 32
+    motion = MotionPrimitives(BODY)
+    motion.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
+    assert len(list(motion.turn(0.6, 0.6))) <= 32

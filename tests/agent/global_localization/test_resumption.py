@@ -9,8 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
+from agent.global_localization.global_localization import MOVE
+from agent.global_localization.resumption import Resumption
+from agent.global_localization.settings import ResumptionSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
-from agent.resuming.resumption import Resumption, ResumptionSettings
 from agent.vision.sift import Features
 from benchmarks.synthetic import CAMERA, World, room, take_map, take_view
 from hybridmap.change import NodePut
@@ -142,7 +144,7 @@ def test_it_turns_until_two_views_agree_where_it_is(home, own_map, heading):
     assert abs(wrap_angle(here.heading - body.pose.heading)) < 0.03
     assert body.commands[-1] == Command()
     assert all(command.forward == 0.0 for command in body.commands)
-    assert QUICK.agreement.turn <= turned(body) < math.pi, "and no further than it needs"
+    assert QUICK.consistency.turn <= turned(body) < math.pi, "and no further than it needs"
     # The rangers' readings are kept with the postures from which they were taken.
     assert len(resumption.seen) == len(body.commands)
     for odom_from_robot, _ in resumption.seen:
@@ -174,9 +176,9 @@ def test_where_nothing_is_recognised_it_looks_elsewhere_and_gives_up(elsewhere, 
         "cannot find itself on its own map of 7 nodes: nothing was recognised at 2 places"
     )
     assert "none of 7 nodes is recognised" in body.said
-    assert "moving on to look from elsewhere" in body.said
+    assert "nothing here is known: driving on to look from elsewhere" in body.said
     assert turned(body) > 2 * math.tau
-    assert sum(c.forward for c in body.commands) * BODY.tick == pytest.approx(QUICK.move, abs=0.05)
+    assert sum(c.forward for c in body.commands) * BODY.tick == pytest.approx(MOVE, abs=0.05)
 
 
 def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
@@ -185,7 +187,7 @@ def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
     readings[1:8] = 2.0
     body = Body(elsewhere, PLACE)
     assert search(own_map, body, proximity=readings).lost
-    assert "moving on to look from elsewhere" in body.said
+    assert "nothing here is known: driving on to look from elsewhere" in body.said
     to_the_way = -sum(min(command.turn, 0.0) for command in body.commands) * BODY.tick
     assert to_the_way == pytest.approx(-BEARINGS[4], abs=0.1)
     assert all(command.forward == 0.0 for command in body.commands)
@@ -210,7 +212,7 @@ def test_without_room_that_it_can_see_it_stays(elsewhere, own_map, proximity, de
 def test_with_a_covered_lens_it_is_never_lost(own_map, camera):
     body = Body(None, PLACE)
     assert not search(own_map, body, camera=camera).lost
-    assert body.said == ["", "only 0 features in view" if camera else "no image from the camera"]
+    assert body.said == ["looking", "only 0 features in view" if camera else "no image from the camera"]
     assert all(command.forward == 0.0 for command in body.commands)
 
 
@@ -230,7 +232,7 @@ def test_nor_must_it_turn_if_it_is_carried_far_enough(home):
     body = Body(home, path[0])
     resumption = search(map_of(home, tour), body, ticks=50, drives=False, carry=path)
     assert resumption.found is not None
-    assert body.pose.x - path[0].x >= QUICK.agreement.way
+    assert body.pose.x - path[0].x >= QUICK.consistency.way
 
 
 def test_a_carried_robot_gives_up_in_the_end(elsewhere, own_map):

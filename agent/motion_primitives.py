@@ -1,4 +1,4 @@
-"""What a behaviour can do: stand, turn, drive on, ask. Each is a generator that yields a command a tick."""
+"""Motion primitives: stand, turn, drive on, ask. Each is a generator that yields a command a tick."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ Behaviour = Generator[Command, None, None]
 NO_ANSWER = "nobody answered: is the map server up?"
 
 
-class Helm:
+class MotionPrimitives:
     """Ties behaviours, which read from top to bottom, to observations and answers, which come tick by tick.
 
     Attributes:
-        odom_from_robot: where the wheels have brought the robot since the helm was made.
+        odom_from_robot: where the wheels have brought the robot since the beginning.
         now: simulated or real time since then, s.
+        way: driven since then, m, forward or backward.
+        turned: turned since then, rad, either way.
     """
 
     def __init__(self, description: RobotDescription, patience: int = 0) -> None:
@@ -31,7 +33,7 @@ class Helm:
                 nobody needs none.
         """
         self.odom_from_robot = Pose2()
-        self.now = 0.0
+        self.now = self.way = self.turned = 0.0
         self._description = description
         self._patience = patience
         self._observation: Observation | None = None
@@ -52,6 +54,8 @@ class Helm:
         self._questions = []
         self.odom_from_robot = self.odom_from_robot @ observation.odometry.motion()
         self.now += self._description.tick
+        self.way += abs(observation.odometry.forward)
+        self.turned += abs(observation.odometry.turn)
 
     def questions(self) -> list[Question]:
         """What was asked in this tick."""

@@ -1,9 +1,9 @@
-"""Two looks that agree where the robot is.
+"""Two recognitions that agree where the robot is.
 
 One image may show what hangs in another room too, or stands on every shelf. So a robot that wants to map on
-asks for a second look that shows other things, because it has turned or driven on in between, and puts it at
-the same place. In a warehouse of alike shelves single looks were wrong from 12 of 28 places where the robot
-had never been, two that agree from 1; in offices 36 of 37 places that were recognised by one look were
+asks for a second view that shows other things, because it has turned or driven on in between, and puts it at
+the same place. In a warehouse of alike shelves single views were wrong from 12 of 28 places where the robot
+had never been, two that agree from 1; in offices 36 of 37 places that were recognised by one view were
 recognised by two.
 """
 
@@ -16,11 +16,11 @@ from hybridmap.pose import Pose2
 
 
 @dataclass(frozen=True)
-class AgreementSettings:
-    """When two looks agree.
+class ConsistencySettings:
+    """When two recognitions agree.
 
     Attributes:
-        turn: a look shows other things than another if the robot has turned by this in between, rad,
+        turn: a view shows other things than another if the robot has turned by this in between, rad,
         way: or has driven this far, m.
         within: they agree within this, m and rad,
         drift: and this share of the way and of the turn in between: wheels are never quite round.
@@ -33,12 +33,12 @@ class AgreementSettings:
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """A look in which a node of the own map was recognised.
+class PoseHypothesis:
+    """Where a recognised node puts the robot.
 
     Attributes:
-        map_from_robot: where that puts the robot.
-        odom_from_robot: where the wheels put it.
+        map_from_robot: by the node.
+        odom_from_robot: by the wheels.
         way: driven until then, m.
         turned: turned until then, rad, either way.
         exact: whether mapping may go on from there.
@@ -51,8 +51,8 @@ class Sighting:
     exact: bool
 
 
-def agree(earlier: Sighting, now: Sighting, settings: AgreementSettings) -> bool:
-    """Whether two looks show different things and put the robot at the same place."""
+def consistent(earlier: PoseHypothesis, now: PoseHypothesis, settings: ConsistencySettings) -> bool:
+    """Whether two recognitions come of different views and put the robot at the same place."""
     moved = earlier.odom_from_robot.inverse() @ now.odom_from_robot
     if abs(moved.heading) < settings.turn and math.hypot(moved.x, moved.y) < settings.way:
         return False

@@ -1,0 +1,115 @@
+"""Who may know a view: the robot's own map, and the fleet's. Each says where the robot may be."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.localizing.recall import lookalikes, recall_all
+from agent.mission import WhereAmI
+from agent.motion_primitives import NO_ANSWER, MotionPrimitives
+from agent.observation import Command
+from agent.vision.sift import Features
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Node, NodeId
+from hybridmap.pose import PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, View
+from hybridmap.recognising.recognition import Recognition
+
+RIVAL = 0.5
+"""Another node of the own map with this share of the best one's inliers has a say too,"""
+APART = 0.5
+"""if it puts the robot further away than this, m: then the view is ambiguous."""
+
+SILENCE = 20.0
+"""After a question that nobody answered the fleet is not asked for so long, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecognizedNode:
+    """A node of the own map, recognised in an image: its landmarks can be tracked from there on."""
+
+    node: Node
+    image: NDArray[np.uint8]
+    features: Features
+    recognition: Recognition
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A place where the robot may be.
+
+    Attributes:
+        node: of whichever robot's map.
+        node_from_robot: posture.
+        recognized: how the own map knows it; None if the fleet does.
+    """
+
+    node: NodeId
+    node_from_robot: PoseGaussian
+    recognized: RecognizedNode | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What one source says to a view.
+
+    Attributes:
+        places: best first.
+        ambiguous: why the best is not to be told from another, in words; empty if it is.
+        reason: in words, whatever the outcome.
+    """
+
+    places: tuple[Candidate, ...]
+    ambiguous: str
+    reason: str
+
+
+class OwnMap:
+    """The robot's own map as a source."""
+
+    def __init__(self, hybrid_map: HybridMap, rng: np.random.Generator) -> None:
+        """Take the map, which may grow, and what verification draws its samples from."""
+        self.map = hybrid_map
+        self._rng = rng
+
+    def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> Candidates:
+        """Nodes that a view shows, of an image with these features."""
+        recalled = recall_all(self.map, view, self._rng)
+        if not recalled:
+            return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
+        alike = lookalikes(recalled, RIVAL, APART)
+        ambiguous = "" if alike is None else f"nodes {alike[0].id} and {alike[1].id} look the same"
+        places = tuple(
+            Candidate(node.id, found.node_from_robot, RecognizedNode(node, image, features, found))
+            for node, found in recalled
+        )
+        best, found = recalled[0]
+        return Candidates(places, ambiguous, f"node {best.id}: {found.inliers} landmarks agree")
+
+
+class FleetMap:
+    """The fleet's merged map as a source: a server, which knows whether another room looks the same."""
+
+    def __init__(self, motion: MotionPrimitives) -> None:
+        """Take what asks, and stands until the answer comes."""
+        self._motion = motion
+        self._silent_until = 0.0
+
+    def candidates(self, view: View) -> Generator[Command, None, Candidates]:
+        """Where a view was taken, as the fleet knows it; who does not answer is not asked at each view."""
+        if self._motion.now < self._silent_until:
+            return Candidates((), "", NO_ANSWER)
+        answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view))
+        if answer.content is None:
+            self._silent_until = self._motion.now + (answer.retry_after or SILENCE)
+        if not isinstance(answer.content, RelocalizeAnswer):
+            return Candidates((), "", answer.error or "no answer")
+        told = answer.content
+        ambiguous = told.reason if told.certainty is Certainty.AMBIGUOUS else ""
+        found = told.candidates if told.certainty is Certainty.FOUND else ()
+        places = tuple(Candidate(place.node, place.node_from_robot) for place in found)
+        return Candidates(places, ambiguous, told.reason)

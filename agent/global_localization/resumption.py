@@ -1,0 +1,87 @@
+"""Taking up a map again: global localization on the own map alone, tick by tick, for a robot that maps."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from agent.global_localization.candidates import OwnMap, RecognizedNode
+from agent.global_localization.global_localization import GlobalLocalization
+from agent.global_localization.settings import GlobalLocalizationSettings, ResumptionSettings
+from agent.motion_primitives import Behaviour, MotionPrimitives
+from agent.observation import Command, Observation, RobotDescription
+from agent.vision.sift import Sift
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.pose import Array, Pose2
+
+REMEMBERED = 600
+"""Readings of the rangers that are kept for the floor, the latest."""
+
+
+class Resumption:
+    """Finds a robot on its own map: one that was started again, has navigated, or was carried off.
+
+    Attributes:
+        found: the place that was recognised in the last observation; None until then.
+        lost: whether it has tried everything in vain.
+        seen: `odom_from_robot` and readings of the rangers, (K,) m, while it looked around; the wheels' own
+            frame begins where it began.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        sift: Sift,
+        own_map: HybridMap,
+        drives: bool,
+        settings: GlobalLocalizationSettings | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Start to look.
+
+        Args:
+            description: the body.
+            sift: features of an image.
+            own_map: with at least one node.
+            drives: whether it may turn and drive by itself.
+            settings: how hard it tries.
+            seed: of the recognition's random samples.
+        """
+        self.found: RecognizedNode | None = None
+        self.lost = False
+        self.seen: deque[tuple[Pose2, Array]] = deque(maxlen=REMEMBERED)
+        self._motion = MotionPrimitives(description)
+        self._localization = GlobalLocalization(
+            description, sift, self._motion, OwnMap(own_map, np.random.default_rng(seed)), None,
+            settings or ResumptionSettings(),
+        )  # fmt: skip
+        self._behaviour = self._find(drives)
+
+    @property
+    def detail(self) -> str:
+        """What it does and why, in words."""
+        return self._localization.detail
+
+    @property
+    def odom_from_robot(self) -> Pose2:
+        """Where the wheels have brought the robot since it began to look."""
+        return self._motion.odom_from_robot
+
+    def step(self, observation: Observation, standing: bool = False) -> Command:
+        """One tick: returns what the wheels shall do. Once `found` is set there is nothing more to do.
+
+        Args:
+            observation: what the robot senses now.
+            standing: the robot must not move; the behaviour waits.
+        """
+        self._motion.take_in(observation, ())
+        self.seen.append((self.odom_from_robot, observation.proximity))
+        return Command() if standing else next(self._behaviour)
+
+    def _find(self, drives: bool) -> Behaviour:
+        place = yield from self._localization.search() if drives else self._localization.wait()
+        self.found = None if place is None else place.recognized
+        self.lost = place is None
+        while True:
+            yield Command()

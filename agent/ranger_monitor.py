@@ -1,0 +1,41 @@
+"""Whether the proximity sensors that a robot promises are read: without them nothing tells free room."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agent.observation import RobotDescription
+from hybridmap.pose import Array
+
+
+class RangerMonitor:
+    """Compares each tick's readings with the description.
+
+    A robot that promises no rangers drives without them, by the choice of who described it. One that
+    promises some and sends none, or another number, has a broken sensor or driver: its readings belong to
+    no known bearing, and everywhere counts as free.
+    """
+
+    def __init__(self, description: RobotDescription) -> None:
+        """Nothing is read yet, and nothing is missing."""
+        self._promised = len(description.ranger_bearings)
+        self._tick = description.tick
+        self._read = self._promised
+        self._missing_ticks = 0
+
+    def see(self, proximity: Array) -> None:
+        """Take one tick's readings, m; those that are not finite or negative are none."""
+        good = int((np.isfinite(proximity) & (proximity >= 0.0)).sum())
+        self._read = good if len(proximity) == self._promised else len(proximity)
+        self._missing_ticks = 0 if good == len(proximity) == self._promised else self._missing_ticks + 1
+
+    @property
+    def fault(self) -> str:
+        """What is missing now, in words; empty if every promised sensor was read in this tick."""
+        if not self._missing_ticks:
+            return ""
+        sensors = "proximity sensor" if self._promised == 1 else "proximity sensors"
+        seconds = self._missing_ticks * self._tick
+        return (
+            f"{self._promised} {sensors} promised, {self._read or 'none'} read for {seconds:.1f} s: standing"
+        )

@@ -1,0 +1,52 @@
+"""`mapweave map extract`: the maps of a journal or a store as map files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "extract",
+        help="write every map of an agent's journal or a server's store into a map file",
+        description="Write every map that an agent's journal (NAME.sqlite) or a server's store holds into a "
+        "map file of its own, for example r0.3.mapweave. The agent or server must not be running. A file "
+        "that is there already is never written over.",
+    )
+    parser.add_argument("source", type=Path, metavar="JOURNAL|STORE", help="an agent's or a server's .sqlite")
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path(), metavar="DIR", help="folder for the files (default: here)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write them, and say which; 1 if something of a map could not be read."""
+    from mapweave.map_extraction import extract_maps
+
+    maps = extract_maps(arguments.source, arguments.out)
+    if arguments.json:
+        rows = [
+            {
+                "map": str(one.map), "path": str(one.path) if one.path else None, "nodes": one.nodes,
+                "edges": one.edges, "complaint": one.complaint,
+            }
+            for one in maps
+        ]  # fmt: skip
+        print(json.dumps({"maps": rows}))
+    else:
+        for one in maps:
+            content = f"{one.nodes} nodes, {one.edges} edges" if one.path else "empty, not written"
+            print(f"{one.path or one.map}: {content}")
+        if not maps:
+            print(f"{arguments.source}: holds no map")
+    for one in maps:
+        if one.complaint:
+            print(f"mapweave: {one.complaint}", file=sys.stderr)
+    return int(any(one.complaint for one in maps))

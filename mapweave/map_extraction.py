@@ -1,0 +1,100 @@
+"""Every map of an agent's journal or of a server's store, each into a map file of its own."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from agent.sharing import journal
+from agent.sharing.kept import Kept
+from hybridmap.change import ChangeBody, NodePut
+from hybridmap.errors import InvalidFile, InvalidValue
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId
+from mapserver.log import store
+from wire.mapfile import MapFile, write_map_file
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """One map of a journal or store.
+
+    Attributes:
+        map: which.
+        path: of its file; None if it has nothing that could be written.
+        nodes: in the file.
+        edges: in the file.
+        complaint: what could not be read, in one line; empty if all could.
+    """
+
+    map: MapId
+    path: Path | None
+    nodes: int
+    edges: int
+    complaint: str
+
+
+def extract_maps(source: Path, folder: Path) -> list[Extracted]:
+    """Write every map of a journal or store into a file of a folder. Nobody else may have the source open.
+
+    Args:
+        source: journal or store.
+        folder: made if it is not there.
+
+    Raises:
+        InvalidFile: the source is neither, or cannot be read.
+        InvalidValue: a file is there already; nothing was written.
+    """
+    maps = _read(source)
+    paths = {map_id: folder / f"{map_id}.mapweave" for map_id in maps}
+    for path in paths.values():
+        if path.exists():
+            raise InvalidValue(f"{path}: is there already; choose another folder with -o")
+    folder.mkdir(parents=True, exist_ok=True)
+    extracted = []
+    for map_id, (contents, complaint) in maps.items():
+        if contents:
+            write_map_file(paths[map_id], MapFile("agent", str(map_id), contents))
+        nodes = sum(isinstance(body, NodePut) for body in contents)
+        written = paths[map_id] if contents else None
+        extracted.append(Extracted(map_id, written, nodes, len(contents) - nodes, complaint))
+    return extracted
+
+
+def _read(source: Path) -> dict[MapId, tuple[tuple[ChangeBody, ...], str]]:
+    """The contents of all maps, with what is wrong with each."""
+    kind = _application_id(source)
+    if kind == journal.APPLICATION_ID:
+        with closing(journal.Journal(source)) as of_agent:
+            kept = {map_id: Kept.of(of_agent, map_id) for map_id in of_agent.maps()}
+        return {map_id: (one.contents, one.complaint) for map_id, one in kept.items()}
+    if kind == store.APPLICATION_ID:
+        with closing(store.Store(source)) as of_server:
+            return {map_id: _replay(of_server, map_id) for map_id in of_server.maps()}
+    raise InvalidFile(f"{source}: is neither an agent's journal nor a server's store")
+
+
+def _replay(of_server: store.Store, map_id: MapId) -> tuple[tuple[ChangeBody, ...], str]:
+    """A map of a store, up to the first change that is damaged."""
+    hybrid, complaint = HybridMap(), ""
+    try:
+        for change in of_server.replay(map_id):
+            hybrid.apply(change.body)
+    except InvalidFile as error:
+        complaint = str(error)
+    return tuple(hybrid.contents()), complaint
+
+
+def _application_id(source: Path) -> int:
+    """What kind of SQLite file it is; 0 if nobody says."""
+    if not source.is_file():
+        raise InvalidFile(f"{source}: no such file")
+    try:
+        # By SQLite itself: what was committed last may stand in the file beside it only.
+        with closing(sqlite3.connect(source)) as connection:
+            return int(connection.execute("PRAGMA application_id").fetchone()[0])
+    except sqlite3.Error as error:
+        what = "is in use by another process" if "locked" in str(error) else f"cannot be read ({error})"
+        raise InvalidFile(f"{source}: {what}") from None

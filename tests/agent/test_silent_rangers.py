@@ -1,0 +1,125 @@
+"""A robot whose proximity sensors are not read stands, says so, and goes on when they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from agent.drivers.messages import decode_observation, encode_observation
+from agent.mission import Carried, Explore, GoTo, Idle
+from agent.observation import Command, Observation, Odometry, RobotDescription
+from agent.pipeline import Pipeline, Step
+from agent.ranger_monitor import RangerMonitor
+from hybridmap.camera import Camera
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2
+from sim.simulation import Simulation
+from sim.worlds.catalog import make_world
+from tests.agent.ranged_body import BODY, MAP, on, rangers
+
+Broken = Callable[[np.ndarray], np.ndarray]
+NONE: Broken = lambda readings: readings[:0]  # noqa: E731
+FEWER: Broken = lambda readings: readings[:5]  # noqa: E731
+MORE: Broken = lambda readings: np.append(readings, readings)  # noqa: E731
+NAN: Broken = lambda readings: np.where(np.arange(len(readings)) == 3, np.nan, readings)  # noqa: E731
+
+
+class Drive:
+    """A body that does what it is told, among the photographs, with rangers that may break."""
+
+    def __init__(self, walls, pipeline: Pipeline) -> None:
+        self.walls, self.pipeline = walls, pipeline
+        self.pose, self.tick, self._moved = Pose2(), 0, Odometry(0.0, 0.0)
+
+    def run(self, ticks: int, broken: Broken = lambda readings: readings) -> list[Step]:
+        steps = []
+        for _ in range(ticks):
+            observation = Observation(
+                self.tick * 100_000_000, self._moved, self.walls.render(self.pose), broken(rangers(self.pose))
+            )
+            step = self.pipeline.step(observation)
+            self._moved = Odometry(step.command.forward * BODY.tick, step.command.turn * BODY.tick)
+            self.pose = self.pose @ self._moved.motion()
+            self.tick += 1
+            steps.append(step)
+        return steps
+
+
+@pytest.mark.parametrize(
+    ("broken", "read"),
+    [(NONE, "none"), (FEWER, "5"), (MORE, "48"), (NAN, "23")],
+    ids=["none", "fewer", "more", "nan"],
+)
+@pytest.mark.parametrize(
+    ("mission", "ticks"), [(Explore(), 20), (GoTo(NodeId("r0", 1, 1)), 130)], ids=["explore", "goto"]
+)
+def test_it_stands_while_they_are_silent_and_says_so_and_goes_on_after(walls, mission, ticks, broken, read):
+    drive = Drive(walls, on(mission))
+    moving = drive.run(ticks)
+    assert any(step.command != Command() for step in moving)
+    silent = drive.run(12, broken)
+    assert {step.command for step in silent} == {Command()}
+    status = silent[-1].status
+    assert status.doing == "standing still"
+    assert f"24 proximity sensors promised, {read} read for 1.2 s: standing" in status.detail
+    after = drive.run(ticks)
+    assert any(step.command != Command() for step in after)
+    assert "promised" not in after[0].status.detail
+
+
+def test_a_long_silence_does_not_count_against_what_the_robot_was_doing(walls):
+    """The same commands as without the silence: behaviours have waited, not given up."""
+    pipelines = [Drive(walls, on(Explore())) for _ in range(2)]
+    commands = []
+    for drive, silence in zip(pipelines, (0, 900), strict=True):
+        first = drive.run(40)
+        drive.run(silence, NONE)
+        commands.append([step.command for step in first + drive.run(60)])
+    steady, interrupted = commands
+    assert any(command.forward for command in steady[40:])
+    # The images of the pause are the same image: the filter has learnt from it a little more.
+    for one, other in zip(steady, interrupted, strict=True):
+        assert one.forward == pytest.approx(other.forward, abs=0.05)
+        assert one.turn == pytest.approx(other.turn, abs=0.05)
+
+
+@pytest.mark.parametrize("mission", [Idle(), Carried()])
+def test_whoever_drives_nothing_needs_none(walls, mission):
+    steps = Drive(walls, on(mission)).run(5, NONE)
+    assert all("promised" not in step.status.detail for step in steps)
+
+
+def test_a_robot_that_promises_none_drives_without(walls):
+    body = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3))
+    drive = Drive(walls, on(Explore(), body=body))
+    assert any(step.command != Command() for step in drive.run(20, NONE))
+
+
+def test_one_sensor_is_named_as_one() -> None:
+    monitor = RangerMonitor(RobotDescription(BODY.camera, ranger_bearings=(0.0,), ranger_reach=1.0))
+    assert monitor.fault == ""
+    monitor.see(np.zeros(0))
+    assert monitor.fault == "1 proximity sensor promised, none read for 0.1 s: standing"
+    monitor.see(np.array([0.4]))
+    assert monitor.fault == ""
+
+
+@pytest.mark.parametrize("broken", [NONE, FEWER], ids=["none", "five"])
+def test_a_simulated_robot_touches_nothing(broken):
+    """24 s in an office: with free room assumed it touched a wall several times."""
+    world = make_world("office", 3)
+    with Simulation(world, ["r0"], 3) as simulation:
+        pipeline = Pipeline(MAP, simulation.describe("r0"))
+        pipeline.set_mission(Explore())
+        command = Command()
+        for _ in range(240):
+            seen = simulation.step({"r0": command})["r0"]
+            through = Observation(
+                seen.stamp_ns, seen.odometry, seen.image, broken(seen.proximity), seen.bumped
+            )
+            step = pipeline.step(decode_observation(encode_observation(through)))
+            command = step.command
+        assert simulation.collisions("r0") == 0
+    assert "16 proximity sensors promised" in step.status.detail

@@ -1,0 +1,270 @@
+"""No start of an agent loses a map: real processes that are killed, journals, stores and map files."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agent.drivers.messages import decode_step, encode_description, encode_observation
+from agent.observation import Observation, Odometry
+from agent.report import AgentReport, decode_report
+from agent.sharing.journal import Journal
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
+from hybridmap.pose import Pose2
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
+from mapweave.agent_process import epochs_of_files
+from mapweave.cli import main
+from mapweave.trial.children import Children, free_port
+from tests.agent.conftest import DESCRIPTION, PhotoWalls
+from tests.mapweave.command_line import complaint
+from tests.mapweave.test_cli_files import one_node
+from tests.waiting import eventually
+from wire.bus import Request
+from wire.bus_settings import BusSettings
+from wire.codec import encode_body, encode_change
+from wire.keys import Keys
+from wire.mapfile import MapFile, read_map_file, write_map_file
+from wire.zenoh_bus import ZenohBus
+
+KEYS = Keys("kept")
+PATIENCE = 120.0
+"""s; for a process to start and map a few views on a machine that is busy."""
+WAY = [*np.arange(0.0, 1.2, 0.02), *np.arange(1.2, 0.0, -0.02)]
+"""m: a body is carried back and forth before two photographs."""
+
+
+class Body:
+    """A camera that somebody carries back and forth, as fast as its agent asks."""
+
+    def __init__(self, bus: ZenohBus) -> None:
+        walls = PhotoWalls()
+        self._images = [walls.render(Pose2(float(x))) for x in WAY]
+        self._tick = 0
+        bus.serve(KEYS.robot_describe("r0"), lambda request: request.reply(encode_description(DESCRIPTION)))
+        bus.serve(KEYS.robot_step("r0"), self._step)
+
+    def _step(self, request: Request) -> None:
+        decode_step(request.payload)
+        before, now = self._tick % len(WAY), (self._tick + 1) % len(WAY)
+        self._tick += 1
+        moved = Odometry(float(WAY[now] - WAY[before]), 0.0)
+        request.reply(encode_observation(Observation(self._tick * 10**8, moved, self._images[now])))
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Iterator[tuple[Children, ZenohBus, str]]:
+    """A server process with its router, a body, and an endpoint."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with Children(tmp_path / "logs") as children:
+        children.start(
+            "server", ["server", "--fleet", "kept", "--listen", endpoint, "--data", str(tmp_path / "server")]
+        )
+        bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
+        try:
+            eventually(bus.connected, PATIENCE)
+            Body(bus)
+            yield children, bus, endpoint
+        finally:
+            bus.close()
+
+
+@pytest.mark.timeout(600)
+def test_agents_that_are_killed_begun_afresh_and_robbed_of_their_disk_lose_no_map(
+    network: tuple[Children, ZenohBus, str], tmp_path: Path
+) -> None:
+    children, bus, endpoint = network
+    data = tmp_path / "agents"
+
+    def start(*more: str) -> None:
+        children.start(
+            "r0",
+            ["agent", "r0", "--data", str(data), "--mission", "carried", "--fleet", "kept", "--connect",
+             endpoint, *more],
+        )  # fmt: skip
+
+    def report() -> AgentReport | None:
+        children.check()
+        replies = [r for r in bus.ask(KEYS.agent_status("r0"), b"", 2.0) if not r.error]
+        return decode_report(replies[0].payload) if replies else None
+
+    def mapped(nodes: int) -> AgentReport:
+        """Wait until a map has so many nodes, all of them on the server's disk."""
+        found: list[AgentReport] = []
+
+        def done() -> bool:
+            now = report()
+            if now is not None and now.status.nodes >= nodes and now.unsent == 0:
+                found.append(now)
+            return bool(found)
+
+        eventually(done, PATIENCE)
+        return found[0]
+
+    start()
+    first = mapped(2)
+    assert first.epoch == 1
+    children.kill("r0")
+    assert not list(data.glob("*.mapweave")), "it was killed"
+
+    start("--fresh")
+    assert mapped(1).epoch == 2
+    of_first = HybridMap(read_map_file(data / "r0.1.mapweave", "agent").changes)
+    assert len(of_first.nodes) >= first.status.nodes
+    children.kill("r0")
+
+    # Idle: one that is to map on would look for itself, in vain here, and begin a third map.
+    start("--resume", "r0.1", "--mission", "idle")
+    eventually(lambda: (now := report()) is not None and now.epoch == 1 and now.status.nodes >= 2, PATIENCE)
+    children.end("r0")
+    resumed = HybridMap(read_map_file(data / "r0.1.mapweave", "agent").changes)
+    assert set(of_first.nodes) <= set(resumed.nodes)
+
+    lost = tmp_path / "lost"
+    shutil.move(data, lost)
+    start()
+    assert mapped(1).epoch == 3, "the server knows that there were two"
+    children.end("r0")
+    children.end("server")
+
+    for source, maps in ((lost / "r0.sqlite", {1, 2}), (tmp_path / "server" / "s0.sqlite", {1, 2, 3})):
+        out = tmp_path / f"out-{source.stem}"
+        assert main(["map", "extract", str(source), "-o", str(out)]) == 0
+        assert set(epochs_of_files(out, "r0")) == maps
+        again = HybridMap(read_map_file(out / "r0.1.mapweave", "agent").changes)
+        assert contents(again) == contents(resumed)
+
+
+def contents(hybrid: HybridMap) -> list[bytes]:
+    return sorted(map(encode_body, hybrid.contents()))
+
+
+def journal_with(path: Path, *epochs: int) -> Path:
+    """A journal with maps of one node; epoch 9 stays empty."""
+    journal = Journal(path, "r0")
+    for epoch in epochs:
+        map_id = journal.open_map(epoch)
+        if epoch != 9:
+            journal.append(map_id, [renumbered(epoch)], 0)
+    journal.close()
+    return path
+
+
+def renumbered(epoch: int):
+    from dataclasses import replace
+
+    (put,) = one_node()
+    return replace(put, node=replace(put.node, id=NodeId("r0", epoch, 1)))
+
+
+def test_maps_of_a_journal_are_extracted_and_no_file_is_written_over(tmp_path, capfd):
+    source = journal_with(tmp_path / "r0.sqlite", 1, 4, 9)
+    assert main(["map", "extract", str(source), "-o", str(tmp_path / "out")]) == 0
+    said = capfd.readouterr().out
+    assert f"{tmp_path / 'out' / 'r0.4.mapweave'}: 1 nodes, 0 edges" in said
+    assert "r0.9: empty, not written" in said
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["r0.1.mapweave", "r0.4.mapweave"]
+    (tmp_path / "out" / "r0.1.mapweave").unlink()
+    kept = tmp_path / "out" / "r0.4.mapweave"
+    kept.write_bytes(b"mine")
+    said = complaint(capfd, "map", "extract", source, "-o", tmp_path / "out")
+    assert "r0.4.mapweave: is there already; choose another folder with -o" in said
+    assert kept.read_bytes() == b"mine"
+    assert not (tmp_path / "out" / "r0.1.mapweave").exists(), "all or nothing"
+
+
+def test_what_is_neither_journal_nor_store_or_is_in_use_is_named(tmp_path, capfd):
+    assert "no such file" in complaint(capfd, "map", "extract", tmp_path / "none")
+    other = tmp_path / "other.txt"
+    other.write_text("no database at all")
+    assert "other.txt: cannot be read" in complaint(capfd, "map", "extract", other)
+    path = tmp_path / "r0.sqlite"
+    journal = Journal(path, "r0")
+    try:
+        assert "is in use by another process" in complaint(capfd, "map", "extract", path)
+    finally:
+        journal.close()
+    empty = tmp_path / "empty.sqlite"
+    empty.write_bytes(b"")
+    assert "neither an agent's journal nor a server's store" in complaint(capfd, "map", "extract", empty)
+
+
+def test_what_a_store_can_still_read_is_extracted_and_the_rest_is_named(tmp_path, capfd):
+    import sqlite3
+
+    from hybridmap.change import Change
+
+    path = tmp_path / "s0.sqlite"
+    store = Store(path)
+    for epoch in (1, 2):
+        map_id = MapId("r0", epoch)
+        encoded = encode_change(Change(map_id, 1, 0, renumbered(epoch)))
+        store.apply(map_id, 7, [Entry.read(map_id, 1, encoded)], 1)
+    store.close()
+    with sqlite3.connect(path) as rows:
+        rows.execute("UPDATE change SET crc = crc + 1 WHERE epoch = 1")
+    rows.close()
+    assert main(["map", "extract", str(path), "-o", str(tmp_path / "out")]) == 1
+    assert "damaged" in capfd.readouterr().err
+    assert (tmp_path / "out" / "r0.2.mapweave").exists()
+
+
+def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, nobody, simulator):
+    said = complaint(capfd, "agent", "r0", "--connect", nobody, "--data", tmp_path, "--resume", "r0.3")
+    assert "there is no journal of r0" in said
+    assert not list(tmp_path.iterdir()), "nothing is left behind"
+
+
+def test_a_file_of_a_map_of_before_counts_as_a_number_that_is_taken(tmp_path, recording, capfd):
+    """The journal is lost, the map files are not."""
+    data = tmp_path / "data"
+    data.mkdir()
+    old = data / "walk.3.mapweave"
+    write_map_file(old, MapFile("agent", "walk.3", one_node()))
+    before = old.read_bytes()
+    for expected in (4, 5):
+        arguments = ["replay", str(recording), "--offline", "--data", str(data), "--epoch", "1"]
+        assert main(arguments) == 0
+        assert (data / f"walk.{expected}.mapweave").exists()
+    assert old.read_bytes() == before
+    capfd.readouterr()
+
+
+def test_a_replay_without_a_number_draws_a_short_one_and_counts_on(tmp_path, recording, capfd):
+    data = tmp_path / "data"
+    for _ in range(2):
+        assert main(["replay", str(recording), "--offline", "--data", str(data)]) == 0
+    first, second = sorted(epochs_of_files(data, "walk"))
+    assert 1000 <= first < 10_000
+    assert second == first + 1
+    capfd.readouterr()
+
+
+def test_a_file_is_set_aside_before_a_damaged_journal_writes_over_it(tmp_path, recording, capfd):
+    import sqlite3
+
+    data = tmp_path / "data"
+    data.mkdir()
+    journal = Journal(data / "walk.sqlite", "walk")
+    (put,) = one_node()
+    from dataclasses import replace
+
+    nodes = [replace(put, node=replace(put.node, id=NodeId("walk", 1, k))) for k in (1, 2)]
+    journal.append(journal.open_map(1), nodes, 0)
+    journal.close()
+    whole = data / "walk.1.mapweave"
+    write_map_file(whole, MapFile("agent", "walk.1", tuple(nodes)))
+    before = whole.read_bytes()
+    with sqlite3.connect(data / "walk.sqlite") as rows:
+        rows.execute("UPDATE change SET crc = crc + 1 WHERE sequence = 2")
+    rows.close()
+    assert main(["replay", str(recording), "--offline", "--data", str(data)]) == 0
+    assert (data / "walk.1.before-damage.mapweave").read_bytes() == before
+    assert len(HybridMap(read_map_file(whole).changes).nodes) == 1
+    assert (data / "walk.2.mapweave").exists()
+    capfd.readouterr()
