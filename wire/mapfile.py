@@ -199,7 +199,8 @@ def _pack(content: MapFile) -> bytes:
 
 
 def _unpack(content: bytes) -> MapFile:
-    reader = Reader(content, "map file", MAX_CONTENT_BYTES)
+    # A map file has as many values as it has room for: whoever reads one has chosen it.
+    reader = Reader(content, "map file", MAX_CONTENT_BYTES, MAX_CONTENT_BYTES)
     name = reader.text("kind", 16)
     kinds: dict[str, Kind] = {kind: kind for kind in get_args(Kind)}
     if name not in kinds:
