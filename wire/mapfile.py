@@ -38,7 +38,7 @@ from wire.landmark_codec import MAX_LANDMARKS
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import POSTURE, pack_posture, unpack_posture
 from wire.ruling_codec import pack_ruling, read_ruling
-from wire.whole_file import write_whole
+from wire.whole_file import read_whole, write_whole
 
 MAGIC = b"MAPWEAVE"
 VERSION = 1
@@ -117,7 +117,7 @@ def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
         InvalidFile: it cannot be read, is truncated, altered or of another kind; one line says which.
     """
     try:
-        data = path.read_bytes()
+        data = read_whole(path)
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
     try:

@@ -27,15 +27,16 @@ MAX_STAMP_NS = 2**63 - 1
 MAX_VALUES = 4096
 """Values in one message, unless its kind needs more: maps, lists, keys and what is in them each count as one.
 
-An empty list is one byte on the wire and 64 bytes in memory, so the length of a message does not bound what it
-costs to unpack."""
+An empty list is one byte on the wire and 64 bytes in memory, so the length of a message does not bound what
+it costs to unpack."""
 
 SIZES = [1] * 256
 """Bytes of a value by its first byte, without the children of a container and the payload of a binary."""
 for _first, _size in (
-    (0xC4, 2), (0xC5, 3), (0xC6, 5), (0xC7, 3), (0xC8, 4), (0xC9, 6), (0xCA, 5), (0xCB, 9), (0xCC, 2), (0xCD, 3),
-    (0xCE, 5), (0xCF, 9), (0xD0, 2), (0xD1, 3), (0xD2, 5), (0xD3, 9), (0xD4, 3), (0xD5, 4), (0xD6, 6), (0xD7, 10),
-    (0xD8, 18), (0xD9, 2), (0xDA, 3), (0xDB, 5), (0xDC, 3), (0xDD, 5), (0xDE, 3), (0xDF, 5),
+    (0xC4, 2), (0xC5, 3), (0xC6, 5), (0xC7, 3), (0xC8, 4), (0xC9, 6), (0xCA, 5), (0xCB, 9), (0xCC, 2),
+    (0xCD, 3), (0xCE, 5), (0xCF, 9), (0xD0, 2), (0xD1, 3), (0xD2, 5), (0xD3, 9), (0xD4, 3), (0xD5, 4),
+    (0xD6, 6), (0xD7, 10), (0xD8, 18), (0xD9, 2), (0xDA, 3), (0xDB, 5), (0xDC, 3), (0xDD, 5), (0xDE, 3),
+    (0xDF, 5),
 ):  # fmt: skip
     SIZES[_first] = _size
 
@@ -66,7 +67,7 @@ class Reader:
             values: most values in it, see MAX_VALUES. They are counted before any is made.
 
         Raises:
-            InvalidMessage: too long, too many values, no MessagePack map with text keys, or of another schema.
+            InvalidMessage: too long, too many values, no MessagePack map with text keys, or another schema.
         """
         self._what = what
         if len(data) > limit:
