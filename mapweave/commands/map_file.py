@@ -8,6 +8,7 @@ from typing import Any
 from mapweave.commands import (
     map_explain,
     map_export,
+    map_extract,
     map_history,
     map_import,
     map_merge,
@@ -26,6 +27,6 @@ def add_to(commands: Any) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (
         map_show, map_explain, map_route, map_history, map_unmerge, map_retire,
-        map_merge, map_export, map_import,
+        map_merge, map_export, map_import, map_extract,
     ):  # fmt: skip
         action.add_to(actions)

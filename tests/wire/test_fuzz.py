@@ -20,7 +20,7 @@ from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplana
 from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
-from hybridmap.ruling import Ruling, Rulings
+from hybridmap.ruling import Ruling
 from wire.codec import decode_body, decode_change, encode_body, encode_change
 from wire.explanation_messages import (
     ExplainRequest,
@@ -62,7 +62,6 @@ from wire.messages import (
 )
 from wire.packing import _exceeds
 from wire.posture_messages import MergedPosture, PostureNews
-from wire.ruling_codec import decode_rulings, encode_rulings
 
 Decoder = Callable[[bytes], object]
 
@@ -123,7 +122,6 @@ def explanations(some: SimpleNamespace, a: Node, posture: PoseGaussian) -> list[
         (decode_maps, encode_maps((maps,))),
         (decode_explain_request, encode_explain_request(ExplainRequest((one, two)))),
         (decode_ruling, encode_ruling(ruling)),
-        (decode_rulings, encode_rulings(Rulings([ruling]))),
     ]
 
 
