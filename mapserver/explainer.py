@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
-from hybridmap.errors import InvalidFile, InvalidMessage
+from hybridmap.errors import InvalidMessage
 from hybridmap.explanation import Explanation, MapsExplanation, PairExplanation, RouteExplanation
 from hybridmap.history import Happening
 from hybridmap.node import MapId, NodeId
@@ -31,17 +31,15 @@ from wire.explanation_messages import (
     decode_ruling,
     encode_maps,
     encode_pair,
+    encode_ruling,
 )
 from wire.history_codec import encode_history
 from wire.keys import Keys
 from wire.log_messages import encode_record
 from wire.route_explanation import encode_route_explanation
-from wire.ruling_codec import decode_rulings, encode_rulings
 
 log = logging.getLogger(__name__)
 
-NAME = "rulings"
-"""In the store."""
 Told = TypeVar("Told", PairExplanation, MapsExplanation, RouteExplanation)
 
 
@@ -49,17 +47,15 @@ class RulingBook:
     """The server's record of what people have ruled, on its disk. Entries are added, never taken out."""
 
     def __init__(self, store: Store) -> None:
-        """Read the record.
-
-        Raises:
-            InvalidFile: it is damaged.
-        """
+        """Read the record."""
         self._store = store
-        found = store.result(NAME)
-        try:
-            self._rulings = Rulings() if found is None else decode_rulings(found)
-        except InvalidMessage as error:
-            raise InvalidFile(f"the server's record of rulings is damaged ({error})") from None
+        made: list[Ruling] = []
+        for body in store.rulings():
+            try:
+                made.append(decode_ruling(body))
+            except InvalidMessage as error:
+                log.error("a ruling cannot be read (%s); it is left out", error)
+        self._rulings = Rulings(made)
 
     @property
     def rulings(self) -> Rulings:
@@ -74,11 +70,11 @@ class RulingBook:
         """Enter a ruling; it is on the disk when this returns.
 
         Raises:
+            InvalidValue: there are too many.
             InvalidFile: the disk does not take it; then nothing has changed.
         """
-        rulings = Rulings([*self._rulings.made, ruling])
-        self._store.put_result(NAME, encode_rulings(rulings))
-        self._rulings = rulings
+        self._store.add_ruling(encode_ruling(ruling))
+        self._rulings = Rulings([*self._rulings.made, ruling])
 
 
 class Explainer:

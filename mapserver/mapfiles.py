@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+import numpy as np
+
 from hybridmap.change import EdgePut
+from hybridmap.errors import InvalidFile, InvalidValue
 from hybridmap.history import Happening
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId
@@ -69,11 +72,20 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     Args:
         content: of the file.
         settings: with which it was merged.
+
+    Raises:
+        InvalidFile: its measurements determine no postures.
     """
     s = settings or MergeSettings()
     maps, rulings = maps_of(content), Rulings(content.rulings)
     links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
-    solved = Solver(fragments_of(undo(maps, (), rulings).maps, s.consistency, s.strain), s.huber).solve(links)
+    try:
+        parts = fragments_of(undo(maps, (), rulings).maps, s.consistency, s.strain)
+        solved = Solver(parts, s.huber).solve(links)
+    except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
+        # The solver's RuntimeError says that a system is singular.
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InvalidFile(f"the postures of this map cannot be solved ({reason})") from None
     postures = {
         node: Placement(number, posture)
         for number, graph in enumerate(solved)
@@ -83,8 +95,17 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     components = tuple(frozenset(graph.nodes) for graph in solved)
     superseded = {node: fate for node, fate in content.superseded.items() if node in postures}
     faded = {node: gone for node, gone in content.faded.items() if node in postures}
-    parts = dict(sorted(maps.items()))
-    return MergedMap(parts, links, refused, components, postures, tuple(solved), rulings, superseded, faded)
+    return MergedMap(
+        dict(sorted(maps.items())),
+        links,
+        refused,
+        components,
+        postures,
+        tuple(solved),
+        rulings,
+        superseded,
+        faded,
+    )
 
 
 def _is_link(edge: Edge) -> bool:

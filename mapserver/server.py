@@ -149,6 +149,7 @@ class MapServer:
             "links": len(merged.links) - loops,
             "loops": loops,
             "refused": sum(refusal.link is not None for refusal in merged.refused),
+            "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
             "rulings": len(merged.rulings.in_force),
             "set_apart": len(merged.set_apart),
             "event": self._upkeep.event,

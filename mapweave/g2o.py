@@ -20,7 +20,7 @@ import numpy as np
 
 from hybridmap.errors import InvalidFile
 from hybridmap.pose import Array, Pose2, wrap_angle
-from wire.whole_file import write_whole
+from wire.whole_file import read_whole, write_whole
 
 UPPER = np.triu_indices(3)
 KNOWN = {"VERTEX_SE2": 5, "EDGE_SE2": 12, "FIX": 2}
@@ -113,7 +113,7 @@ def read_g2o(path: Path) -> G2oGraph:
         InvalidFile: it cannot be read, is not planar, or a line is wrong; the words name the line.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_whole(path).decode("utf-8").splitlines()
     except UnicodeDecodeError:
         raise InvalidFile(f"{path}: is no g2o file") from None
     except OSError as error:

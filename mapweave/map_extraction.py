@@ -11,9 +11,9 @@ from agent.sharing import journal
 from agent.sharing.kept import Kept
 from hybridmap.change import ChangeBody, NodePut
 from hybridmap.errors import InvalidFile, InvalidValue
-from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from mapserver.log import store
+from mapserver.log.salvage import Salvage, salvage
 from wire.mapfile import MapFile, write_map_file
 
 
@@ -36,18 +36,21 @@ class Extracted:
     complaint: str
 
 
-def extract_maps(source: Path, folder: Path) -> list[Extracted]:
+def extract_maps(source: Path, folder: Path) -> tuple[list[Extracted], str]:
     """Write every map of a journal or store into a file of a folder. Nobody else may have the source open.
 
     Args:
         source: journal or store.
         folder: made if it is not there.
 
+    Returns:
+        The maps, and in one line what of the source could not be read and belongs to no map; empty if nothing.
+
     Raises:
         InvalidFile: the source is neither, or cannot be read.
         InvalidValue: a file is there already; nothing was written.
     """
-    maps = _read(source)
+    maps, lost = _read(source)
     paths = {map_id: folder / f"{map_id}.mapweave" for map_id in maps}
     for path in paths.values():
         if path.exists():
@@ -60,31 +63,30 @@ def extract_maps(source: Path, folder: Path) -> list[Extracted]:
         nodes = sum(isinstance(body, NodePut) for body in contents)
         written = paths[map_id] if contents else None
         extracted.append(Extracted(map_id, written, nodes, len(contents) - nodes, complaint))
-    return extracted
+    return extracted, lost
 
 
-def _read(source: Path) -> dict[MapId, tuple[tuple[ChangeBody, ...], str]]:
-    """The contents of all maps, with what is wrong with each."""
+def _read(source: Path) -> tuple[dict[MapId, tuple[tuple[ChangeBody, ...], str]], str]:
+    """The contents of all maps with what is wrong with each, and what is wrong with the file."""
     kind = _application_id(source)
     if kind == journal.APPLICATION_ID:
         with closing(journal.Journal(source)) as of_agent:
             kept = {map_id: Kept.of(of_agent, map_id) for map_id in of_agent.maps()}
-        return {map_id: (one.contents, one.complaint) for map_id, one in kept.items()}
+        return {map_id: (one.contents, one.complaint) for map_id, one in kept.items()}, ""
     if kind == store.APPLICATION_ID:
-        with closing(store.Store(source)) as of_server:
-            return {map_id: _replay(of_server, map_id) for map_id in of_server.maps()}
+        found = salvage(source)
+        maps = {map_id: (tuple(hybrid.contents()), "") for map_id, hybrid in sorted(found.maps.items())}
+        return maps, _lost(source, found)
     raise InvalidFile(f"{source}: is neither an agent's journal nor a server's store")
 
 
-def _replay(of_server: store.Store, map_id: MapId) -> tuple[tuple[ChangeBody, ...], str]:
-    """A map of a store, up to the first change that is damaged."""
-    hybrid, complaint = HybridMap(), ""
-    try:
-        for change in of_server.replay(map_id):
-            hybrid.apply(change.body)
-    except InvalidFile as error:
-        complaint = str(error)
-    return tuple(hybrid.contents()), complaint
+def _lost(source: Path, found: Salvage) -> str:
+    """What of a store is missing in the files, in one line; empty if nothing is."""
+    if found.whole and not found.damaged:
+        return ""
+    lost = f"{found.damaged} damaged changes" if found.damaged else "no damaged change"
+    pages = "" if found.whole else ", and pages that cannot be read: how many changes they had is not known"
+    return f"{source} had {lost}{pages}"
 
 
 def _application_id(source: Path) -> int:

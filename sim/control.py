@@ -22,6 +22,7 @@ from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 
 MAX_BYTES = 64 * 2**20
 MAX_RECTANGLES = 100_000
+MAX_VALUES = 8 * MAX_RECTANGLES
 MAX_ROBOTS = 1024
 FARTHEST = 1e6
 """m, and the like for angles: larger numbers are no postures."""
@@ -179,7 +180,7 @@ class SimControl:
             raise NotConnected(f"{self._key}: nobody answers; start the simulator with: mapweave sim serve")
         if replies[0].error:
             raise InvalidValue(f"the simulator refuses {operation}: {replies[0].error}")
-        return Reader(replies[0].payload, f"answer to {operation}", MAX_BYTES)
+        return Reader(replies[0].payload, f"answer to {operation}", MAX_BYTES, MAX_VALUES)
 
 
 def _read_rectangle(reader: Reader, value: object) -> Rectangle:

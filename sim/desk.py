@@ -62,7 +62,7 @@ class ControlDesk:
         Raises:
             MapweaveError: the question is broken, or the simulation refuses.
         """
-        reader = Reader(question, "control", MAX_BYTES)
+        reader = Reader(question, "control", MAX_BYTES, MAX_BYTES)
         operation = reader.text("op", 32)
         if operation not in self._operations:
             raise reader.error(f"no operation {operation!r}; there are {', '.join(self._operations)}")
@@ -74,7 +74,7 @@ class ControlDesk:
         Raises:
             MapweaveError: the question is broken.
         """
-        reader = Reader(question, "control", MAX_BYTES)
+        reader = Reader(question, "control", MAX_BYTES, MAX_BYTES)
         return reader.integer("tick", 0, MAX_NUMBER) if reader.text("op", 32) == "advance" else None
 
     def reached(self) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,7 +17,16 @@ class Database:
     changes alike.
     """
 
-    def __init__(self, path: Path, what: str, application_id: int, version: int, schema: str) -> None:
+    def __init__(
+        self,
+        path: Path,
+        what: str,
+        application_id: int,
+        version: int,
+        schema: str,
+        repair: Callable[[sqlite3.Connection], None] | None = None,
+        advice: str = "",
+    ) -> None:
         """Open the file, or make it.
 
         Args:
@@ -26,17 +35,23 @@ class Database:
             application_id: marks files of this kind.
             version: of the schema.
             schema: SQL that makes the tables of a new file.
+            repair: called before the check of the file's pages; may take out rows that are damaged.
+            advice: what to do about a damaged file, for people; stands behind the reason.
 
         Raises:
             InvalidFile: damaged, of another kind or version, in use, or not readable.
         """
         self.path = path
         self.what = what
+        self._repair = repair
+        self._advice = f"; {advice}" if advice else ""
         with self.guard():
             # Threads take turns: whoever shares a Database holds a lock of its own.
             self.connection = sqlite3.connect(
                 path, timeout=5.0, isolation_level=None, check_same_thread=False
             )
+        # Text with a flipped bit may be no UTF-8; what it stands for is checked by whoever reads it.
+        self.connection.text_factory = lambda data: data.decode("utf-8", "replace")
         try:
             with self.guard():
                 self._prepare(application_id, version, schema)
@@ -52,6 +67,11 @@ class Database:
         except sqlite3.Error as error:
             if "locked" in str(error):
                 raise InvalidFile(f"{self.path}: {self.what} is in use by another process") from None
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF in (
+                sqlite3.SQLITE_CORRUPT,
+                sqlite3.SQLITE_NOTADB,
+            ):
+                raise self._damaged(str(error)) from None
             raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error})") from None
 
     @contextmanager
@@ -95,6 +115,12 @@ class Database:
             run(f"PRAGMA application_id={application_id}")
             run(f"PRAGMA user_version={version}")
             run("COMMIT")
-        damage = run("PRAGMA quick_check(1)").fetchone()[0]
+        if self._repair is not None and not empty:
+            self._repair(self.connection)
+        # With its name in front a message may have two lines, the second of which says what is wrong.
+        damage = str(run("PRAGMA quick_check(1)").fetchone()[0])
         if damage != "ok":
-            raise InvalidFile(f"{self.path}: {self.what} is damaged ({damage.splitlines()[0]})")
+            raise self._damaged(damage.splitlines()[-1])
+
+    def _damaged(self, reason: str) -> InvalidFile:
+        return InvalidFile(f"{self.path}: {self.what} is damaged ({reason}){self._advice}")

@@ -29,6 +29,8 @@ MAX_RULINGS = 4096
 MAX_REASON = 4096
 MAX_PAIR_BYTES = 2 * MAX_BODY_BYTES + 4_000_000
 MAX_MAPS_BYTES = 4_000_000
+MAX_PAIR_VALUES = 16 * (MAX_WITNESSES + MAX_RULINGS)
+MAX_MAPS_VALUES = 16 * MAX_MAPS_TOLD * MAX_NEAREST
 INFINITE = 1e300
 """Stands for a number beyond all bounds."""
 
@@ -120,7 +122,7 @@ def encode_pair(told: PairExplanation) -> bytes:
 
 def decode_pair(data: bytes) -> PairExplanation:
     """Decode the explanation of two nodes; raises InvalidMessage."""
-    reader = Reader(data, "explanation", MAX_PAIR_BYTES)
+    reader = Reader(data, "explanation", MAX_PAIR_BYTES, MAX_PAIR_VALUES)
     standing = reader.text("y", 16)
     if standing not in set(Standing):
         raise reader.error(f"standing {standing!r} is unknown")
@@ -158,7 +160,7 @@ def encode_maps(told: tuple[MapsExplanation, ...]) -> bytes:
 
 def decode_maps(data: bytes) -> tuple[MapsExplanation, ...]:
     """Decode explanations of maps; raises InvalidMessage."""
-    reader = Reader(data, "explanation", MAX_MAPS_BYTES)
+    reader = Reader(data, "explanation", MAX_MAPS_BYTES, MAX_MAPS_VALUES)
     return tuple(read_maps(reader, value) for value in reader.array("m", MAX_MAPS_TOLD))
 
 

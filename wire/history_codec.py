@@ -15,6 +15,7 @@ MAX_WORDS = 4096
 MAX_HAPPENINGS = 100_000
 MAX_MAPS = 100_000
 MAX_BYTES = 2**26
+MAX_VALUES = 4 * (MAX_HAPPENINGS + MAX_MAPS)
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def encode_history(happenings: Sequence[Happening]) -> bytes:
 
 def decode_history(data: bytes) -> tuple[Happening, ...]:
     """The same back; raises InvalidMessage."""
-    return _happenings(Reader(data, "history", MAX_BYTES))
+    return _happenings(Reader(data, "history", MAX_BYTES, MAX_VALUES))
 
 
 def encode_kept_history(kept: KeptHistory) -> bytes:
@@ -60,7 +61,7 @@ def encode_kept_history(kept: KeptHistory) -> bytes:
 
 def decode_kept_history(data: bytes) -> KeptHistory:
     """The same back; raises InvalidMessage."""
-    reader = Reader(data, "history", MAX_BYTES)
+    reader = Reader(data, "history", MAX_BYTES, MAX_VALUES)
     parts = (_maps(reader, value) for value in reader.array("p", MAX_MAPS))
     apart = (_maps(reader, value) for value in reader.array("a", MAX_MAPS))
     return KeptHistory(

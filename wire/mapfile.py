@@ -38,7 +38,7 @@ from wire.landmark_codec import MAX_LANDMARKS
 from wire.packing import MAX_NUMBER, Reader, pack
 from wire.posture_codec import POSTURE, pack_posture, unpack_posture
 from wire.ruling_codec import pack_ruling, read_ruling
-from wire.whole_file import write_whole
+from wire.whole_file import read_whole, write_whole
 
 MAGIC = b"MAPWEAVE"
 VERSION = 1
@@ -117,7 +117,7 @@ def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
         InvalidFile: it cannot be read, is truncated, altered or of another kind; one line says which.
     """
     try:
-        data = path.read_bytes()
+        data = read_whole(path)
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
     try:
@@ -199,7 +199,8 @@ def _pack(content: MapFile) -> bytes:
 
 
 def _unpack(content: bytes) -> MapFile:
-    reader = Reader(content, "map file", MAX_CONTENT_BYTES)
+    # A map file has as many values as it has room for: whoever reads one has chosen it.
+    reader = Reader(content, "map file", MAX_CONTENT_BYTES, MAX_CONTENT_BYTES)
     name = reader.text("kind", 16)
     kinds: dict[str, Kind] = {kind: kind for kind in get_args(Kind)}
     if name not in kinds:

@@ -20,7 +20,10 @@ from wire.posture_codec import MAX_POSITION, pack_camera, pack_posture, unpack_c
 
 MAX_VIEW_BYTES = MAX_LANDMARKS_BYTES + 256
 MAX_CANDIDATES = 64
-MAX_LEGS = 1024
+MAX_LEGS = 512
+"""A route through a building has tens of legs."""
+MAX_ROUTE_BYTES = 8 * 2**20
+"""16 kB a leg; a node takes about 3 kB."""
 MAX_REASON = 1024
 MAX_KNOWN = 512
 """Views in one answer: 8 kB, as much as two or three nodes."""
@@ -149,7 +152,7 @@ def encode_route_answer(answer: RouteAnswer) -> bytes:
 
 def decode_route_answer(data: bytes) -> RouteAnswer:
     """Decode a way; raises InvalidMessage."""
-    reader = Reader(data, "route", MAX_LEGS * (MAX_BODY_BYTES + 64) + 4 * MAX_REASON)
+    reader = Reader(data, "route", MAX_ROUTE_BYTES)
     legs = tuple(_read_leg(reader, leg) for leg in reader.array("g", MAX_LEGS))
     return RouteAnswer(legs, reader.text("r", MAX_REASON))
 

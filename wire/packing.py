@@ -24,6 +24,22 @@ MAX_NUMBER = 2**53
 
 MAX_STAMP_NS = 2**63 - 1
 
+MAX_VALUES = 4096
+"""Values in one message, unless its kind needs more: maps, lists, keys and what is in them each count as one.
+
+An empty list is one byte on the wire and 64 bytes in memory, so the length of a message does not bound what
+it costs to unpack."""
+
+SIZES = [1] * 256
+"""Bytes of a value by its first byte, without the children of a container and the payload of a binary."""
+for _first, _size in (
+    (0xC4, 2), (0xC5, 3), (0xC6, 5), (0xC7, 3), (0xC8, 4), (0xC9, 6), (0xCA, 5), (0xCB, 9), (0xCC, 2),
+    (0xCD, 3), (0xCE, 5), (0xCF, 9), (0xD0, 2), (0xD1, 3), (0xD2, 5), (0xD3, 9), (0xD4, 3), (0xD5, 4),
+    (0xD6, 6), (0xD7, 10), (0xD8, 18), (0xD9, 2), (0xDA, 3), (0xDB, 5), (0xDC, 3), (0xDD, 5), (0xDE, 3),
+    (0xDF, 5),
+):  # fmt: skip
+    SIZES[_first] = _size
+
 
 def pack(fields: Mapping[str, object], *, single_floats: bool = False) -> bytes:
     """Make a message of fields; the schema version goes first.
@@ -41,20 +57,24 @@ def pack(fields: Mapping[str, object], *, single_floats: bool = False) -> bytes:
 class Reader:
     """A message taken apart. Every method raises InvalidMessage if the field is missing or not as asked."""
 
-    def __init__(self, data: bytes, what: str, limit: int) -> None:
+    def __init__(self, data: bytes, what: str, limit: int, values: int = MAX_VALUES) -> None:
         """Take a message apart.
 
         Args:
             data: as it came.
             what: what it should be, for the reason.
             limit: longest message that is looked at, bytes.
+            values: most values in it, see MAX_VALUES. They are counted before any is made.
 
         Raises:
-            InvalidMessage: too long, no MessagePack map with text keys, or of another schema.
+            InvalidMessage: too long, too many values, no MessagePack map with text keys, or another schema.
         """
         self._what = what
         if len(data) > limit:
             raise self.error(f"{len(data)} bytes, at most {limit} are allowed")
+        # A value takes at least one byte, so short messages need no count.
+        if len(data) > values and _exceeds(data, values):
+            raise self.error(f"more than {values} values")
         try:
             # The lengths that a message may claim are bounded by its own, so nothing huge is allocated.
             fields = msgpack.unpackb(data, strict_map_key=True, max_ext_len=0)
@@ -181,3 +201,32 @@ class Reader:
         if type(value) is not bytes or len(value) > longest:
             raise self.error(f"{name} must be at most {longest} bytes")
         return value
+
+
+def _exceeds(data: bytes, most: int) -> bool:
+    """Whether MessagePack holds more values than so many, by the heads of the values alone."""
+    at, left, count = 0, 1, 1
+    while left and at < len(data):
+        first = data[at]
+        end = at + SIZES[first]
+        children = payload = 0
+        if 0x80 <= first <= 0x8F:
+            children = 2 * (first & 0x0F)
+        elif 0x90 <= first <= 0x9F:
+            children = first & 0x0F
+        elif 0xA0 <= first <= 0xBF:
+            payload = first & 0x1F
+        elif first in (0xDC, 0xDD):
+            children = int.from_bytes(data[at + 1 : end], "big")
+        elif first in (0xDE, 0xDF):
+            children = 2 * int.from_bytes(data[at + 1 : end], "big")
+        elif 0xC4 <= first <= 0xC6 or 0xD9 <= first <= 0xDB:
+            payload = int.from_bytes(data[at + 1 : end], "big")
+        elif 0xC7 <= first <= 0xC9:
+            payload = int.from_bytes(data[at + 1 : end - 1], "big")
+        count += children
+        if count > most:
+            return True
+        left += children - 1
+        at = end + payload
+    return False

@@ -82,7 +82,7 @@ class PostureNews:
         Raises:
             InvalidMessage: it is damaged, or another agent's.
         """
-        reader = Reader(data, "postures", MAX_BYTES)
+        reader = Reader(data, "postures", MAX_BYTES, 2 * MAX_POSTURES)
         if (told := reader.name("a")) != agent:
             raise reader.error(f"they are of {told}'s nodes, not of {agent}'s")
         placed: dict[NodeId, MergedPosture] = {}

@@ -40,7 +40,7 @@ def encode_route_explanation(told: RouteExplanation) -> bytes:
 
 def decode_route_explanation(data: bytes) -> RouteExplanation:
     """Decode it; raises InvalidMessage."""
-    reader = Reader(data, "explanation of a route", MAX_BYTES)
+    reader = Reader(data, "explanation of a route", MAX_BYTES, MAX_HOPS * 32)
     return RouteExplanation(
         reader.node_id("a"),
         reader.node_id("b"),

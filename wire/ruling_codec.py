@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from hybridmap.errors import InvalidValue
-from hybridmap.ruling import MOST_WORDS, Ends, Ruling, Rulings
-from wire.packing import MAX_STAMP_NS, Reader, pack
-
-MAX_RULINGS = 100_000
-MAX_RULINGS_BYTES = 2**28
+from hybridmap.ruling import MOST_WORDS, Ends, Ruling
+from wire.packing import MAX_STAMP_NS, Reader
 
 
 def pack_ruling(ruling: Ruling) -> list[object]:
@@ -33,17 +30,6 @@ def read_ruling(reader: Reader, value: Any) -> Ruling:
         )
     except InvalidValue as error:
         raise reader.error(str(error)) from None
-
-
-def encode_rulings(rulings: Rulings) -> bytes:
-    """All rulings, in order, for a server's disk."""
-    return pack({"g": [pack_ruling(ruling) for ruling in rulings.made]})
-
-
-def decode_rulings(data: bytes) -> Rulings:
-    """The same back; raises InvalidMessage."""
-    reader = Reader(data, "rulings", MAX_RULINGS_BYTES)
-    return Rulings(read_ruling(reader, value) for value in reader.array("g", MAX_RULINGS))
 
 
 def read_ends(reader: Reader, first: Any, second: Any) -> Ends:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hybridmap.errors import SettingsError
+from wire.whole_file import read_whole
 
 T = TypeVar("T")
 
@@ -25,7 +26,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         SettingsError: the file is missing or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_whole(path).decode("utf-8"))
     except FileNotFoundError:
         raise SettingsError(f"{path}: no such file") from None
     except OSError as error:

@@ -1,4 +1,7 @@
-"""Files that are written whole or not at all: a full disk or a loss of power leaves the old one."""
+"""Files that are written whole or not at all: a full disk or a loss of power leaves the old one.
+
+Only regular files are read: a device or a pipe may have no end.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +39,17 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
         # Somebody interrupts: nothing is left lying about.
         beside.unlink(missing_ok=True)
         raise
+
+
+def read_whole(path: Path) -> bytes:
+    """Read a regular file.
+
+    Raises:
+        OSError: it is missing, cannot be read, or is a device or a pipe.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return path.read_bytes()
 
 
 def check_place(path: Path) -> None:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from wire.bus_settings import BusSettings
 
+ACCEPT_PENDING = 1000
+"""Connections of which a router does not know yet who they are."""
+ACCEPT_TIMEOUT = 2.0
+"""s; a new connection that says nothing for this long is dropped. A handshake takes two round trips."""
+
 
 def session_values(settings: BusSettings) -> dict[str, object]:
     """Zenoh's configuration, by path."""
@@ -21,6 +26,9 @@ def session_values(settings: BusSettings) -> dict[str, object]:
         "scouting/gossip/enabled": False,
         # There is nobody to scout for, so opening a router need not wait half a second for it.
         "scouting/delay": 1,
+        # With Zenoh's own 100 and 10 s, a hundred idle connections keep everybody else out for 10 s.
+        "transport/unicast/accept_pending": ACCEPT_PENDING,
+        "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT * 1e3),
         "transport/link/tx/lease": round(settings.lease * 1e3),
         "transport/link/tx/queue/size/data": settings.router_queue if settings.mode == "router" else 2,
         "transport/shared_memory/enabled": False,

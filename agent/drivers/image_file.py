@@ -1,7 +1,9 @@
-"""Images on disk, as recordings and people bring them."""
+"""Images on disk, as recordings and people bring them. Their size is read before they are decoded."""
 
 from __future__ import annotations
 
+import re
+import struct
 from pathlib import Path
 
 import cv2
@@ -9,14 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
-from hybridmap.errors import DeviceError
+from hybridmap.errors import DeviceError, InvalidValue
+from wire.whole_file import read_whole
+
+MAX_PIXELS = 50_000_000
+"""Larger images are refused before they are decoded; phones take up to 50 megapixels."""
+MAX_SEGMENTS = 1024
+"""Segments of a JPEG before its image. Phones write tens; Exif and colour profiles at most 255 each."""
+MAX_SCANS = 20
+"""Scans of a progressive JPEG. Encoders write about ten; each one costs a pass over all pixels."""
+PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 
 
 def read_grey(path: Path, camera: Camera | None = None, told: str = "the camera") -> NDArray[np.uint8]:
     """Read an image.
 
     Args:
-        path: of a file that OpenCV can read.
+        path: of a PNG, JPEG, PGM or BMP file.
         camera: that took it, if known.
         told: who says so, for the error.
 
@@ -24,15 +35,89 @@ def read_grey(path: Path, camera: Camera | None = None, told: str = "the camera"
         (H, W) grey.
 
     Raises:
-        DeviceError: it is not there, no image, or none of the size that the camera takes.
+        DeviceError: it is not there, no image, too large, or none of the size that the camera takes.
     """
-    if not path.exists():
-        raise DeviceError(f"{path}: no such file")
-    # OpenCV warns of a missing file on its own, past all logging.
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
-    if image is None:
-        raise DeviceError(f"{path}: not an image that can be read")
+    try:
+        data = read_whole(path)
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file") from None
+    except OSError:
+        data = b""
+    try:
+        image = decode_grey(data)
+    except InvalidValue as error:
+        raise DeviceError(f"{path}: not an image that can be read ({error})") from None
     if camera is not None and image.shape != (camera.height, camera.width):
         height, width = image.shape
         raise DeviceError(f"{path}: {width}x{height} px, but {told} says {camera.width}x{camera.height}")
+    return image
+
+
+def decode_grey(data: bytes) -> NDArray[np.uint8]:
+    """Decode an image.
+
+    Args:
+        data: a whole PNG, JPEG, PGM or BMP file.
+
+    Returns:
+        (H, W) grey, upright if the file says how the camera was held.
+
+    Raises:
+        InvalidValue: it is none of these, damaged, or too large or too costly to decode.
+    """
+    check_cost(data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        # OpenCV raises for some broken input and returns nothing for other.
+        image = None
+    if image is None:
+        raise InvalidValue("the image is damaged")
     return np.asarray(image, np.uint8)
+
+
+def check_cost(data: bytes) -> None:
+    """Refuse an image that takes long or much memory to decode, by its head.
+
+    Raises:
+        InvalidValue: it is too large, or no PNG, JPEG, PGM or BMP.
+    """
+    width, height = image_size(data)
+    if width * height > MAX_PIXELS:
+        raise InvalidValue(f"an image of {width}x{height} px is too large, at most {MAX_PIXELS} are taken")
+    if data.startswith(b"\xff\xd8") and data.count(b"\xff\xda") > MAX_SCANS:
+        raise InvalidValue(f"a JPEG of more than {MAX_SCANS} scans takes too long to decode")
+
+
+def image_size(data: bytes) -> tuple[int, int]:
+    """Width and height of an image file, px, from its head alone.
+
+    Raises:
+        InvalidValue: it is no PNG, JPEG, PGM or BMP.
+    """
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return width, height
+    if data.startswith(b"BM") and len(data) >= 26:
+        width, height = struct.unpack("<ii", data[18:26])
+        return abs(width), abs(height)
+    if found := PNM.match(data[:4096]):
+        return int(found[1]), int(found[2])
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_size(data)
+    raise InvalidValue("send a JPEG or PNG image")
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    """Of the first frame that a JPEG begins; the segments before it are skipped."""
+    at = 2
+    for _ in range(MAX_SEGMENTS):
+        if at + 9 > len(data) or data[at] != 0xFF:
+            break
+        kind = data[at + 1]
+        # Start of frame, except the tables that have numbers in between.
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
+        at += 1 if kind == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    raise InvalidValue("send a JPEG or PNG image")

@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.drivers.image_file import decode_grey, image_size
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.errors import InvalidMessage, InvalidValue
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
@@ -206,10 +206,10 @@ def _read_image(reader: Reader) -> NDArray[np.uint8]:
 
 def _decompress(reader: Reader, encoding: str, data: bytes, shape: Sequence[int]) -> NDArray[np.uint8]:
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error as error:
-        # OpenCV raises for some broken input and returns nothing for other.
-        raise InvalidMessage(f"observation: no {encoding} image") from error
+        # The message says the size; an image that says another one is not decoded.
+        image = decode_grey(data) if sorted(image_size(data)) == sorted(shape) else None
+    except InvalidValue as error:
+        raise reader.error(f"no {encoding} image ({error})") from None
     if image is None or list(image.shape) != list(shape):
         raise reader.error(f"no {encoding} image of {shape[1]}x{shape[0]} px")
-    return np.asarray(image, np.uint8)
+    return image

@@ -21,6 +21,7 @@ from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError, InvalidValue
 from wire.packing import MAX_STAMP_NS
+from wire.whole_file import read_whole
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 AXLE_PER_HEIGHT = 0.9
@@ -37,7 +38,7 @@ def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, f
         DeviceError: the file is missing or wrong.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(read_whole(path).decode("utf-8"))
         camera = Camera(
             width=_whole(values["width"]), height=_whole(values["height"]), fx=_number(values, "fx"),
             fy=_number(values, "fy"), cx=_number(values, "cx"), cy=_number(values, "cy"),
@@ -159,7 +160,7 @@ def _read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]
     if not path.exists():
         return np.linspace(0.0, 0.1 * (count - 1), count)
     try:
-        times = np.array([float(line) for line in path.read_text().split()])
+        times = np.array([float(line) for line in read_whole(path).decode().split()])
     except (OSError, ValueError) as error:
         raise DeviceError(f"{path}: {error}") from None
     if len(times) != count or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
@@ -193,11 +194,13 @@ def _read_split(path: Path, robot: str | None, count: int) -> range:
     if robot is None:
         return range(count)
     try:
-        robots = {str(r["name"]): r for r in tomllib.loads(path.read_text(encoding="utf-8")).get("robot", [])}
+        robots = {str(r["name"]): r for r in tomllib.loads(read_whole(path).decode("utf-8")).get("robot", [])}
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file; without it there is no robot {robot!r}") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError) as error:
         raise DeviceError(f"{path}: {error}") from None
+    except (KeyError, TypeError):
+        raise DeviceError(f"{path}: write a [[robot]] table with a name for each robot") from None
     if robot not in robots:
         raise DeviceError(f"{path}: no robot {robot!r}; there are {', '.join(sorted(robots)) or 'none'}")
     split = robots[robot]

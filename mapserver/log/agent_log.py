@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from hybridmap.node import MapId
 from mapserver.log.entry import Applied, Entry
+from mapserver.log.integrity import Gap
 from wire.log_messages import MAX_REFUSALS, MAX_ROWS, LogRequest, Refusal
 
 NEVER = float("inf")
@@ -40,6 +41,7 @@ class AgentLog:
         newest: the highest sequence number that was heard of.
         ahead: changes that came and are not settled, by sequence number.
         refusals: the newest that were refused.
+        damaged: parts of the settled changes that were found damaged on the disk.
         pulling: whether a pull is under way.
         pull_at: when the next one is due.
         chunk: changes to ask for at once; smaller after an answer that could not be read.
@@ -52,6 +54,7 @@ class AgentLog:
     newest: int = 0
     ahead: dict[int, Entry] = field(default_factory=dict)
     refusals: tuple[Refusal, ...] = ()
+    damaged: list[Gap] = field(default_factory=list)
     pulling: bool = False
     pull_at: float = NEVER
     chunk: int = MAX_ROWS
@@ -79,14 +82,14 @@ class AgentLog:
     def heard(self, now: float) -> None:
         """The agent is there: no need to wait long for the next attempt."""
         self._pause = min(self._pause, self.settings.first_pause)
-        if self.newest > self.watermark:
+        if self.newest > self.watermark or self.damaged:
             self.pull_at = min(self.pull_at, now + self._pause)
 
     def missing(self, now: float) -> LogRequest | None:
         """What to pull now, if anything."""
         if self.pulling:
             return None
-        if self.newest <= self.watermark:
+        if self.newest <= self.watermark and not self.damaged:
             self.pull_at = NEVER
             return None
         if self.pull_at == NEVER:
@@ -94,9 +97,16 @@ class AgentLog:
         if self.pull_at > now:
             return None
         self.pulling = True
+        if self.newest <= self.watermark:
+            _, first, last = self.damaged[0]
+            return LogRequest(first, min(last, first + self.chunk - 1))
         first = self.watermark + 1
         end = min((sequence - 1 for sequence in self.ahead), default=self.newest)
         return LogRequest(first, max(first, min(end, self.newest, first + self.chunk - 1)))
+
+    def was_damaged(self, sequence: int) -> bool:
+        """Whether a settled change was found damaged on the disk."""
+        return any(first <= sequence <= last for _, first, last in self.damaged)
 
     def pulled(self, now: float, *, gained: bool) -> None:
         """A pull is over. After one that gained nothing the pause doubles."""

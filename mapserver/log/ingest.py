@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from hybridmap.change import Change
-from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from hybridmap.node import MapId, check_name
 from mapserver.log.agent_log import NEVER, AgentLog, PullSettings
 from mapserver.log.entry import Entry
@@ -89,7 +89,7 @@ class Ingest:
             replay: called instead with all that is in the store at once, map by map.
 
         Raises:
-            InvalidFile: the store is damaged.
+            InvalidFile: the store cannot be read.
         """
         self._bus = bus
         self._keys = keys
@@ -115,8 +115,9 @@ class Ingest:
             watermark, log_id = self._store.watermark(map_id), self._store.log_id(map_id) or 0
             refusals = tuple(self._store.refusals(map_id))
             self._logs[map_id] = AgentLog(
-                map_id, log_id, self._settings.pull, watermark, watermark, refusals=refusals
-            )
+                map_id, log_id, self._settings.pull, watermark, watermark, refusals=refusals,
+                damaged=self._store.damaged(map_id),
+            )  # fmt: skip
         self._thread.start()
         self._declared = [
             self._bus.subscribe(self._keys.changes(), self._work.put),
@@ -225,11 +226,28 @@ class Ingest:
         one = self._logs[pulled.map]
         entries, covered = self._read_answer(one, pulled)
         self._count(pulled=len(entries))
-        gained = covered > one.watermark
+        first = pulled.asked.first
+        damaged = one.was_damaged(first)
+        gained = covered >= first if damaged else covered > one.watermark
         one.pulled(time.monotonic(), gained=gained)
-        if gained:
+        if gained and damaged:
+            self._restore(one, first, covered, entries)
+        elif gained:
             self._apply(one, entries, covered)
         return one
+
+    def _restore(self, one: AgentLog, first: int, covered: int, entries: list[Entry]) -> None:
+        """Put damaged changes in their places again and pass them on."""
+        try:
+            changes = self._store.restore(one.map, first, covered, entries)
+        except InvalidFile as error:
+            self._commit_failed(one, error)
+            return
+        self._failure = ""
+        one.damaged = self._store.damaged(one.map)
+        log.warning("changes %d to %d of %s are whole again", first, covered, one.map)
+        self._count(restored=len(entries))
+        self._pass_on(changes)
 
     def _read_answer(self, one: AgentLog, pulled: _Pulled) -> tuple[list[Entry], int]:
         """The changes that were pulled and how far they reach; (nothing, 0) if no answer is of use."""
@@ -274,25 +292,31 @@ class Ingest:
             applied = self._store.apply(one.map, one.log_id, entries, covered)
         except (InvalidFile, InvalidValue) as error:
             # Nothing is lost: it is not acknowledged, so the agent keeps it and it is pulled later.
-            one.commit_failed(time.monotonic(), self._settings.retry_interval)
-            self._count(failures=1)
-            if str(error) != self._failure:
-                log.error("%s", error)
-            self._failure = str(error)
+            self._commit_failed(one, error)
             return
         self._failure = ""
         one.settled(applied)
         for refusal in applied.refusals:
             log.warning("refused %s %d: %s", one.map, refusal.sequence, refusal.reason)
         self._count(applied=len(applied.changes), refused=len(applied.refusals))
-        for change in applied.changes:
+        self._pass_on(applied.changes)
+        # Last: a robot whose changes are acknowledged may ask at once what has become of them.
+        self._acknowledge(one)
+
+    def _commit_failed(self, one: AgentLog, error: MapweaveError) -> None:
+        one.commit_failed(time.monotonic(), self._settings.retry_interval)
+        self._count(failures=1)
+        if str(error) != self._failure:
+            log.error("%s", error)
+        self._failure = str(error)
+
+    def _pass_on(self, changes: Iterable[Change]) -> None:
+        for change in changes:
             try:
                 self._on_change(change)
             except Exception:
                 # The change is safe on the disk; whoever choked on it must not stop the other robots' logs.
                 log.exception("passing on %s %d failed", change.map, change.sequence)
-        # Last: a robot whose changes are acknowledged may ask at once what has become of them.
-        self._acknowledge(one)
 
     def _acknowledge(self, one: AgentLog) -> None:
         ack = Ack(one.map, one.log_id, one.watermark, one.refusals)

@@ -18,6 +18,7 @@ class IngestCounters:
         refused: changes that were refused for good.
         pulls: pieces of logs that were asked for.
         pulled: changes that came with them.
+        restored: changes that took the place of ones damaged on the disk.
         failures: commits that the disk did not take.
     """
 
@@ -29,6 +30,7 @@ class IngestCounters:
     refused: int = 0
     pulls: int = 0
     pulled: int = 0
+    restored: int = 0
     failures: int = 0
 
     def plus(self, **more: int) -> IngestCounters:

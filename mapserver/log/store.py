@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
-import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
-from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from hybridmap.node import Edge, EdgeId, MapId, NodeId
+from hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
+from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.node import MapId, NodeId
 from mapserver.log.entry import Applied, Entry, Position, Traffic
-from wire.codec import decode_body, element_of, encode_body, unwrap_body
+from mapserver.log.integrity import SCHEMA, Gap, insert, repair
+from wire.codec import decode_body, element_of, unwrap_body
 from wire.database import Database
 from wire.log_messages import Refusal
 
@@ -22,46 +22,29 @@ log = logging.getLogger(__name__)
 APPLICATION_ID = 0x4D575354
 """'MWST' in the file's header."""
 
-VERSION = 1
-SCHEMA = """
-CREATE TABLE log (
-    agent TEXT NOT NULL, epoch INTEGER NOT NULL, log_id TEXT NOT NULL, watermark INTEGER NOT NULL,
-    PRIMARY KEY (agent, epoch)
-) WITHOUT ROWID;
-CREATE TABLE change (
-    agent TEXT NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL, stamp_ns INTEGER NOT NULL,
-    kind TEXT NOT NULL, number INTEGER NOT NULL, wire_bytes INTEGER NOT NULL, body BLOB NOT NULL,
-    crc INTEGER NOT NULL, PRIMARY KEY (agent, epoch, sequence)
-) WITHOUT ROWID;
-CREATE TABLE node (
-    agent TEXT NOT NULL, epoch INTEGER NOT NULL, number INTEGER NOT NULL, landmarks INTEGER NOT NULL,
-    PRIMARY KEY (agent, epoch, number)
-) WITHOUT ROWID;
-CREATE TABLE refused (
-    agent TEXT NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL, reason TEXT NOT NULL,
-    message BLOB NOT NULL, PRIMARY KEY (agent, epoch, sequence)
-) WITHOUT ROWID;
-CREATE TABLE link (
-    agent TEXT NOT NULL, epoch INTEGER NOT NULL, number INTEGER NOT NULL, undone INTEGER NOT NULL,
-    body BLOB NOT NULL, PRIMARY KEY (agent, epoch, number)
-) WITHOUT ROWID;
-CREATE TABLE result (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID
-"""
-
+VERSION = 2
 READ_AT_ONCE = 256
+ADVICE = (
+    "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "
+    "again what they keep"
+)
+MAX_RULINGS = 10_000
+"""Made by hand, one by one."""
 
 
 class Store:
     """All logs in one SQLite file. Its methods may be called from any thread."""
 
     def __init__(self, path: Path) -> None:
-        """Open the store, or make one.
+        """Open the store, or make one. Rows that are damaged are taken out, see `damaged`.
 
         Raises:
-            InvalidFile: damaged, of another kind, or in use.
+            InvalidFile: damaged as a whole, of another kind, or in use.
         """
         self._lock = threading.RLock()
-        self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA)
+        self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA, repair, ADVICE)
+        for gap in self.damaged():
+            log.error("%s: %s", path, _words(gap))
 
     def maps(self) -> list[MapId]:
         """All maps of which something is known."""
@@ -118,7 +101,7 @@ class Store:
         refusals: list[Refusal] = []
         with self._lock, self._database.transaction() as rows:
             known = self.log_id(map_id)
-            if known is not None and known != log_id:
+            if known is not None and known != log_id and self.watermark(map_id) > 0:
                 raise InvalidValue(f"another log goes by the name {map_id}: begin a fresh map")
             watermark = self.watermark(map_id)
             for entry in entries:
@@ -126,43 +109,74 @@ class Store:
                     continue
                 if entry.sequence > watermark + 1 and covered is None:
                     break
-                reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
-                if isinstance(entry.change, str) or reason:
-                    refusals.append(Refusal(entry.sequence, reason))
-                    values = (*map_id, entry.sequence, reason, entry.message)
-                    rows.execute("INSERT INTO refused VALUES (?, ?, ?, ?, ?)", values)
-                else:
-                    changes.append(entry.change)
-                    self._insert(rows, entry, entry.change)
+                self._take(rows, map_id, entry, changes, refusals)
                 watermark = entry.sequence
             watermark = max(watermark, covered or 0)
-            rows.execute(
-                "INSERT INTO log VALUES (?, ?, ?, ?) ON CONFLICT (agent, epoch) "
-                "DO UPDATE SET watermark = excluded.watermark",
-                (*map_id, str(log_id), watermark),
-            )
+            insert(rows, "log", (*map_id, str(log_id), watermark))
         return Applied(tuple(changes), tuple(refusals), watermark)
 
-    def replay(self, map_id: MapId) -> Iterator[Change]:
-        """Every change that was taken, in order; without those that are out of bounds since then.
+    def replay(self, map_id: MapId, last: int = 0) -> Iterator[Change]:
+        """Every change behind `last` that was taken, in order.
 
-        Raises:
-            InvalidFile: a change is damaged.
+        Those that cannot be read, or are out of bounds since they were taken, are left out.
         """
         query = (
-            "SELECT sequence, stamp_ns, body, crc FROM change "
+            "SELECT sequence, stamp_ns, body FROM change "
             "WHERE agent = ? AND epoch = ? AND sequence > ? ORDER BY sequence LIMIT ?"
         )
-        last = 0
         while found := self._read(query, (*map_id, last, READ_AT_ONCE)):
-            for last, stamp_ns, body, crc in found:
-                if zlib.crc32(body) != crc:
-                    raise InvalidFile(f"{self._database.path}: change {last} of {map_id} is damaged")
+            for last, stamp_ns, body in found:
                 try:
                     yield Change(map_id, last, stamp_ns, decode_body(body))
                 except InvalidMessage as error:
-                    # An older program took it. It stays on the disk; the map is made without it.
-                    log.warning("change %d of %s in the store is left out: %s", last, map_id, error)
+                    log.error("change %d of %s cannot be read (%s); it is left out", last, map_id, error)
+
+    def damaged(self, map_id: MapId | None = None) -> list[Gap]:
+        """Changes that were found damaged and are not restored yet, of one map or of all."""
+        query = (
+            "SELECT agent, epoch, first, last FROM damaged WHERE ? IS NULL OR (agent = ? AND epoch = ?) "
+            "ORDER BY agent, epoch, first"
+        )
+        agent, epoch = map_id or (None, None)
+        rows = self._read(query, (agent, agent, epoch))
+        return [Gap(MapId(agent, epoch), first, last) for agent, epoch, first, last in rows]
+
+    def restore(self, map_id: MapId, first: int, covered: int, entries: Sequence[Entry]) -> Iterator[Change]:
+        """Put changes that were damaged in their places again, as the robot's log has them.
+
+        Args:
+            map_id: whose log.
+            first: of a damaged part.
+            covered: the robot has nothing else up to here.
+            entries: of this part.
+
+        Returns:
+            What makes the map whole in the order of its log: the restored changes, and those behind them if
+            one of these may undo a restored one.
+
+        Raises:
+            InvalidFile: the disk does not take it; nothing is restored.
+        """
+        changes: list[Change] = []
+        refusals: list[Refusal] = []
+        with self._lock, self._database.transaction() as rows:
+            for gap in self.damaged(map_id):
+                if gap.first <= first <= gap.last:
+                    rows.execute(
+                        "DELETE FROM damaged WHERE agent = ? AND epoch = ? AND first = ?",
+                        (*map_id, gap.first),
+                    )
+                    if gap.first < first:
+                        insert(rows, "damaged", (*map_id, gap.first, first - 1))
+                    if covered < gap.last:
+                        insert(rows, "damaged", (*map_id, covered + 1, gap.last))
+            for entry in entries:
+                self._take(rows, map_id, entry, changes, refusals)
+        for refusal in refusals:
+            log.warning("refused %s %d: %s", map_id, refusal.sequence, refusal.reason)
+        if any(self._may_undo(change) for change in changes):
+            return self.replay(map_id, changes[0].sequence - 1)
+        return iter(changes)
 
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""
@@ -189,28 +203,22 @@ class Store:
         nodes = self._read(count, (agent, agent, epoch))[0][0]
         return Traffic(nodes, node_puts, node_bytes, edge_puts, edge_bytes)
 
-    def put_link(self, edge: Edge) -> None:
-        """Keep an edge that the server itself has found; one that was undone is valid again.
+    def rulings(self) -> list[bytes]:
+        """What people have ruled, in order."""
+        return [bytes(body) for (body,) in self._read("SELECT body FROM ruling ORDER BY number")]
+
+    def add_ruling(self, body: bytes) -> None:
+        """Keep one more ruling.
 
         Raises:
-            InvalidValue: it cannot be encoded.
+            InvalidValue: there are too many.
             InvalidFile: the disk does not take it.
         """
-        encoded = encode_body(EdgePut(edge))
         with self._lock, self._database.transaction() as rows:
-            rows.execute("INSERT OR REPLACE INTO link VALUES (?, ?, ?, 0, ?)", (*edge.id, encoded))
-
-    def undo_link(self, link: EdgeId) -> bool:
-        """Mark a link as undone; it stays on the disk. False if there is no such link in force."""
-        with self._lock, self._database.transaction() as rows:
-            query = "UPDATE link SET undone = 1 WHERE agent = ? AND epoch = ? AND number = ? AND NOT undone"
-            return rows.execute(query, link).rowcount > 0
-
-    def links(self, *, undone: bool = False) -> list[Edge]:
-        """The server's own links that are in force, or those that were undone."""
-        query = "SELECT body FROM link WHERE undone = ? ORDER BY agent, epoch, number"
-        bodies = [decode_body(body) for (body,) in self._read(query, (undone,))]
-        return [body.edge for body in bodies if isinstance(body, EdgePut)]
+            count, newest = rows.execute("SELECT count(*), coalesce(max(number), 0) FROM ruling").fetchone()
+            if count >= MAX_RULINGS:
+                raise InvalidValue(f"the record of rulings is full: {MAX_RULINGS}")
+            insert(rows, "ruling", (newest + 1, body))
 
     def put_result(self, name: str, value: bytes) -> None:
         """Keep something else that the server has worked out.
@@ -219,7 +227,7 @@ class Store:
             InvalidFile: the disk does not take it.
         """
         with self._lock, self._database.transaction() as rows:
-            rows.execute("INSERT OR REPLACE INTO result VALUES (?, ?)", (name, value))
+            insert(rows, "result", (name, value))
 
     def result(self, name: str) -> bytes | None:
         """What was kept under this name."""
@@ -231,16 +239,43 @@ class Store:
         with self._lock:
             self._database.close()
 
+    def _take(
+        self, rows: Any, map_id: MapId, entry: Entry, changes: list[Change], refusals: list[Refusal]
+    ) -> None:
+        """Keep a change, or keep it aside with the reason."""
+        reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
+        if isinstance(entry.change, str) or reason:
+            refusals.append(Refusal(entry.sequence, reason))
+            insert(rows, "refused", (*map_id, entry.sequence, reason, entry.message))
+        else:
+            changes.append(entry.change)
+            self._insert(rows, entry, entry.change)
+
     def _insert(self, rows: Any, entry: Entry, change: Change) -> None:
         _, stamp_ns, body = unwrap_body(entry.message)
         kind, number = type(change.body).__name__, element_of(change.body).number
-        rows.execute(
-            "INSERT INTO change VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*change.map, entry.sequence, stamp_ns, kind, number, len(entry.message), body, zlib.crc32(body)),
+        values = (*change.map, entry.sequence, stamp_ns, kind, number, len(entry.message), body)
+        insert(rows, "change", values)
+        later = (
+            "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND sequence > ? AND number = ? AND kind = ?"
         )
-        if isinstance(change.body, NodePut):
-            count = len(change.body.node.landmarks)
-            rows.execute("INSERT OR REPLACE INTO node VALUES (?, ?, ?, ?)", (*change.map, number, count))
+        if (
+            isinstance(change.body, NodePut)
+            and not rows.execute(later, (*change.map, entry.sequence, number, kind)).fetchone()
+        ):
+            insert(rows, "node", (*change.map, number, len(change.body.node.landmarks)))
+
+    def _may_undo(self, change: Change) -> bool:
+        """Whether the log goes on behind a change with something that depends on its place in the order."""
+        if not isinstance(change.body, NodePut | EdgePut):
+            return True
+        query = (
+            "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND sequence > ? "
+            "AND (number = ? OR kind IN (?, ?)) LIMIT 1"
+        )
+        retired = (NodeRetired.__name__, EdgeRetired.__name__)
+        number = element_of(change.body).number
+        return bool(self._read(query, (*change.map, change.sequence, number, *retired)))
 
     def _objection(self, change: Change) -> str:
         """Why a change that decodes still cannot be taken; empty if it can."""
@@ -260,3 +295,8 @@ class Store:
     def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
         with self._lock, self._database.guard():
             return self._database.connection.execute(query, values).fetchall()
+
+
+def _words(gap: Gap) -> str:
+    changes = f"change {gap.first}" if gap.first == gap.last else f"changes {gap.first} to {gap.last}"
+    return f"{changes} of {gap.map}: damaged, and left out until {gap.map.agent} sends them again"

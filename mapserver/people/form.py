@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
-import tomllib
+import re
 from email.message import Message
-from email.parser import BytesHeaderParser
 from typing import Any
 
 from hybridmap.errors import InvalidValue
 from mapserver.people.photo import Photo
 
 MOST_PARTS = 32
-LONGEST_FIELD = 65536
+LONGEST_FIELD = 4096
+LONGEST_CAMERA = 4096
+"""Bytes. A camera.toml has about 200."""
+LONGEST_HEAD = 2048
+LONGEST_TYPE = 256
+NAME = re.compile(rb'(?:^|;)[ \t]*name="?([^";\r\n]{1,64})"?[ \t]*(?=;|$)')
+"""Parameter of a part's Content-Disposition, as browsers and curl write it."""
 
 
 def read_photo(content_type: str, body: bytes, query: dict[str, str]) -> Photo:
@@ -30,6 +35,8 @@ def read_photo(content_type: str, body: bytes, query: dict[str, str]) -> Photo:
     Raises:
         InvalidValue: it is no such form.
     """
+    if len(content_type) > LONGEST_TYPE:
+        raise InvalidValue("Content-Type is too long")
     header = Message()
     header["Content-Type"] = content_type or "application/octet-stream"
     if header.get_content_type() != "multipart/form-data":
@@ -41,7 +48,7 @@ def read_photo(content_type: str, body: bytes, query: dict[str, str]) -> Photo:
     image = parts.pop("image", None)
     if image is None:
         raise InvalidValue("the form has no part named image")
-    optics: dict[str, Any] = _camera(parts.pop("camera")) if "camera" in parts else {}
+    optics: dict[str, Any] = camera_values(parts.pop("camera")) if "camera" in parts else {}
     for name, value in parts.items():
         optics[name] = _text(name, value)
     return Photo(image, {**optics, **query})
@@ -57,21 +64,37 @@ def _parts(body: bytes, boundary: bytes) -> dict[str, bytes]:
         raise InvalidValue(f"the form has more than {MOST_PARTS} parts")
     for piece in pieces[1:-1]:
         head, found, content = piece.partition(b"\r\n\r\n")
-        headers = BytesHeaderParser().parsebytes(head.lstrip(b"\r\n"))
-        name = headers.get_param("name", header="content-disposition")
-        if not found or not isinstance(name, str):
+        lines = head[:LONGEST_HEAD].split(b"\r\n") if found else []
+        named = [line for line in lines if line.lower().startswith(b"content-disposition:")]
+        name = NAME.search(named[0].partition(b";")[2]) if named and len(head) <= LONGEST_HEAD else None
+        if name is None:
             raise InvalidValue("a part of the form has no name")
-        parts[name] = content
+        parts[name[1].decode("utf-8", errors="replace")] = content
     return parts
 
 
-def _camera(data: bytes) -> dict[str, Any]:
-    text = _text("camera", data)
-    try:
-        values = json.loads(text) if text.lstrip().startswith("{") else tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InvalidValue(f"camera is neither TOML nor JSON: {error}") from None
-    return dict(values)
+def camera_values(data: bytes) -> dict[str, Any]:
+    """What a camera.toml, or the same as JSON, says of a camera. Both are flat: a name and a value a line.
+
+    Raises:
+        InvalidValue: it is too long, or neither.
+    """
+    if len(data) > LONGEST_CAMERA:
+        raise InvalidValue(f"camera has {len(data)} bytes, at most {LONGEST_CAMERA} are read")
+    text = data.decode("utf-8", errors="replace").lstrip("\ufeff")
+    if text.lstrip().startswith("{"):
+        try:
+            return dict(json.loads(text))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise InvalidValue(f"camera is neither TOML nor JSON: {error}") from None
+    values: dict[str, Any] = {}
+    for line in text.splitlines():
+        if words := line.partition("#")[0].strip():
+            name, _, value = (word.strip() for word in words.partition("="))
+            if not value or not name.isidentifier():
+                raise InvalidValue(f"camera is neither TOML nor JSON: {words[:40]!r} is no name = number")
+            values[name] = value.removeprefix("[").removesuffix("]").strip(" ,")
+    return values
 
 
 def _text(name: str, data: bytes) -> str:

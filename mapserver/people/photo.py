@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from agent.drivers.image_file import check_cost, decode_grey
 from agent.observation import RobotDescription
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
@@ -18,8 +18,6 @@ from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.query import View
 
-MOST_PIXELS = 50_000_000
-"""Larger images are refused before they are decoded; phones take up to 50 megapixels."""
 LONG_SIDE = 1024
 """Larger images are made so small, px: a robot's image shows things no larger than that."""
 LONG_SIDE_FOV = math.radians(69.4)
@@ -50,11 +48,7 @@ class Photo:
         Raises:
             InvalidValue: it is neither JPEG nor PNG, or too large.
         """
-        width, height = image_size(self.data)
-        if width * height > MOST_PIXELS:
-            raise InvalidValue(
-                f"an image of {width}x{height} px is too large, at most {MOST_PIXELS} are taken"
-            )
+        check_cost(self.data)
 
     def view(self) -> View:
         """Its features.
@@ -62,18 +56,16 @@ class Photo:
         Raises:
             InvalidValue: it cannot be decoded, or its camera cannot be.
         """
-        self.check()
-        image = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise InvalidValue("the image is damaged")
+        image = decode_grey(self.data)
         # A phone notes in the file how it was held; the decoded image is upright.
         camera, distortion = camera_of(self.optics, image.shape[1], image.shape[0])
         scale = min(LONG_SIDE / max(image.shape), 1.0)
         if scale < 1.0:
             camera = scaled(camera, scale)
-            image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+            small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+            image = np.asarray(small, np.uint8)
         sift = Sift(Lens(RobotDescription(camera, distortion)))
-        return sift.extract(np.asarray(image, np.uint8)).view(camera)
+        return sift.extract(image).view(camera)
 
 
 def camera_of(
@@ -121,26 +113,6 @@ def scaled(camera: Camera, scale: float) -> Camera:
         width, height, x * camera.fx, y * camera.fy, x * (camera.cx + 0.5) - 0.5, y * (camera.cy + 0.5) - 0.5,
         camera.mount_height, camera.mount_forward,
     )  # fmt: skip
-
-
-def image_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a PNG or JPEG file, px, from its head alone.
-
-    Raises:
-        InvalidValue: it is neither.
-    """
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
-        width, height = struct.unpack(">II", data[16:24])
-        return width, height
-    at = 2 if data.startswith(b"\xff\xd8") else len(data)
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        kind = data[at + 1]
-        # Start of frame, except the tables that have numbers in between.
-        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        at += 1 if kind == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    raise InvalidValue("send a JPEG or PNG image")
 
 
 def _number(name: str, value: Any) -> float:

@@ -38,6 +38,7 @@ from mapserver.people.answer_json import answer_record
 from mapserver.people.explanation_json import explanation_record, history_record
 from mapserver.people.form import read_photo
 from mapserver.people.page import PAGE
+from mapserver.people.same_site import check_site, own_names
 from mapserver.people.why_page import WHY_PAGE
 from wire.explanation_messages import ExplainRequest
 from wire.log_messages import Scalar
@@ -138,6 +139,7 @@ class _Server(ThreadingHTTPServer):
             self.address_family = socket.AF_INET6
         super().__init__(address, _Handler)
         self.server = server
+        self.names = own_names(address[0])
         self.places = threading.BoundedSemaphore(MOST_AT_ONCE)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -156,6 +158,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """The pages, the status, why maps are one, and why routes lead so."""
+        if self._is_foreign():
+            return
         address = urlsplit(self.path)
         if address.path in PAGES:
             self._send(HTTPStatus.OK, PAGES[address.path].encode(), "text/html; charset=utf-8")
@@ -171,6 +175,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Where was this taken?"""
+        if self._is_foreign():
+            return
         address = urlsplit(self.path)
         if address.path != "/relocalize":
             self._no_such(address.path)
@@ -181,12 +187,36 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(lambda: self._relocalize(length, query))
 
     def _relocalize(self, length: int, query: dict[str, str]) -> Mapping[str, Any]:
-        body = self.rfile.read(length)
+        body = self._read(length)
         if len(body) < length:
             raise InvalidValue(f"only {len(body)} of {length} bytes came")
         photo = read_photo(self.headers.get("Content-Type", ""), body, query)
         photo.check()
         return answer_record(self._web.server.locate(photo.view, hash(photo.data)).result(PATIENCE))
+
+    def _read(self, length: int) -> bytes:
+        """The body; the time that it may take is one for all of it."""
+        end = time.monotonic() + self.timeout
+        body = bytearray()
+        while len(body) < length:
+            left = end - time.monotonic()
+            if left <= 0.0:
+                raise TimeoutError
+            self.connection.settimeout(left)
+            piece = self.rfile.read1(min(length - len(body), 1 << 18))
+            if not piece:
+                break
+            body += piece
+        return bytes(body)
+
+    def _is_foreign(self) -> bool:
+        """Whether another site's page asks; it is told so."""
+        try:
+            check_site(self.headers.get("Host"), self.headers.get("Origin"), self._web.names)
+        except InvalidValue as error:
+            self.send_error(HTTPStatus.FORBIDDEN, str(error))
+            return True
+        return False
 
     def _explain(self, path: str, query: dict[str, str]) -> Mapping[str, Any]:
         ends, route = None, path == "/route"

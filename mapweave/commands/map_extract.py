@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write them, and say which; 1 if something of a map could not be read."""
     from mapweave.map_extraction import extract_maps
 
-    maps = extract_maps(arguments.source, arguments.out)
+    maps, lost = extract_maps(arguments.source, arguments.out)
     if arguments.json:
         rows = [
             {
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
             }
             for one in maps
         ]  # fmt: skip
-        print(json.dumps({"maps": rows}))
+        print(json.dumps({"maps": rows, "lost": lost}))
     else:
         for one in maps:
             content = f"{one.nodes} nodes, {one.edges} edges" if one.path else "empty, not written"
@@ -49,4 +49,6 @@ def run(arguments: argparse.Namespace) -> int:
     for one in maps:
         if one.complaint:
             print(f"mapweave: {one.complaint}", file=sys.stderr)
-    return int(any(one.complaint for one in maps))
+    if lost:
+        print(f"mapweave: {lost}", file=sys.stderr)
+    return int(bool(lost) or any(one.complaint for one in maps))

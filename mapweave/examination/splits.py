@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 from hybridmap.errors import DeviceError
+from wire.whole_file import read_whole
 
 
 def robots_of(path: Path) -> list[str]:
@@ -15,6 +16,9 @@ def robots_of(path: Path) -> list[str]:
         DeviceError: it cannot be read.
     """
     try:
-        return [str(robot["name"]) for robot in tomllib.loads(path.read_text(encoding="utf-8"))["robot"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DeviceError(f"{path}: {type(error).__name__}: {error}") from None
+        robots = tomllib.loads(read_whole(path).decode("utf-8")).get("robot", [])
+        return [str(robot["name"]) for robot in robots]
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    except (KeyError, TypeError):
+        raise DeviceError(f"{path}: write a [[robot]] table with a name for each robot") from None

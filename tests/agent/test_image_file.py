@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+import struct
+import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from agent.drivers.image_file import read_grey
+from agent.drivers.image_file import decode_grey, image_size, read_grey
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError
 
@@ -52,3 +55,39 @@ def test_an_image_of_another_camera_is_refused(tmp_path):
     assert read_grey(path).shape == (48, 60)
     with pytest.raises(DeviceError, match=re.escape(f"{path}: 60x48 px, but camera.toml says 64x48")):
         read_grey(path, CAMERA, "camera.toml")
+
+
+def png(width: int, height: int) -> bytes:
+    """A whole and valid PNG of zeros, which compress a thousandfold."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    packer, row = zlib.compressobj(9), bytes(width + 1)
+    packed = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+
+
+def test_a_bomb_in_a_recording_is_not_decoded(tmp_path, monkeypatch):
+    path = tmp_path / "1.png"
+    path.write_bytes(png(20_000, 2_600))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(
+        DeviceError, match="an image of 20000x2600 px is too large, at most 50000000 are taken"
+    ):
+        read_grey(path, CAMERA)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".pgm", ".bmp"])
+@pytest.mark.parametrize("size", [(48, 64), (5, 3)])
+def test_the_size_is_read_from_the_head(size, suffix):
+    grey = np.random.default_rng(0).integers(0, 255, size).astype(np.uint8)
+    data = cv2.imencode(suffix, grey)[1].tobytes()
+    assert image_size(data) == size[::-1]
+    assert decode_grey(data).shape == size
+
+
+def test_a_device_is_no_image():
+    with pytest.raises(DeviceError, match="/dev/zero: not an image"):
+        read_grey(Path("/dev/zero"))

@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.errors import InvalidFile, InvalidValue
+from hybridmap.errors import InvalidValue
 from hybridmap.explanation import MapsExplanation, RouteExplanation, Standing
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
@@ -303,9 +303,10 @@ def test_witnesses_are_held_to_the_gate_of_the_merge(path: Path) -> None:
     bus.close()
 
 
-def test_a_damaged_record_of_rulings_is_said(path: Path) -> None:
+def test_a_ruling_that_cannot_be_read_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = Store(path)
-    store.put_result("rulings", b"rubbish")
-    with pytest.raises(InvalidFile, match="record of rulings is damaged"):
-        RulingBook(store)
+    store.add_ruling(b"rubbish")
+    RulingBook(store).add(Ruling((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
+    assert [ruling.who for ruling in RulingBook(store).rulings.made] == ["anna"]
+    assert "a ruling cannot be read" in caplog.text
     store.close()

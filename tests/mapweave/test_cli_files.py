@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from hybridmap.camera import Camera
+from hybridmap.change import EdgePut, NodePut
+from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
 from mapweave.cli import main
 from tests.mapweave.command_line import complaint
 from wire.mapfile import MapFile, write_map_file
@@ -27,6 +34,39 @@ def test_map_files(tmp_path, capfd):
     assert "is truncated" in complaint(capfd, "map", "show", path)
     path.write_bytes(whole[:20] + b"\0" + whole[21:])
     assert "is damaged" in complaint(capfd, "map", "show", path)
+
+
+@pytest.mark.parametrize("pipe", [False, True])
+def test_what_has_no_end_is_not_read(tmp_path, capfd, pipe):
+    path = tmp_path / "pipe" if pipe else Path("/dev/zero")
+    if pipe:
+        os.mkfifo(path)
+    for command in (
+        ("map", "show", path), ("map", "export", path, "--to", "tum", "-o", tmp_path / "x"),
+        ("map", "merge", path, "-o", tmp_path / "x"), ("map", "import", path, "-o", tmp_path / "x"),
+        ("server", "--settings", path),
+    ):  # fmt: skip
+        assert "not a regular file" in complaint(capfd, *command)
+
+
+def test_a_map_that_cannot_be_solved(tmp_path, capfd):
+    """The covariances of one robot's edges contradict its nodes so that the posture of one has none."""
+    bodies = []
+    for number in (1, 3, 5):
+        here = PoseGaussian(Pose2(number, 0, 0), np.eye(3) * 1e-4)
+        camera = Camera(160, 120, 150, 150, 80, 60, 0.3)
+        nothing = Landmarks.empty()
+        bodies.append(NodePut(Node(NodeId("r0", 1, number), 0, here, camera, nothing)))
+    v = np.array([1.0, -2.0, 0.5])
+    for a, b in ((1, 3), (3, 5)):
+        moved = PoseGaussian(Pose2(2, 0, 0), np.outer(v, v) * 1e11)
+        ends = NodeId("r0", 1, a), NodeId("r0", 1, b)
+        bodies.append(EdgePut(Edge(NodeId("r0", 1, a + 1), *ends, moved, EdgeKind.MAPPED)))
+    path = tmp_path / "odd.mapweave"
+    write_map_file(path, MapFile("agent", "r0.1", tuple(bodies)))
+    assert "cannot be solved" in complaint(
+        capfd, "map", "export", path, "--to", "g2o", "-o", tmp_path / "map.g2o"
+    )
 
 
 def test_settings(tmp_path, capfd, recording):

@@ -20,7 +20,7 @@ from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplana
 from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
-from hybridmap.ruling import Ruling, Rulings
+from hybridmap.ruling import Ruling
 from wire.codec import decode_body, decode_change, encode_body, encode_change
 from wire.explanation_messages import (
     ExplainRequest,
@@ -60,8 +60,8 @@ from wire.messages import (
     encode_route_request,
     encode_view,
 )
+from wire.packing import _exceeds
 from wire.posture_messages import MergedPosture, PostureNews
-from wire.ruling_codec import decode_rulings, encode_rulings
 
 Decoder = Callable[[bytes], object]
 
@@ -122,7 +122,6 @@ def explanations(some: SimpleNamespace, a: Node, posture: PoseGaussian) -> list[
         (decode_maps, encode_maps((maps,))),
         (decode_explain_request, encode_explain_request(ExplainRequest((one, two)))),
         (decode_ruling, encode_ruling(ruling)),
-        (decode_rulings, encode_rulings(Rulings([ruling]))),
     ]
 
 
@@ -218,6 +217,49 @@ def test_a_claim_of_gigabytes_allocates_nothing(some: SimpleNamespace, bomb: byt
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 1_000_000
+
+
+SMALL = (b"\x90", b"\x80", b"\x91\x90", b"\xa0", b"\x01", b"\xc4\x00", b"\x81\xa0\x90")
+
+
+@pytest.mark.parametrize("small", SMALL, ids=bytes.hex)
+@pytest.mark.parametrize("outer", ["field", "unknown", "nested"])
+def test_small_values_in_a_large_message_cost_no_memory(
+    some: SimpleNamespace, small: bytes, outer: str
+) -> None:
+    """A message as long as its kind allows, full of the smallest values, is refused before they are made."""
+    for decode, length in (
+        (LogAnswer.decode, 31_000_000), (decode_route_answer, 8_000_000), (decode_change, 100_000),
+        (decode_relocalize_answer, 36_000), (Head.decode, 65_000), (decode_record, 65_000),
+    ):  # fmt: skip
+        count = length // len(small) - 10
+        name = {"field": "c", "unknown": "zz", "nested": "w"}[outer].encode()
+        bomb = b"\x82\xa1v\x01" + bytes([0xA0 + len(name)]) + name
+        bomb += b"\x91\x91" if outer == "nested" else b""
+        bomb += b"\xdd" + count.to_bytes(4, "big") + small * count
+        tracemalloc.start()
+        with pytest.raises(InvalidMessage, match="more than 4096 values"):
+            decode(bomb)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 1_000_000
+
+
+@given(st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text()
+    | st.binary(max_size=300),
+    lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=40), inner, max_size=20),
+    max_leaves=60,
+))  # fmt: skip
+def test_values_are_counted_as_they_are(value: object) -> None:
+    def count(one: object) -> int:
+        if isinstance(one, dict):
+            return 1 + sum(1 + count(inner) for inner in one.values())
+        return 1 + sum(map(count, one)) if isinstance(one, list) else 1
+
+    data, values = msgpack.packb(value), count(value)
+    assert not _exceeds(data, values)
+    assert _exceeds(data, values - 1) or values == 1
 
 
 def test_too_long_is_refused_before_it_is_looked_at(some: SimpleNamespace) -> None:

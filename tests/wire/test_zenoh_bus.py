@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import time
@@ -52,6 +53,33 @@ def test_a_taken_port_is_one_clear_line() -> None:
         assert endpoints[0] in str(error.value)
     finally:
         first.close()
+
+
+def test_idle_connections_keep_nobody_out() -> None:
+    port = free_port()
+    endpoints = (f"tcp/127.0.0.1:{port}",)
+    router = ZenohBus(BusSettings(mode="router", listen=endpoints))
+    idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(150)]
+    client = ZenohBus(BusSettings(endpoints=endpoints))
+    try:
+        # With Zenoh's own limits it takes 10 s.
+        assert client.wait_connected(5.0)
+        # Who says nothing is dropped.
+        eventually(lambda: all(_is_closed(one) for one in idle))
+    finally:
+        client.close()
+        for one in idle:
+            one.close()
+        router.close()
+
+
+def _is_closed(connection: socket.socket) -> bool:
+    try:
+        return connection.recv(1, socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
 
 
 @pytest.mark.parametrize("declaring_thread_is_daemon", [False, True])

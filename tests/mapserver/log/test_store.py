@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import sqlite3
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgpack
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -205,23 +202,6 @@ def test_what_the_maps_cost_on_the_wire(store: Store) -> None:
     assert store.traffic().payload_bytes == sum(sizes) + len(other)
 
 
-def test_links_can_be_undone_and_made_again(path: Path, store: Store) -> None:
-    links = [edge_put(k, 1, 2).edge for k in (1, 2)]
-    for link in links:
-        store.put_link(link)
-    assert [link.id for link in store.links()] == [link.id for link in links]
-    assert store.undo_link(links[0].id)
-    assert not store.undo_link(links[0].id)
-    assert not store.undo_link(NodeId("r9", 1, 1))
-    store.close()
-    again = Store(path)
-    assert [link.id for link in again.links()] == [links[1].id]
-    assert [link.id for link in again.links(undone=True)] == [links[0].id]
-    again.put_link(links[0])
-    assert len(again.links()) == 2
-    again.close()
-
-
 def test_results_are_kept_by_name(store: Store) -> None:
     assert store.result("postures") is None
     store.put_result("postures", b"1")
@@ -235,37 +215,3 @@ def test_a_journal_is_no_store(tmp_path: Path) -> None:
     Journal(tmp_path / "j", "r0").close()
     with pytest.raises(InvalidFile, match="is not a Mapweave map store"):
         Store(tmp_path / "j")
-
-
-def test_a_damaged_change_is_found(path: Path, store: Store) -> None:
-    store.apply(MAP, 5, [entry(1), entry(2)])
-    store.close()
-    other = sqlite3.connect(path)
-    other.execute("UPDATE change SET crc = crc + 1 WHERE sequence = 2")
-    other.commit()
-    other.close()
-    store = Store(path)
-    replay = store.replay(MAP)
-    assert next(replay).sequence == 1
-    with pytest.raises(InvalidFile, match=r"change 2 of r0\.1 is damaged"):
-        next(replay)
-    store.close()
-
-
-def test_what_an_older_program_took_and_is_out_of_bounds_now_is_left_out(
-    path: Path, store: Store, caplog: pytest.LogCaptureFixture
-) -> None:
-    store.apply(MAP, 5, [entry(1, node_put(1)), entry(2, edge_put(3, 1, 2)), entry(3, node_put(2))])
-    store.close()
-    # The edge's evidence, as version 0.9 took it.
-    fields = msgpack.unpackb(encode_body(edge_put(3, 1, 2))) | {"x": {"inliers": 9e29}}
-    body = msgpack.packb(fields)
-    rows = sqlite3.connect(path)
-    with rows:
-        rows.execute("UPDATE change SET body = ?, crc = ? WHERE sequence = 2", (body, zlib.crc32(body)))
-    rows.close()
-    again = Store(path)
-    assert [change.sequence for change in again.replay(MAP)] == [1, 3]
-    assert again.watermark(MAP) == 3
-    assert "change 2 of r0.1 in the store is left out" in caplog.text and "inliers" in caplog.text
-    again.close()

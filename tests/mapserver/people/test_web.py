@@ -8,6 +8,7 @@ import math
 import socket
 import struct
 import time
+import tracemalloc
 import zlib
 from collections.abc import Iterator
 
@@ -155,6 +156,9 @@ def huge_png() -> bytes:
         (b"no image", "send a JPEG or PNG image"),
         (b"\xff\xd8", "send a JPEG or PNG image"),
         (b"\xff\xd8\xff\xff\xff\xe0\x00\x00" * 9, "send a JPEG or PNG image"),
+        (b"\xff\xd8" + b"\xff\xe0\x00\x02" * 1_000_000, "send a JPEG or PNG image"),
+        (b"\xff\xd8" + b"\xff" * 5_000_000, "send a JPEG or PNG image"),
+        (picture(kind=".jpg") + b"\xff\xda" * 20, "more than 20 scans"),
         (picture()[:60], "the image is damaged"),
         (huge_png(), "an image of 100000x100000 px is too large"),
         (picture(8, 8), "camera: image size 8x8 is out of range"),
@@ -177,7 +181,7 @@ def test_images_that_are_none(served: Web, body: bytes, words: str) -> None:
         (b"--b\r\n\r\nx\r\n--b--", "multipart/form-data; boundary=b", "a part of the form has no name"),
         (form(("image", b"x"), ("camera", b"fx = "))[0], form()[1]["Content-Type"], "neither TOML nor JSON"),
         (
-            form(("image", b"x"), ("camera", b"{" * 9999))[0],
+            form(("image", b"x"), ("camera", b"{" * 4000))[0],
             form()[1]["Content-Type"],
             "neither TOML nor JSON",
         ),
@@ -188,6 +192,90 @@ def test_forms_that_are_none(served: Web, body: bytes, content_type: str, words:
     status, answer = post(served, body=body or b"x", **{"Content-Type": content_type})
     assert status == 400
     assert words in answer["error"]
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        b"a" + b".a" * 30_000 + b"=1",
+        b"[" * 60_000,
+        b"fx = [" * 10_000,
+        b'{"fx": ' * 9_000,
+        b"fx = 1\n" * 9_000,
+    ],
+    ids=["dots", "brackets", "open-lists", "deep-json", "many-lines"],
+)
+def test_a_camera_costs_next_to_nothing(served: Web, camera: bytes) -> None:
+    body, headers = form(("image", picture()), ("camera", camera))
+    tracemalloc.start()
+    begin = time.monotonic()
+    status, answer = post(served, body=body, **headers)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert (status, answer["error"]) == (400, f"camera has {len(camera)} bytes, at most 4096 are read")
+    assert peak < 2_000_000 and time.monotonic() < begin + 5.0
+
+
+@pytest.mark.parametrize(
+    "camera", [b"a" + b".a" * 2_000 + b" = 1", b"fx = {a = 1}", b"[camera]\nfx = 1", b"fx\n"]
+)
+def test_a_camera_is_flat(served: Web, camera: bytes) -> None:
+    body, headers = form(("image", picture()), ("camera", camera))
+    status, answer = post(served, body=body, **headers)
+    assert status == 400 and (
+        "neither TOML nor JSON" in answer["error"] or "must be a number" in answer["error"]
+    )
+
+
+def test_a_camera_with_remarks(served: Web, desk: Desk) -> None:
+    toml = b"# phone\r\nfx = 99.0  # px\n\nfy = 1_00\ndistortion = [0.1, -2e-2, 0, 0, 0,]\n"
+    body, headers = form(("image", picture()), ("camera", toml))
+    assert post(served, body=body, **headers)[0] == 200
+    assert (desk.views[-1].camera.fx, desk.views[-1].camera.fy) == (99.0, 100.0)
+
+
+def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
+    head = b'--b\r\nContent-Disposition: form-data; name="image"' + b"; a*0=b" * 100_000
+    begin = time.monotonic()
+    status, _ = post(
+        served, body=head + b"\r\n\r\nx\r\n--b--", **{"Content-Type": "multipart/form-data; boundary=b"}
+    )
+    assert status == 400 and time.monotonic() < begin + 2.0
+
+
+@pytest.mark.parametrize(
+    ("headers", "words"),
+    [
+        ({"Host": "evil.example"}, "this server is not 'evil.example'"),
+        ({"Host": "evil.example:8080"}, "this server is not 'evil.example:8080'"),
+        ({"Host": "127.0.0.1.evil.example"}, "this server is not"),
+        ({"Host": ""}, "this server is not 'named'"),
+        ({"Origin": "https://evil.example"}, "pages of 'https://evil.example' may not ask here"),
+        ({"Origin": "null"}, "pages of 'null' may not ask here"),
+        ({"Host": "127.0.0.1:1", "Origin": "http://127.0.0.1:2"}, "pages of 'http://127.0.0.1:2'"),
+    ],
+)
+def test_pages_of_other_sites_are_refused(
+    served: Web, desk: Desk, headers: dict[str, str], words: str
+) -> None:
+    status, answer = post(served, **headers)
+    assert status == 403 and words in answer["error"]
+    assert not desk.views
+    for path in ("/", "/why", "/status", "/history", "/explain", "/nothing"):
+        status, _, content = ask(served, "GET", path, headers=headers)
+        assert status == 403 and words in json.loads(content)["error"]
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost", "LOCALHOST:8080", "127.0.0.1", "[::1]:8080", socket.gethostname()]
+)
+def test_own_pages_ask_by_any_name_of_this_machine(served: Web, host: str) -> None:
+    for headers in (
+        {"Host": host},
+        {"Host": host, "Origin": f"http://{host}"},
+        {"Host": host, "Origin": f"https://{host}"},
+    ):
+        assert post(served, **headers)[0] == 200
 
 
 def test_a_busy_server_says_when_to_come_again(served: Web, desk: Desk) -> None:
@@ -253,7 +341,7 @@ def raw(served: Web, data: bytes, close: bool = False) -> bytes:
     ],
 )
 def test_lengths_that_are_refused_before_anything_is_read(served: Web, head: bytes, status: bytes) -> None:
-    got = raw(served, b"POST /relocalize HTTP/1.1\r\nHost: x\r\n" + head + b"\r\n")
+    got = raw(served, b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\n")
     assert got.startswith(b"HTTP/1.1 " + status)
     assert b'{"error": ' in got
     assert got.count(b"HTTP/1.1") == 1
@@ -265,7 +353,7 @@ def test_a_body_that_is_too_long_gets_its_answer_all_the_same(served: Web) -> No
 
 
 def test_who_hangs_up_or_dawdles_holds_up_nobody(served: Web, monkeypatch: pytest.MonkeyPatch) -> None:
-    half = b"POST /relocalize HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\nabc"
+    half = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
     assert b"only 3 of 1000 bytes came" in raw(served, half, close=True)
     monkeypatch.setattr(web._Handler, "timeout", 0.2)
     slow = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(web.MOST_AT_ONCE)]
@@ -280,6 +368,24 @@ def test_who_hangs_up_or_dawdles_holds_up_nobody(served: Web, monkeypatch: pytes
     assert slow[0].recv(65536).startswith(b"HTTP/1.1 408")
     for connection in slow:
         connection.close()
+
+
+def test_a_byte_now_and_then_takes_no_longer_than_anything_else(
+    served: Web, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web._Handler, "timeout", 0.5)
+    with socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow:
+        slow.sendall(b"POST /relocalize HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1000\r\n\r\n")
+        begin = time.monotonic()
+        slow.settimeout(0.1)
+        while time.monotonic() < begin + 10.0:
+            try:
+                slow.sendall(b"x")
+                if slow.recv(100).startswith(b"HTTP/1.1 408"):
+                    break
+            except TimeoutError:
+                continue
+        assert time.monotonic() < begin + 5.0
 
 
 def test_noise_instead_of_http(served: Web) -> None:

@@ -1,0 +1,418 @@
+"""Flipped bits in the store: the server starts, says what is lost, and robots make the store whole again."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agent.sharing.journal import Draft, Journal
+from agent.sharing.replication import ReplicationSettings, Replicator
+from hybridmap.camera import Camera
+from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from hybridmap.errors import InvalidFile, InvalidValue
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.ruling import Ruling
+from mapserver.explainer import RulingBook
+from mapserver.log import store as store_module
+from mapserver.log.agent_log import PullSettings
+from mapserver.log.ingest import Ingest, IngestSettings
+from mapserver.log.integrity import checksum
+from mapserver.log.store import Store
+from mapweave.cli import main
+from tests.waiting import eventually, free_port
+from wire.codec import encode_body, encode_change
+from wire.keys import Keys
+from wire.mapfile import read_map_file
+from wire.memory import MemoryBus, MemoryHub
+
+KEYS = Keys("fleet")
+AGENT = ReplicationSettings(beacon_interval=0.02, answer_bytes=20_000)
+SERVER = IngestSettings(PullSettings(grace=0.01, first_pause=0.02, longest_pause=0.1))
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
+HERE = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
+ROBOTS = ("r0", "r1", "r2")
+PAGE = 4096
+
+
+def node(map_id: MapId, number: int, rng: np.random.Generator) -> NodePut:
+    count = int(rng.integers(0, 200))
+    seen = Landmarks(
+        rng.uniform(0, 230, (count, 2)).astype(np.float32), rng.integers(0, 9, (count, 32)).astype(np.uint8),
+        rng.uniform(0.5, 5, count).astype(np.float32), np.full(count, 0.05, np.float32),
+    )  # fmt: skip
+    return NodePut(Node(NodeId(*map_id, number), number, HERE, CAMERA, seen))
+
+
+def edge(map_id: MapId, number: int, a: int, b: int) -> EdgePut:
+    ends = NodeId(*map_id, a), NodeId(*map_id, b)
+    return EdgePut(Edge(NodeId(*map_id, number), *ends, HERE, EdgeKind.MAPPED))
+
+
+def life(map_id: MapId, rng: np.random.Generator, length: int) -> list[ChangeBody]:
+    """Nodes with edges; some are put again, some are retired."""
+    bodies: list[ChangeBody] = []
+    nodes: list[int] = []
+    edges: list[int] = []
+    for number in range(1, length):
+        draw = rng.random()
+        if len(nodes) < 3 or not edges or draw < 0.5:
+            bodies.append(node(map_id, number, rng))
+            nodes.append(number)
+            if len(nodes) > 1:
+                edges.append(1000 + number)
+                bodies.append(edge(map_id, edges[-1], nodes[-2], number))
+        elif draw < 0.7:
+            bodies.append(node(map_id, int(rng.choice(nodes)), rng))
+        elif draw < 0.8:
+            a, b = rng.choice(nodes, 2, replace=False)
+            bodies.append(edge(map_id, int(rng.choice(edges)), int(a), int(b)))
+        elif draw < 0.9:
+            bodies.append(EdgeRetired(NodeId(*map_id, edges.pop(int(rng.integers(len(edges)))))))
+        else:
+            bodies.append(NodeRetired(NodeId(*map_id, nodes.pop(int(rng.integers(len(nodes)))))))
+    return bodies
+
+
+@dataclass
+class Fleet:
+    """Robots with their journals and a server with its store, in one folder."""
+
+    folder: Path
+    seen: list[Change] = field(default_factory=list)
+    robots: list[tuple[Replicator, Journal, MemoryBus]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.hub = MemoryHub()
+
+    @property
+    def path(self) -> Path:
+        return self.folder / "s0.sqlite"
+
+    def start_server(self) -> None:
+        self.seen.clear()
+        self.bus = MemoryBus(self.hub)
+        self.store = Store(self.path)
+        self.ingest = Ingest(self.bus, KEYS, self.store, "s0", self.seen.append, SERVER)
+
+    def stop_server(self) -> None:
+        self.ingest.close()
+        self.bus.close()
+        self.store.close()
+
+    def start_robots(self) -> None:
+        for name in ROBOTS:
+            bus, journal = MemoryBus(self.hub), Journal(self.folder / name, name)
+            one = Replicator(bus, KEYS, journal, journal.open_map(1), ("s0",), AGENT)
+            self.robots.append((one, journal, bus))
+
+    def stop_robots(self) -> None:
+        while self.robots:
+            replicator, journal, bus = self.robots.pop()
+            replicator.close()
+            bus.close()
+            journal.close()
+
+    def lacks(self) -> int:
+        """Changes that robots keep and the store does not have as they are. Robots drop what was undone."""
+        stored = self.stored()
+        return sum(
+            encode_change(change) not in stored[one]
+            for _, journal, _ in self.robots
+            for one in journal.maps()
+            for change in journal.changes(one, 1, journal.head(one))
+        )
+
+    def stored(self) -> dict[MapId, list[bytes]]:
+        return {
+            one: [encode_change(change) for change in self.store.replay(one)] for one in self.store.maps()
+        }
+
+    def served(self) -> dict[MapId, list[bytes]]:
+        """What the rest of the server has been told, as maps."""
+        maps: dict[MapId, HybridMap] = {}
+        for change in self.seen:
+            maps.setdefault(change.map, HybridMap()).apply(change.body)
+        return {one: sorted(map(encode_body, hybrid.contents())) for one, hybrid in maps.items()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What three robots have mapped, and a server has taken in and acknowledged; some rulings besides."""
+    fleet = Fleet(tmp_path_factory.mktemp("whole"))
+    rng = np.random.default_rng(7)
+    for name in ROBOTS:
+        journal = Journal(fleet.folder / name, name)
+        map_id = journal.open_map(None)
+        journal.write(map_id, [Draft.of(body, k) for k, body in enumerate(life(map_id, rng, 40))])
+        journal.close()
+    fleet.start_server()
+    fleet.start_robots()
+    for replicator, _, _ in fleet.robots:
+        assert replicator.wait_acknowledged(30)
+    book = RulingBook(fleet.store)
+    for k in range(5):
+        book.add(Ruling((MapId("r0", 1), MapId(f"r{k + 1}", 1)), True, "anna", k, "two kitchens"))
+    fleet.stop_robots()
+    fleet.stop_server()
+    return fleet.folder
+
+
+@pytest.fixture
+def fleet(whole: Path, tmp_path: Path) -> Iterator[Fleet]:
+    shutil.copytree(whole, tmp_path / "fleet")
+    fleet = Fleet(tmp_path / "fleet")
+    yield fleet
+    fleet.stop_robots()
+
+
+def truth(whole: Path) -> tuple[dict[MapId, list[bytes]], dict[MapId, list[bytes]]]:
+    """Logs, and the maps that they make, by the journals."""
+    logs, maps = {}, {}
+    for name in ROBOTS:
+        journal = Journal(whole / name, name)
+        (one,) = journal.maps()
+        logs[one] = [encode_change(change) for change in journal.changes(one, 1, journal.head(one))]
+        maps[one] = sorted(map(encode_body, HybridMap(journal.replay(one)).contents()))
+        journal.close()
+    return logs, maps
+
+
+def journal_bodies(whole: Path, one: MapId) -> list[ChangeBody]:
+    journal = Journal(whole / one.agent, one.agent)
+    bodies = list(journal.replay(one))
+    journal.close()
+    return bodies
+
+
+def bodies_in(path: Path) -> list[tuple[MapId, int, bytes]]:
+    disk = sqlite3.connect(path)
+    rows = disk.execute("SELECT agent, epoch, sequence, body FROM change").fetchall()
+    disk.close()
+    return [(MapId(agent, epoch), sequence, body) for agent, epoch, sequence, body in rows]
+
+
+def flip(path: Path, at: int, bit: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1 << bit
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("seed", range(14))
+def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
+    whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    logs, maps = truth(whole)
+    rng = np.random.default_rng(seed)
+    rows = bodies_in(fleet.path)
+    data = fleet.path.read_bytes()
+    hit: set[tuple[MapId, int]] = set()
+    for _ in range(int(rng.integers(1, 4))):
+        # A body that is too long for its page lies in several pieces.
+        while True:
+            map_id, sequence, body = rows[rng.integers(len(rows))]
+            start = int(rng.integers(max(len(body) - 40, 1)))
+            found = data.find(body[start : start + 40])
+            if len(body) > 60 and found >= 0 and data.count(body[start : start + 40]) == 1:
+                break
+        flip(fleet.path, found + int(rng.integers(40)), int(rng.integers(8)))
+        hit.add((map_id, sequence))
+    fleet.start_server()
+    lost = {(gap.map, k) for gap in fleet.store.damaged() for k in range(gap.first, gap.last + 1)}
+    assert hit == lost
+    for map_id, sequence in hit:
+        assert f"{sequence}" in caplog.text and f"of {map_id}" in caplog.text
+    # All others are served at once.
+    served = {(change.map, change.sequence): encode_change(change) for change in fleet.seen}
+    expected = {(one, k): data for one, log in logs.items() for k, data in enumerate(log, 1)}
+    assert served == {key: data for key, data in expected.items() if key not in hit}
+    fleet.start_robots()
+    eventually(lambda: not fleet.store.damaged())
+    fleet.ingest.close()
+    assert fleet.lacks() == 0
+    fleet.stop_robots()
+    assert all(set(log) <= set(logs[one]) for one, log in fleet.stored().items())
+    assert fleet.served() == maps, "what came late must not undo what came after it"
+    fleet.stop_server()
+    caplog.clear()
+    fleet.start_server()
+    assert fleet.served() == maps and "damaged" not in caplog.text
+    fleet.stop_server()
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_a_flipped_bit_anywhere_is_healed_or_said_in_one_line(
+    whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    logs, maps = truth(whole)
+    rng = np.random.default_rng(1000 + seed)
+    # Half of them where a page is described rather than filled: there a bit does most.
+    size = fleet.path.stat().st_size
+    inside = int(rng.integers(PAGE if seed % 2 else 60))
+    flip(fleet.path, int(rng.integers(size // PAGE)) * PAGE + inside, int(rng.integers(8)))
+    try:
+        fleet.start_server()
+    except InvalidFile as error:
+        words = str(error)
+        assert words.startswith(f"{fleet.path}: ") and "\n" not in words
+        assert "mapweave map extract" in words or "is not a Mapweave" in words or "of format" in words
+        return
+    expected = {(one, k): data for one, log in logs.items() for k, data in enumerate(log, 1)}
+    served = {(change.map, change.sequence): encode_change(change) for change in fleet.seen}
+    assert served.items() <= expected.items()
+    assert len(served) == len(expected) or "damaged" in caplog.text, "something is missing without a word"
+    fleet.start_robots()
+    eventually(lambda: not fleet.store.damaged() and fleet.lacks() == 0)
+    for replicator, _, _ in fleet.robots:
+        assert replicator.wait_acknowledged(30)
+    fleet.stop_robots()
+    fleet.stop_server()
+    assert fleet.served() == maps
+
+
+def test_what_is_known_of_a_log_may_be_lost(
+    whole: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its robot may not be there: its map is served all the same, and its log goes on when it comes."""
+    logs, maps = truth(whole)
+    disk = sqlite3.connect(fleet.path)
+    disk.execute("UPDATE log SET watermark = 5, log_id = '17' WHERE agent = 'r1'")
+    disk.commit()
+    disk.close()
+    fleet.start_server()
+    assert fleet.stored() == logs and fleet.served() == maps
+    assert "the position of r1.1 was damaged; its log is pulled from the beginning" in caplog.text
+    fleet.start_robots()
+    eventually(lambda: fleet.store.watermark(MapId("r1", 1)) == len(logs[MapId("r1", 1)]))
+    fleet.stop_robots()
+    fleet.stop_server()
+    assert fleet.served() == maps
+
+
+def test_damage_is_remembered_until_the_robot_comes(fleet: Fleet) -> None:
+    disk = sqlite3.connect(fleet.path)
+    disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = 'r1' AND sequence IN (3, 4, 9)")
+    disk.commit()
+    disk.close()
+    for _ in range(2):
+        fleet.start_server()
+        assert [(gap.first, gap.last) for gap in fleet.store.damaged(MapId("r1", 1))] == [(3, 4), (9, 9)]
+        assert fleet.store.damaged(MapId("r0", 1)) == []
+        fleet.stop_server()
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_a_damaged_key_misleads_nobody(whole: Path, fleet: Fleet, bit: int) -> None:
+    """A row that claims to be of another map: what it was stands between its neighbours."""
+    logs, maps = truth(whole)
+    one = MapId("r1", 1)
+    sequence, body = next((k, body) for m, k, body in bodies_in(fleet.path) if m == one and len(body) > 999)
+    data = fleet.path.read_bytes()
+    flip(fleet.path, data.rindex(b"r1", 0, data.index(body[:40])), bit)
+    fleet.start_server()
+    assert fleet.store.maps() == sorted(logs)
+    assert [(gap.map, gap.first, gap.last) for gap in fleet.store.damaged()] == [(one, sequence, sequence)]
+    assert len(fleet.seen) == sum(map(len, logs.values())) - 1
+    fleet.start_robots()
+    eventually(lambda: not fleet.store.damaged())
+    fleet.stop_robots()
+    fleet.stop_server()
+    assert fleet.served() == maps
+
+
+def test_a_change_that_this_program_cannot_read_costs_only_itself(
+    fleet: Fleet, caplog: pytest.LogCaptureFixture
+) -> None:
+    disk = sqlite3.connect(fleet.path)
+    row = disk.execute("SELECT * FROM change WHERE agent = 'r1' AND sequence = 6").fetchone()
+    values = (*row[:7], b"\xc1 of a newer program")
+    disk.execute(
+        "UPDATE change SET body = ?, crc = ? WHERE agent = 'r1' AND sequence = 6",
+        (values[7], checksum(values)),
+    )
+    disk.commit()
+    disk.close()
+    fleet.start_server()
+    assert 6 not in {change.sequence for change in fleet.seen if change.map.agent == "r1"}
+    assert "change 6 of r1.1 cannot be read" in caplog.text
+    fleet.stop_server()
+
+
+def test_a_damaged_ruling_costs_only_itself(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+    disk = sqlite3.connect(fleet.path)
+    disk.execute("UPDATE ruling SET body = body || x'00' WHERE number = 2")
+    disk.commit()
+    disk.close()
+    store = Store(fleet.path)
+    assert [ruling.stamp_ns for ruling in RulingBook(store).rulings.made] == [0, 2, 3, 4]
+    assert "1 damaged rows of table ruling" in caplog.text
+    store.close()
+
+
+def test_rulings_are_no_more_than_can_be_read_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_module, "MAX_RULINGS", 7)
+    store = Store(fleet.path)
+    book = RulingBook(store)
+    ruling = book.rulings.made[0]
+    for k in range(2):
+        book.add(replace(ruling, stamp_ns=100 + k))
+    with pytest.raises(InvalidValue, match="the record of rulings is full: 7"):
+        book.add(ruling)
+    assert len(book.rulings.made) == 7
+    store.close()
+    store = Store(fleet.path)
+    assert RulingBook(store).rulings.made == book.rulings.made
+    store.close()
+
+
+def test_a_store_with_broken_pages_is_extracted(
+    whole: Path, fleet: Fleet, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """One line says what is wrong and what to do; what the line says works."""
+    _, maps = truth(whole)
+    size = fleet.path.stat().st_size
+    data = bytearray(fleet.path.read_bytes())
+    # A leaf of an index, as SQLite keeps tables without row ids: what lies in an overflow page can be healed.
+    leaves = [at for at in range(0, size, PAGE) if data[at] == 0x0A and len(set(data[at : at + PAGE])) > 99]
+    middle = leaves[len(leaves) // 2]
+    data[middle : middle + PAGE] = np.random.default_rng(3).bytes(PAGE)
+    fleet.path.write_bytes(bytes(data))
+    assert main(["server", "--data", str(fleet.folder), "--listen", f"tcp/127.0.0.1:{free_port()}"]) == 1
+    said = capfd.readouterr().err.splitlines()
+    assert len(said) == 1 and "is damaged (" in said[0] and "`mapweave map extract FILE -o FOLDER`" in said[0]
+    out = fleet.folder / "out"
+    assert main(["map", "extract", str(fleet.path), "-o", str(out)]) == 1
+    assert "pages that cannot be read" in capfd.readouterr().err
+    kept = 0
+    for path in out.iterdir():
+        kept += sum(isinstance(body, NodePut) for body in read_map_file(path).changes)
+    assert kept > 0.8 * sum(len(HybridMap(journal_bodies(whole, one)).nodes) for one in maps)
+    fleet.path.rename(fleet.folder / "away")
+    fleet.start_server()
+    fleet.start_robots()
+    eventually(lambda: set(fleet.store.maps()) == set(maps) and fleet.lacks() == 0)
+    fleet.stop_robots()
+    fleet.stop_server()
+    assert fleet.served() == maps
+
+
+def test_a_whole_store_is_extracted_whole(
+    whole: Path, fleet: Fleet, capfd: pytest.CaptureFixture[str]
+) -> None:
+    _, maps = truth(whole)
+    before = fleet.path.read_bytes()
+    assert main(["map", "extract", str(fleet.path), "-o", str(fleet.folder / "out")]) == 0
+    assert capfd.readouterr().err == "" and fleet.path.read_bytes() == before
+    for one, bodies in maps.items():
+        content = read_map_file(fleet.folder / "out" / f"{one}.mapweave")
+        assert sorted(map(encode_body, content.changes)) == bodies
+    for path, words in ((fleet.folder / "nothing", "no such file"), (Path(__file__), "cannot be read")):
+        assert main(["map", "extract", str(path), "-o", str(fleet.folder / "out")]) == 1
+        assert words in capfd.readouterr().err
