@@ -44,7 +44,7 @@ def extract_maps(source: Path, folder: Path) -> tuple[list[Extracted], str]:
         folder: made if it is not there.
 
     Returns:
-        The maps, and in one line what of the source could not be read and belongs to no map; empty if nothing.
+        The maps, and in one line what could not be read and belongs to no map; empty if nothing.
 
     Raises:
         InvalidFile: the source is neither, or cannot be read.

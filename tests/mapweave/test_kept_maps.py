@@ -67,7 +67,8 @@ def network(tmp_path: Path) -> Iterator[tuple[Children, ZenohBus, str]]:
         )
         bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
         try:
-            eventually(bus.connected, PATIENCE)
+            asked = KEYS.server_status("s0")
+            eventually(lambda: any(not reply.error for reply in bus.ask(asked, b"", 1.0)), PATIENCE)
             Body(bus)
             yield children, bus, endpoint
         finally:
