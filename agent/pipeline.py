@@ -189,7 +189,7 @@ class Pipeline:
             observation: what the robot senses now.
             answers: to questions of earlier steps.
         """
-        command, changes, questions = Command(), list[ChangeBody](), list[Question]()
+        command, questions = Command(), list[Question]()
         self._rangers.see(observation.proximity)
         match self._mission:
             case Idle() if self._mapper.started:
@@ -198,16 +198,16 @@ class Pipeline:
             case Explore() | Carried() if self._mapper.astray:
                 command = self._resume(observation)
             case Explore() | Carried():
-                command, changes, questions = self._map(observation, answers)
+                command, questions = self._map(observation, answers)
             case GoTo() if self._navigator is not None:
                 command, questions = self._navigator.step(observation, answers, bool(self._blind))
-                changes = self._mapper.drove(self._navigator.traverse, self._navigator.refined)
+                self._mapper.drove(self._navigator.traverse, self._navigator.refined)
         safe, warning = guard(command, observation.proximity, self._description)
         if observation.bumped and safe.forward * self._direction > 0:
             safe, warning = Command(0.0, safe.turn), "stopped: the bumper is pressed"
         elif not observation.bumped and safe.forward:
             self._direction = math.copysign(1.0, safe.forward)
-        return Step(safe, tuple(changes), tuple(questions), self._status(warning))
+        return Step(safe, self._mapper.take_changes(), tuple(questions), self._status(warning))
 
     @property
     def _blind(self) -> str:
@@ -226,15 +226,14 @@ class Pipeline:
         if started and not self._mapper.started:
             self._restart()
 
-    def _map(
-        self, observation: Observation, answers: tuple[Answer, ...]
-    ) -> tuple[Command, list[ChangeBody], list[Question]]:
+    def _map(self, observation: Observation, answers: tuple[Answer, ...]) -> tuple[Command, list[Question]]:
         self._keep_up(observation)
         if self._mapper.doubtful or self._mapper.astray or self._blind:
-            return Command(), [], []
+            return Command(), []
         if isinstance(self._mission, Carried):
             assert self._passenger is not None
-            return Command(), self._passenger.step(observation), []
+            self._passenger.step(observation)
+            return Command(), []
         assert self._explorer is not None
         self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
         return self._explorer.step(observation, answers)

@@ -15,7 +15,6 @@ from agent.floor import Floor
 from agent.mapping.mapper import Mapper
 from agent.mission import Answer, Question
 from agent.observation import Command, Observation, RobotDescription
-from hybridmap.change import ChangeBody
 from hybridmap.node import MapId
 from hybridmap.pose import Array
 
@@ -55,14 +54,13 @@ class Explorer:
 
     def step(
         self, observation: Observation, answers: tuple[Answer, ...] = ()
-    ) -> tuple[Command, list[ChangeBody], list[Question]]:
+    ) -> tuple[Command, list[Question]]:
         """One tick. The mapper and the floor have seen the observation already."""
         self._moves.see(observation)
         self._questions = []
         for answer in answers:
             self._hearsay.take(answer)
-        command = next(self._behaviour)
-        return command, self._moves.changes, self._questions
+        return next(self._behaviour), self._questions
 
     @property
     def phase(self) -> Phase:

@@ -12,7 +12,6 @@ from agent.mapping.mapper import Mapper
 from agent.observation import Command, Observation, RobotDescription
 from agent.room import room
 from agent.servo.image_drive import ImageDrive, ImageDriveSettings
-from hybridmap.change import ChangeBody
 from hybridmap.pose import Array, Pose2, wrap_angle
 
 
@@ -22,14 +21,12 @@ class Moves:
     Attributes:
         phase: what it is doing.
         detail: why, in words.
-        changes: to the map, since the last `see`.
     """
 
     def __init__(self, description: RobotDescription, mapper: Mapper, settings: ExplorerSettings) -> None:
         """Take the body, and the mapper that the pipeline keeps up to date."""
         self.phase = Phase.LOOKING
         self.detail = ""
-        self.changes: list[ChangeBody] = []
         self._description = description
         self._mapper = mapper
         self._settings = settings
@@ -39,7 +36,6 @@ class Moves:
     def see(self, observation: Observation) -> None:
         """Begin a tick. The mapper has seen the observation already."""
         self._observation = observation
-        self.changes = []
 
     def begin(self) -> Iterator[Command]:
         """Stand still until there is a first image to map from."""
@@ -192,4 +188,4 @@ class Moves:
 
     def finish(self) -> None:
         """End the episode: what was seen becomes nodes."""
-        self.changes += self._mapper.finish(self._now)
+        self._mapper.finish(self._now)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from agent.mapping.mapper import Mapper
 from agent.observation import Observation
-from hybridmap.change import ChangeBody
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,12 @@ class Passenger:
         self._mapper = mapper
         self._settings = settings or PassengerSettings()
 
-    def step(self, observation: Observation) -> list[ChangeBody]:
+    def step(self, observation: Observation) -> None:
         """One tick. The mapper has seen the observation already."""
         s, mapper = self._settings, self._mapper
         if not mapper.started:
             mapper.begin(observation)
-            return []
+            return
         moved = mapper.anchor_from_robot
         way = math.hypot(moved.x, moved.y)
         left = mapper.anchored
@@ -58,5 +57,4 @@ class Passenger:
             self.detail = f"only {mapper.anchor_features} features in view"
         moving = way > 0.02 * mapper.typical_depth or abs(moved.heading) > 0.1
         if (leaving and moving) or (far and mapper.converged_share >= s.converged):
-            return mapper.finish(observation)
-        return []
+            mapper.finish(observation)

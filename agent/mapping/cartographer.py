@@ -101,11 +101,15 @@ class Cartographer:
         self._settings = settings
         self._last: Placed | None = None
         self._next_number = next_number
+        self._new: list[ChangeBody] = []
         self._rng = np.random.default_rng(0)
 
-    def place(
-        self, anchor: View, leaves: list[View], tracking: Tracking, wayside: Wayside
-    ) -> list[ChangeBody]:
+    def take_changes(self) -> tuple[ChangeBody, ...]:
+        """What was changed in the map since the last call, in order: it is to leave the robot."""
+        new, self._new = tuple(self._new), []
+        return new
+
+    def place(self, anchor: View, leaves: list[View], tracking: Tracking, wayside: Wayside) -> Node | None:
         """Make nodes of an episode's views, edges between them and to the episode before, and loop closures.
 
         Args:
@@ -115,27 +119,24 @@ class Cartographer:
             wayside: where the robot was since the last node: it is the anchor's wake, if that becomes a node.
 
         Returns:
-            The changes, already applied to `map`; none if the anchor shows too little.
+            The anchor's node; None, and nothing is changed, if the anchor shows too little.
         """
-        changes: list[ChangeBody] = []
-        placed = self._node(anchor, tracking, changes, wayside)
-        if placed is not None:
-            loops = self._close_loops(placed.node)
-            if self._last is not None and self._last.evidence and loops:
-                self._settle(placed, loops)
-                changes = [NodePut(placed.node)]
-            elif self._last is not None:
-                changes.append(EdgePut(self._edge(self._last, placed, self._last.node_from_anchor)))
-            changes += [EdgePut(edge) for edge in loops]
-            self._last = placed
-            for leaf in leaves:
-                beside = self._node(leaf, tracking, changes)
-                if beside is not None:
-                    between = self._sober(leaf.anchor_from_view)
-                    changes.append(EdgePut(self._edge(placed, beside, between)))
-        for change in changes:
-            self.map.apply(change)
-        return changes
+        placed = self._node(anchor, tracking, wayside)
+        if placed is None:
+            return None
+        loops = self._close_loops(placed.node)
+        joined: list[Edge] = []
+        if self._last is not None and self._last.evidence and loops:
+            self._settle(placed, loops)
+        elif self._last is not None:
+            joined = [self._edge(self._last, placed, self._last.node_from_anchor)]
+        self._write(placed.node, *joined, *loops)
+        self._last = placed
+        for leaf in leaves:
+            beside = self._node(leaf, tracking)
+            if beside is not None:
+                self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
+        return placed.node
 
     def recognise(self, node: Node, view: View, recognition: Recognition) -> None:
         """The next episode begins at a view that shows a node of this map, however the robot came there.
@@ -165,23 +166,26 @@ class Cartographer:
         if self._last is not None:
             self._last.node_from_anchor = self._last.node_from_anchor @ moved
 
-    def drove(self, traverse: Traverse | None, refined: Node | None) -> list[ChangeBody]:
-        """Write down what a drive has measured; returns the changes, already applied."""
-        changes: list[ChangeBody] = [] if refined is None else [NodePut(refined)]
+    def drove(self, traverse: Traverse | None, refined: Node | None) -> None:
+        """Write down what a drive has measured."""
+        if refined is not None:
+            self._write(refined)
         if traverse is not None:
-            changes.append(EdgePut(driven_edge(self.map, traverse, self._number)))
-        for change in changes:
+            self._write(driven_edge(self.map, traverse, self._number))
+
+    def _write(self, *elements: Node | Edge) -> None:
+        """Put nodes and edges into the map."""
+        for element in elements:
+            change = NodePut(element) if isinstance(element, Node) else EdgePut(element)
             self.map.apply(change)
-        return changes
+            self._new.append(change)
 
     def _number(self) -> NodeId:
         number = NodeId(self._map_id.agent, self._map_id.epoch, self._next_number)
         self._next_number += 1
         return number
 
-    def _node(
-        self, view: View, tracking: Tracking, changes: list[ChangeBody], wayside: Wayside | None = None
-    ) -> Placed | None:
+    def _node(self, view: View, tracking: Tracking, wayside: Wayside | None = None) -> Placed | None:
         landmarks, tracks = self._landmarks(view, tracking)
         if len(landmarks) < self._settings.least_landmarks:
             return None
@@ -192,7 +196,6 @@ class Cartographer:
         node = Node(
             self._number(), view.stamp_ns, posture, d.camera, landmarks, d.clock, d.radius, ranges, wake
         )
-        changes.append(NodePut(node))
         return Placed(node, tracks)
 
     def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:

@@ -19,7 +19,7 @@ from agent.surveying.surveyor import Traverse
 from agent.vision.lens import Lens
 from agent.vision.report import TrackReport
 from agent.vision.sift import Features, Sift, SiftSettings
-from hybridmap.change import ChangeBody, NodePut
+from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node
 from hybridmap.pose import Array, Pose2, PoseGaussian
@@ -157,9 +157,13 @@ class Mapper:
         """Share of the filter's landmarks whose depth has converged; 0 without landmarks."""
         return self._tracking.converged_share
 
-    def drove(self, traverse: Traverse | None, refined: Node | None) -> list[ChangeBody]:
+    def take_changes(self) -> tuple[ChangeBody, ...]:
+        """What was changed in the map since the last call; the only way by which nodes and edges leave."""
+        return self._cartographer.take_changes()
+
+    def drove(self, traverse: Traverse | None, refined: Node | None) -> None:
         """Take in what was measured on a drive while nothing was mapped; see Cartographer."""
-        return self._cartographer.drove(traverse, refined)
+        self._cartographer.drove(traverse, refined)
 
     # One tick, and what ends an episode
 
@@ -218,29 +222,28 @@ class Mapper:
             self._tracking.remember(force=True)
             self._leaves.append(view)
 
-    def finish(self, observation: Observation) -> list[ChangeBody]:
+    def finish(self, observation: Observation) -> bool:
         """End the episode: its views become nodes, and the current image becomes the next anchor.
 
         Returns:
-            The changes to the map, already applied to `map`. Empty without an image.
+            Whether the anchor view became a node. False without an image.
         """
         next_anchor = self._take(observation, HERE)
         if next_anchor is None or self._anchor is None:
-            return []
+            return False
         self._tracking.remember(force=True)
-        changes = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
-        for change in changes[:1]:
-            if isinstance(change, NodePut):
-                self.typical_depth = float(np.median(change.node.landmarks.depths))
+        node = self._cartographer.place(self._anchor, self._leaves, self._tracking, self._wayside)
+        if node is not None:
+            self.typical_depth = float(np.median(node.landmarks.depths))
         moved = self._tracking.reanchor()
         self._cartographer.move_anchor(moved)
-        if changes:
+        if node is not None:
             self._wayside.clear(next_anchor.stamp_ns)
         else:
             self._wayside.move_anchor(moved.mean)
         self._anchor, self._leaves = next_anchor, []
         self._tracking.follow(next_anchor, self.typical_depth)
-        return changes
+        return node is not None
 
     def _take(self, observation: Observation, anchor_from_view: PoseGaussian) -> View | None:
         if observation.image is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from agent.mapping.track_history import TrackHistory
 from agent.mapping.track_settings import TrackingSettings
 from agent.mapping.unheld import Unheld
 from agent.mapping.view import View, associate, even_choice
-from agent.observation import Observation, RobotDescription
+from agent.observation import Observation, Odometry, RobotDescription
 from agent.vision.hidden import Hidden
 from agent.vision.lens import Lens
 from agent.vision.report import TrackReport
@@ -27,6 +28,18 @@ from agent.vision.strikes import Strikes
 from agent.vision.template import Templates
 from agent.vision.tracker import Tracker
 from hybridmap.pose import Array, Pose2, PoseGaussian
+
+
+class LostTracks(NamedTuple):
+    """Landmarks of the filter that were not followed into an image.
+
+    Attributes:
+        ids: (N,) of the tracks.
+        templates: what they looked like.
+    """
+
+    ids: NDArray[np.int64]
+    templates: Templates
 
 
 class Tracking:
@@ -126,36 +139,23 @@ class Tracking:
         return self._filter.landmarks()
 
     def step(self, observation: Observation) -> None:
-        """Predict by the wheels, follow the tracks, correct by what they show."""
-        self._filter.predict(observation.odometry)
-        self._dispute.step(observation.odometry)
-        self._since_believed = self._since_believed @ observation.odometry.motion()
-        if observation.image is None or self._frozen(observation.image):
-            self.missing += self._believed is not None
+        """Predict by the wheels, follow the tracks, correct by what they show.
+
+        Each stage takes what the one before gives: what was lost on the way into the image, what is alive
+        after hidden landmarks were sought, which of that the filter holds, and whether it was corrected.
+        """
+        self._predict(observation.odometry)
+        image = self._new_image(observation)
+        if image is None:
             return
-        self.missing = 0
-        ids, templates = self._tracker.ids, self._tracker.templates
-        if not self._follow(observation.image):
+        lost = self._follow(image)
+        if lost is None:
             return
-        self._seek_hidden(observation.image, ids, templates)
-        # A landmark that is gone stays out: what it taught is in the posture already.
-        alive = np.concatenate([self._tracker.ids, self._hidden.ids])
-        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive)])
-        filtered = np.isin(self._tracker.ids, self._filter.ids)
-        pixels = self._tracker.pixels[filtered]
-        self._misses_px = np.zeros((0, 2))
-        self._unused = None if self._trusted(pixels) else len(pixels)
-        if self._unused is None:
-            ids = self._tracker.ids[filtered]
-            update = self._filter.update(ids, pixels)
-            self._misses_px = update.innovations_px[update.accepted]
-            refused = self._strikes.judge(ids, update.accepted)
-            self._filter.remove(refused)
-            self._tracker.keep(~np.isin(self._tracker.ids, refused))
+        alive = self._seek_hidden(image, lost)
+        corrected = self._correct(self._held(alive))
         if len(self._filter.ids) - len(self._hidden.ids) < self._settings.refill:
             self._fill()
-        ids = self._tracker.ids[: None if self._unused is not None else 0]
-        self._unheld.note(ids, self._tracker.pixels[: len(ids)], self._filter.predict_pixels(ids))
+        self._note_unheld(corrected)
         self.remember()
 
     def remember(self, force: bool = False) -> None:
@@ -186,6 +186,90 @@ class Tracking:
         self._dispute.settle()
         self.history.reanchor(moved.mean, self._tracker.ids)
         return moved
+
+    # The stages of a step, in order.
+
+    def _predict(self, odometry: Odometry) -> None:
+        """Move by the wheels."""
+        self._filter.predict(odometry)
+        self._dispute.step(odometry)
+        self._since_believed = self._since_believed @ odometry.motion()
+
+    def _new_image(self, observation: Observation) -> NDArray[np.uint8] | None:
+        """The image, unless none came or the last one came again."""
+        if observation.image is None or self._frozen(observation.image):
+            self.missing += self._believed is not None
+            return None
+        self.missing = 0
+        return observation.image
+
+    def _follow(self, image: NDArray[np.uint8]) -> LostTracks | None:
+        """Follow the tracks into an image; None if it is not believed: then they stay where they were."""
+        ids, templates = self._tracker.ids, self._tracker.templates
+        believed, moved, (way, turn) = self._believed, self._since_believed, self._settings.stale
+        if believed is None or np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn:
+            self._tracker.track(image, self._expected())
+        else:
+            sight = self._see(image, believed)
+            if sight is not Sight.SAME and self._see(relit(image, believed), believed) is Sight.SAME:
+                # The next image will be in the same light as this one really is.
+                self._tracker.relight(image)
+            elif sight is not Sight.SAME:
+                self.strange += sight is Sight.STRANGE
+                self.blank += sight is Sight.BLANK
+                return None
+        self.strange = self.blank = 0
+        self._believed, self._since_believed = image, Pose2()
+        lost = ~np.isin(ids, self._tracker.ids) & np.isin(ids, self._filter.ids)
+        return LostTracks(ids[lost], templates.chosen(lost))
+
+    def _seek_hidden(self, image: NDArray[np.uint8], lost: LostTracks) -> NDArray[np.int64]:
+        """Hide landmarks just lost, find others again; returns the ids of all that are tracked or hidden."""
+        if self._settings.tracker.anchored:
+            self._hidden.take(lost.ids, lost.templates)
+        self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
+        if len(self._hidden.ids):
+            expected = self._filter.predict_pixels(self._hidden.ids)
+            # What has left the view, or is leaving it, is not hidden.
+            margin = self._settings.tracker.border_px + self._settings.hidden.template.half_px
+            far_in = np.array([self._camera.width, self._camera.height]) - margin
+            inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < far_in)).all(axis=1))
+            self._hidden.keep(inside)
+            found, raw, patches = self._hidden.seek(image, self._lens.distort(expected[inside]))
+            if len(found):
+                self._tracker.add(found, raw, patches)
+        return np.concatenate([self._tracker.ids, self._hidden.ids])
+
+    def _held(self, alive: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(N,) which tracks the filter holds. A landmark that is gone is taken out of it, and stays out.
+
+        What it has taught is in the posture already.
+        """
+        self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive)])
+        return np.isin(self._tracker.ids, self._filter.ids)
+
+    def _correct(self, held: NDArray[np.bool_]) -> bool:
+        """Correct the filter by the tracks that it holds; returns whether they were enough for that."""
+        ids, pixels = self._tracker.ids[held], self._tracker.pixels[held]
+        trusted = self._trusted(pixels)
+        self._misses_px = np.zeros((0, 2))
+        self._unused = None if trusted else len(pixels)
+        if trusted:
+            update = self._filter.update(ids, pixels)
+            self._misses_px = update.innovations_px[update.accepted]
+            refused = self._strikes.judge(ids, update.accepted)
+            self._filter.remove(refused)
+            self._tracker.keep(~np.isin(self._tracker.ids, refused))
+        return trusted
+
+    def _note_unheld(self, corrected: bool) -> None:
+        """While the wheels are trusted alone, note how far the tracks are from where the filter has them."""
+        ids, pixels = self._tracker.ids, self._tracker.pixels
+        if corrected:
+            ids, pixels = ids[:0], pixels[:0]
+        self._unheld.note(ids, pixels, self._filter.predict_pixels(ids))
+
+    # What the stages are made of.
 
     def _fill(self, first: int = 0) -> None:
         """Give the filter an even choice of the tracks that it does not hold, from a first one on."""
@@ -218,25 +302,6 @@ class Tracking:
             inverse_depths[fits], sigmas[fits] = solved.rays[fits, 2], better[fits]
         return inverse_depths, sigmas
 
-    def _seek_hidden(self, image: NDArray[np.uint8], ids: NDArray[np.int64], templates: Templates) -> None:
-        """Of the tracks that were followed until now, ids (N,), hide those just lost; find others again."""
-        lost = ~np.isin(ids, self._tracker.ids) & np.isin(ids, self._filter.ids)
-        if self._settings.tracker.anchored:
-            self._hidden.take(ids[lost], templates.chosen(lost))
-        self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
-        if not len(self._hidden.ids):
-            return
-        expected = self._filter.predict_pixels(self._hidden.ids)
-        # What has left the view, or is leaving it, is not hidden.
-        margin = self._settings.tracker.border_px + self._settings.hidden.template.half_px
-        far_in = np.array([self._camera.width, self._camera.height]) - margin
-        inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < far_in)).all(axis=1))
-        self._hidden.keep(inside)
-        expected = expected[inside]
-        found, raw, patches = self._hidden.seek(image, self._lens.distort(expected))
-        if len(found):
-            self._tracker.add(found, raw, patches)
-
     def _frozen(self, image: NDArray[np.uint8]) -> bool:
         """Whether an image is the last one again, to the last grey level, although the wheels have moved.
 
@@ -247,24 +312,6 @@ class Tracking:
         if stands or self._believed is None or not np.array_equal(image, self._believed):
             return False
         return int(image.min()) < int(image.max())
-
-    def _follow(self, image: NDArray[np.uint8]) -> bool:
-        """Follow the tracks into an image; returns whether it is believed."""
-        believed, moved, (way, turn) = self._believed, self._since_believed, self._settings.stale
-        if believed is None or np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn:
-            self._tracker.track(image, self._expected())
-        else:
-            sight = self._see(image, believed)
-            if sight is not Sight.SAME and self._see(relit(image, believed), believed) is Sight.SAME:
-                # The next image will be in the same light as this one really is.
-                self._tracker.relight(image)
-            elif sight is not Sight.SAME:
-                self.strange += sight is Sight.STRANGE
-                self.blank += sight is Sight.BLANK
-                return False
-        self.strange = self.blank = 0
-        self._believed, self._since_believed = image, Pose2()
-        return True
 
     def _see(self, image: NDArray[np.uint8], believed: NDArray[np.uint8]) -> Sight:
         """Follow the tracks into an image; if it does not continue the one before, they stay behind."""

@@ -19,7 +19,7 @@ def reckless(monkeypatch):
     """An explorer that wants something whatever is in the way."""
 
     def want(command: Command) -> Pipeline:
-        monkeypatch.setattr(Explorer, "step", lambda self, *seen: (command, [], []))
+        monkeypatch.setattr(Explorer, "step", lambda self, *seen: (command, []))
         return on(Explore())
 
     return want

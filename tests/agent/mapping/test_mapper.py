@@ -9,6 +9,7 @@ import numpy as np
 
 from agent.mapping.mapper import Mapper
 from agent.observation import Odometry
+from hybridmap.change import NodePut
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 
@@ -29,9 +30,11 @@ def test_depths_of_a_node_are_those_of_the_walls(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
     there = np.arange(0.0, 0.6, 0.025)
     last = drive(mapper, walls, [*there, *there[::-1]])
-    changes = mapper.finish(last)
+    assert mapper.take_changes() == ()
+    assert mapper.finish(last)
     (node,) = mapper.map.nodes.values()
-    assert len(changes) == 1
+    assert mapper.take_changes() == (NodePut(node),)
+    assert mapper.take_changes() == (), "each change leaves once"
     assert len(node.landmarks) > 30
     true = walls.depth_at(Pose2(), node.landmarks.pixels)
     error = np.abs(node.landmarks.depths - true) / true
@@ -67,7 +70,8 @@ def test_a_view_without_features_gives_no_node(walls, description):
         if not mapper.started:
             mapper.begin(observation)
     assert mapper.anchor_features == 0
-    assert mapper.finish(observation) == []
+    assert not mapper.finish(observation)
+    assert mapper.take_changes() == ()
     assert not mapper.map.nodes
 
 
