@@ -62,11 +62,9 @@ class Gap(NamedTuple):
 
 def checksum(values: Sequence[object]) -> int:
     """Of the columns of a row, whatever they are by now."""
-    crc = 0
-    for value in values:
-        data = value if isinstance(value, bytes) else str(value).encode("utf-8", "replace")
-        crc = zlib.crc32(data, zlib.crc32(b"%d," % len(data), crc))
-    return crc
+    *head, last = values
+    crc = zlib.crc32("\0".join(map(str, head)).encode("utf-8", "replace"))
+    return zlib.crc32(last if isinstance(last, bytes) else str(last).encode("utf-8", "replace"), crc)
 
 
 def insert(rows: sqlite3.Connection, table: str, values: Sequence[object]) -> None:
