@@ -1,4 +1,4 @@
-"""For all tests: one thread for algebra and images, as in Mapweave's own processes."""
+"""For all tests: one thread for algebra and images, as in Mapweave's own processes; and bytecode is kept."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ pytest.register_assert_rewrite("tests.waiting", "tests.mapweave.command_line", "
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 cv2.setNumThreads(1)
+
+# Tests are compiled in each worker, and the product in each of a hundred processes that they start. Where an
+# environment forbids bytecode files, as images of containers do, that is a good part of the time of all tests.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 if not INSTALLED:
     sys.meta_path.insert(0, SkipWithoutSimulator())
