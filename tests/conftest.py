@@ -22,8 +22,8 @@ settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 cv2.setNumThreads(1)
 
-# Tests are compiled in each worker, and the product in each of a hundred processes that they start. Where an
-# environment forbids bytecode files, as images of containers do, that is a good part of the time of all tests.
+# Each worker compiles the tests, and each of a hundred processes that they start the product. Where bytecode
+# files are forbidden, as in images of containers, that is a good part of the time that all tests take.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import CAMERA, random_vectors
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.descriptor import quantise
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.reach import ReachSettings, closed_edges, least_in_view, reach_of
+from synthetic.world import CAMERA, random_vectors
 
 
 def pair(

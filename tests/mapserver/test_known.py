@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -18,6 +17,7 @@ from mapserver.known import Known
 from mapserver.merging.merger import Merger
 from mapserver.server import MapServer, ServerSettings
 from merge.graph.merged import MergedMap, Placement
+from synthetic.world import room, take_map
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
 from wire.messages import (

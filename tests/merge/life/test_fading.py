@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -20,6 +19,15 @@ from merge.graph.links import Link
 from merge.life.fading import Fader, FadingSettings, found_again, presence, things
 from merge.life.looks import Look, expected
 from merge.life.renewal import RenewalSettings
+from synthetic.world import (
+    CAMERA,
+    Sensing,
+    World,
+    random_vectors,
+    room,
+    take_map,
+    take_node,
+)
 
 S = FadingSettings()
 L = S.looks
