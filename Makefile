@@ -48,8 +48,8 @@ check: setup
 	$(BIN)/lint-imports
 
 bench: setup
-	@for b in $$(grep -l '^if __name__ == "__main__"' benchmarks/*.py); do \
-	  echo "== $$(basename $$b .py)"; $(BIN)/python -m benchmarks.$$(basename $$b .py); done
+	@for b in $$(dirname benchmarks/*/__main__.py); do \
+	  echo "== $$(basename $$b)"; $(BIN)/python -m benchmarks.$$(basename $$b); done
 
 clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache

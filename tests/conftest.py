@@ -1,4 +1,4 @@
-"""For all tests: one thread for algebra and images, as in Mapweave's own processes."""
+"""For all tests: one thread for algebra and images, as in Mapweave's own processes; and bytecode is kept."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ pytest.register_assert_rewrite("tests.waiting", "tests.mapweave.command_line", "
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 cv2.setNumThreads(1)
+
+# Each worker compiles the tests, and each of a hundred processes that they start the product. Where bytecode
+# files are forbidden, as in images of containers, that is a good part of the time that all tests take.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 if not INSTALLED:
     sys.meta_path.insert(0, SkipWithoutSimulator())

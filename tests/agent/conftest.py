@@ -9,11 +9,11 @@ import skimage.data
 
 from agent.mapping.mapper import Mapper
 from agent.observation import Observation, Odometry, RobotDescription
-from benchmarks.synthetic import World
 from hybridmap.camera import Camera
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
+from synthetic.world import World
 from tests.agent.scripted_fleet import home_map, home_world
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)

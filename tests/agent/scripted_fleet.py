@@ -13,12 +13,18 @@ from agent.navigating.navigator import Navigator, NavigatorSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.vision.lens import Lens
 from agent.vision.sift import Features
-from benchmarks.synthetic import CAMERA, World, room, take_map, take_view
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, RouteLeg, Whereabouts
+from synthetic.world import (
+    CAMERA,
+    World,
+    room,
+    take_map,
+    take_view,
+)
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
 BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)

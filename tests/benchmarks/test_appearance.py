@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks import appearance
-from benchmarks.appearance import Outcome, park
-from benchmarks.appearance_drivers import DRIVERS, Eye
-from benchmarks.servo_world import CAMERA, draw_task, in_view
+from benchmarks.appearance import benchmark as appearance
+from benchmarks.appearance.benchmark import Outcome, park
+from benchmarks.appearance.drivers import DRIVERS, Eye
+from benchmarks.servo.world import CAMERA, draw_task, in_view
 
 
 def test_an_eye_sees_what_is_in_view_with_the_noise_that_it_says():

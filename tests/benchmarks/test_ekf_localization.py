@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.ekf_localization import FEW, Place, draw_place, drive, try_drives, try_start
+from synthetic.localization_run import (
+    FEW,
+    Place,
+    draw_place,
+    drive,
+    try_drives,
+    try_start,
+)
 
 
 def test_a_place_knows_how_far_off_it_is() -> None:

@@ -11,13 +11,28 @@ import numpy as np
 import pytest
 
 from agent.ekf.mapping import FilterSettings
-from benchmarks.ekf_coordinates import Coordinates, Points, Rays, from_posture, in_robot, jacobian, of_robot
-from benchmarks.ekf_run import MappingRun, draw_run
-from benchmarks.ekf_speed import Ours, gap, plain
-from benchmarks.ekf_textbook import Choice, TextbookFilter
-from benchmarks.ekf_variants import OURS, TEXTBOOK, Outcome, main, summary, try_textbook
+from benchmarks.ekf_speed.benchmark import Ours, gap, plain
+from benchmarks.ekf_variants.benchmark import (
+    OURS,
+    TEXTBOOK,
+    Outcome,
+    main,
+    summary,
+    try_textbook,
+)
+from benchmarks.ekf_variants.coordinates import (
+    Coordinates,
+    Points,
+    Rays,
+    from_posture,
+    in_robot,
+    jacobian,
+    of_robot,
+)
+from benchmarks.ekf_variants.textbook import Choice, TextbookFilter
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2
+from synthetic.mapping_run import MappingRun, draw_run
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.08)
 CHARTS = [Points(), Rays()]

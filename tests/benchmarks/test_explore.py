@@ -8,10 +8,29 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.explore import STRATEGIES, Exploration, figures, measure, table
-from benchmarks.explore_area import REACH, SQUARE, Look, MappedFloor, floor_squares, mapped_floor, shows
-from benchmarks.explore_picture import draw
-from benchmarks.explore_start import APART, NEAR, gathered, office
+from benchmarks.explore.area import (
+    REACH,
+    SQUARE,
+    Look,
+    MappedFloor,
+    floor_squares,
+    mapped_floor,
+    shows,
+)
+from benchmarks.explore.benchmark import (
+    STRATEGIES,
+    Exploration,
+    figures,
+    measure,
+    table,
+)
+from benchmarks.explore.picture import draw
+from benchmarks.explore.start import (
+    APART,
+    NEAR,
+    gathered,
+    office,
+)
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2
 from mapweave.scoring import crossed

@@ -10,11 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import landmarks
-from benchmarks.known_warps import load, warp
-from benchmarks.landmarks import Tally, figures, node_figures
-from benchmarks.landmarks_pairs import _room_pair, _warped_pair, camera_of, epipolar, folder_pairs
-from benchmarks.landmarks_rivals import Packed, features
+from benchmarks.images.known_warps import load, warp
+from benchmarks.landmarks import benchmark as landmarks
+from benchmarks.landmarks.benchmark import Tally, figures, node_figures
+from benchmarks.landmarks.pairs import (
+    _room_pair,
+    _warped_pair,
+    camera_of,
+    epipolar,
+    folder_pairs,
+)
+from benchmarks.landmarks.rivals import Packed, features
 from hybridmap.errors import InvalidFile
 
 

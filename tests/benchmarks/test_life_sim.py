@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.life_sim import Fleet, main
+from benchmarks.life_sim.benchmark import Fleet, main
 from hybridmap.node import MapId
 from sim.floorplan import distances_to
 

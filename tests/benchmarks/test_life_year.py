@@ -3,11 +3,11 @@
 import numpy as np
 from rich.console import Console
 
-from benchmarks.life_drives import DriveSettings, drives
-from benchmarks.life_year import run
-from benchmarks.merge_fleets import FleetSettings
+from benchmarks.life_year.benchmark import run
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
+from synthetic.drives import DriveSettings, drives
+from synthetic.fleet import FleetSettings
 
 
 def test_links_lead_to_nodes_for_which_no_newer_one_stands() -> None:

@@ -16,10 +16,16 @@ import pytest
 from agent.ekf.landmarks import LandmarkEstimates
 from agent.ekf.mapping import FilterSettings
 from agent.observation import Odometry
-from benchmarks.mapping_run import main, notes
-from benchmarks.mapping_scene import MappingDrive, Moment, drive
-from benchmarks.mapping_score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
-from benchmarks.mapping_truth import Surfaces
+from benchmarks.images.surface_points import Surfaces
+from benchmarks.mapping_run.benchmark import main, notes
+from benchmarks.mapping_run.scene import MappingDrive, Moment, drive
+from benchmarks.mapping_run.score import (
+    LastKnown,
+    figures,
+    landmark_nees,
+    reprojection_errors,
+    track_errors,
+)
 from hybridmap.pose import Pose2, PoseGaussian
 from sim.camera import WEBCAM
 from sim.robots import RobotSetup

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks.merge_building import Building
-from benchmarks.merge_scale import at_size, scale
+from benchmarks.merge.scale import at_size, scale
 from hybridmap.change import NodePut
 from hybridmap.errors import InvalidValue
 from merge.graph.links import Link
 from merge.graph.verification import verify
+from synthetic.building import Building
 
 
 def test_links_that_are_drawn_are_those_that_would_be_found() -> None:

@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks import merge_sim
-from benchmarks.merge_sim import Failure, figures, measure, outcome, summary
-from benchmarks.merge_sim_run import Run, false_merges
-from benchmarks.merge_sim_views import lengths, views_shared
+from benchmarks.merge_sim import benchmark as merge_sim
+from benchmarks.merge_sim.benchmark import (
+    Failure,
+    figures,
+    measure,
+    outcome,
+    summary,
+)
+from benchmarks.merge_sim.run import Run, false_merges
+from benchmarks.merge_sim.views import lengths, views_shared
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2
 from sim.camera import WEBCAM

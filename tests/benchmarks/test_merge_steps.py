@@ -5,7 +5,7 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.merge_steps import STEPS, Growth, stepping
+from benchmarks.merge.steps import STEPS, Growth, stepping
 
 
 @pytest.mark.parametrize("seed", [2, 3])

@@ -15,12 +15,16 @@ from agent.mission import GoTo
 from agent.pipeline import Status
 from agent.report import AgentReport
 from agent.tally import Tally
-from benchmarks.navigate import main, summary
-from benchmarks.navigate_drives import PATIENCE, Outcome, _reason, drive
-from benchmarks.navigate_floor import Floor
-from benchmarks.navigate_office import Mapped
-from benchmarks.navigate_plots import LEAST_EDGES, Plot, draw_plot
-from benchmarks.synthetic import room, take_map
+from benchmarks.navigate.benchmark import main, summary
+from benchmarks.navigate.drives import (
+    PATIENCE,
+    Outcome,
+    _reason,
+    drive,
+)
+from benchmarks.navigate.floor import Floor
+from benchmarks.navigate.office import Mapped
+from benchmarks.navigate.plots import LEAST_EDGES, Plot, draw_plot
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
@@ -30,6 +34,7 @@ from mapweave.scoring import crossed
 from sim.control import RobotStatus, SimStatus
 from sim.floorplan import FloorPlan, Rectangle
 from sim.snapshot import Snapshot
+from synthetic.world import room, take_map
 
 RADIUS = 0.17
 WALL = Rectangle.spanning(2.9, 0.0, 3.1, 3.0, "wall")

@@ -6,9 +6,16 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks import parking
-from benchmarks.parking_run import LEAST_VISIBLE, park
-from benchmarks.parking_scene import AHEAD, FARTHEST, LEAST_SEEN, MOST_TURNED, NEAREST, Scene
+from benchmarks.parking import benchmark as parking
+from benchmarks.parking.run import LEAST_VISIBLE, park
+from benchmarks.parking.scene import (
+    AHEAD,
+    FARTHEST,
+    LEAST_SEEN,
+    MOST_TURNED,
+    NEAREST,
+    Scene,
+)
 from hybridmap.pose import Pose2
 
 
@@ -51,7 +58,7 @@ def test_a_parking_is_what_the_truth_says(scene):
 
 
 def test_the_command_prints_figures_and_draws(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("benchmarks.parking_run.TIME_LIMIT", 6.0)
+    monkeypatch.setattr("benchmarks.parking.run.TIME_LIMIT", 6.0)
     out = tmp_path / "deep" / "out"
     arguments = ["parking", "--starts", "1", "--goals", "3", "--one-view", "--seed", "4", "--json", "--out"]
     monkeypatch.setattr("sys.argv", [*arguments, str(out)])

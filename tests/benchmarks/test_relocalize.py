@@ -8,16 +8,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import relocalize_pictures
-from benchmarks.fit_belief import fit, reliability
-from benchmarks.relocalize_distractors import Differences, Distractors
-from benchmarks.relocalize_exhaustive import Exhaustive, asked_of, lost
-from benchmarks.relocalize_peer import Vocabulary, WordIndex
-from benchmarks.relocalize_pictures import Disturbance, Photographer, Picture, Wish, taken
-from benchmarks.relocalize_places import Place, placed, spread_out, twin_lookouts
-from benchmarks.relocalize_queries import Query, beside
-from benchmarks.relocalize_score import Reply, ask, figures, judged, spent
-from benchmarks.synthetic import CAMERA, room, take_map, take_view
+from benchmarks.fit_belief.benchmark import fit, reliability
+from benchmarks.relocalize import pictures as relocalize_pictures
+from benchmarks.relocalize.distractors import Differences, Distractors
+from benchmarks.relocalize.exhaustive import Exhaustive, asked_of, lost
+from benchmarks.relocalize.peer import Vocabulary, WordIndex
+from benchmarks.relocalize.pictures import (
+    Disturbance,
+    Photographer,
+    Picture,
+    Wish,
+    taken,
+)
+from benchmarks.relocalize.places import (
+    Place,
+    placed,
+    spread_out,
+    twin_lookouts,
+)
+from benchmarks.relocalize.queries import Query, beside
+from benchmarks.relocalize.score import (
+    Reply,
+    ask,
+    figures,
+    judged,
+    spent,
+)
 from hybridmap.descriptor import decode, root_sift
 from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -28,6 +44,12 @@ from mapserver.relocalizing.belief import Support
 from mapserver.relocalizing.relocalization import Relocalizer
 from merge.graph.merged import MergedMap
 from sim.worlds.catalog import make_world
+from synthetic.world import (
+    CAMERA,
+    room,
+    take_map,
+    take_view,
+)
 
 
 def picture_of(sift: np.ndarray) -> Picture:
@@ -54,7 +76,7 @@ def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match(monkeypatch: py
     judge = Relocalizer(PlaceIndex(), lambda _: None, MergedMap.empty())
     empty = picture_of(np.zeros((1, 128), np.uint8))
     views = [root_sift(one.sift) for one in (empty, asked)]
-    monkeypatch.setattr("benchmarks.relocalize_exhaustive.NODES_AT_ONCE", 4)
+    monkeypatch.setattr("benchmarks.relocalize.exhaustive.NODES_AT_ONCE", 4)
     counts = Exhaustive(places.__getitem__, len(places), judge).may_match(views)[1]
     matches = [len(match_vectors(root_sift(p.sift), root_sift(asked.sift), MatchSettings())) for p in places]
     assert max(matches) > 20 and min(matches) < max(matches)

@@ -10,8 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import relocalize_load
-from benchmarks.relocalize_load import Building, Tally, figures, is_right
+from benchmarks.relocalize_load import benchmark as relocalize_load
+from benchmarks.relocalize_load.benchmark import (
+    Building,
+    Tally,
+    figures,
+    is_right,
+)
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, Whereabouts

@@ -5,15 +5,15 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 
-from benchmarks.relocalize_distractors import Differences, Distractors
-from benchmarks.relocalize_places import Place
-from benchmarks.relocalize_store import fill
-from benchmarks.synthetic import room, take_map
+from benchmarks.relocalize.distractors import Differences, Distractors
+from benchmarks.relocalize.places import Place
+from benchmarks.relocalize_start.store import fill
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
 from mapserver.log.store import Store
+from synthetic.world import room, take_map
 
 
 def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None:

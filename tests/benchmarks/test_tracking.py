@@ -11,8 +11,14 @@ import pytest
 
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
-from benchmarks.tracking import follow
-from benchmarks.tracking_scenes import TEXEL_PX, Drive, room_drive, wall_drive, wall_to_image
+from benchmarks.tracking.benchmark import follow
+from benchmarks.tracking.scenes import (
+    TEXEL_PX,
+    Drive,
+    room_drive,
+    wall_drive,
+    wall_to_image,
+)
 from hybridmap.pose import Pose2
 from sim.camera import WEBCAM
 

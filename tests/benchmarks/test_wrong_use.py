@@ -11,9 +11,7 @@ import benchmarks
 
 FOLDER = Path(benchmarks.__file__).parent
 SEEDED = sorted(
-    path.stem
-    for path in FOLDER.glob("*.py")
-    if 'add_argument("--seed"' in path.read_text() and 'if __name__ == "__main__"' in path.read_text()
+    path.parent.name for path in FOLDER.glob("*/benchmark.py") if 'add_argument("--seed"' in path.read_text()
 )
 """Those that people start, with a seed."""
 WRONG = [
@@ -41,7 +39,7 @@ def test_what_is_wrong_is_said_in_one_line(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    module = importlib.import_module(f"benchmarks.{name}")
+    module = importlib.import_module(f"benchmarks.{name}.benchmark")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", [name, *wrong])
     with pytest.raises(SystemExit) as ended:

@@ -4,11 +4,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.synthetic import CAMERA
 from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
+from synthetic.world import CAMERA
 
 
 def node(number: int) -> Node:

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import CAMERA, random_vectors
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.descriptor import quantise
 from hybridmap.hybrid_map import HybridMap
@@ -16,6 +15,7 @@ from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.reach import ReachSettings, closed_edges, least_in_view, reach_of
 from hybridmap.reach_book import ReachBook
+from synthetic.world import CAMERA, random_vectors
 
 
 def pair(

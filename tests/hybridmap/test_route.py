@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.synthetic import CAMERA
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.route import RouteSettings, edge_cost, find_route
+from synthetic.world import CAMERA
 
 
 def node(number: int, pose: Pose2, agent: str = "r0") -> Node:

@@ -9,13 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
 from mapserver.log.entry import Entry
 from mapserver.log.store import Store
+from synthetic.world import (
+    World,
+    room,
+    take_map,
+    take_view,
+)
 from tests.mapserver.played import HandAgent, Server
 from wire.codec import encode_change
 from wire.memory import MemoryHub

@@ -9,7 +9,6 @@ from functools import cache
 import cv2
 import numpy as np
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import Busy
 from hybridmap.explanation import Explanation
@@ -23,6 +22,7 @@ from mapserver.routes import Router
 from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
 from merge.graph.merged import MergedMap
+from synthetic.world import room, take_map
 from wire.explanation_messages import ExplainRequest
 from wire.log_messages import Scalar
 

@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from mapserver.blockages import Blockages, BlockageSettings
 from mapserver.merging.merger import Merger
 from mapserver.routes import Router
+from synthetic.world import room, take_map
 
 A, B, C = (NodeId("a", 1, number) for number in (1, 3, 5))
 ME = MapId("a", 1)

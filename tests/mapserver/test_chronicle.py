@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut, NodeRetired
 from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.history import Happening, Kind
@@ -23,6 +22,7 @@ from mapserver.ruling_history import with_rulings
 from merge.bodies.clash import Clash
 from merge.graph.links import refuse
 from merge.graph.merged import MergedMap
+from synthetic.world import room, take_map
 from wire.history_codec import (
     KeptHistory,
     decode_history,

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidValue
 from hybridmap.explanation import MapsExplanation, RouteExplanation, Standing
@@ -31,6 +30,7 @@ from mapserver.server import MapServer, ServerSettings
 from merge.belief.consistency import ConsistencySettings
 from merge.graph.merged import MergedMap
 from merge.merging import MergeSettings
+from synthetic.world import room, take_map
 from wire.bus import Reply
 from wire.codec import encode_change
 from wire.explanation_messages import (

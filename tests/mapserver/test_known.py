@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -19,6 +18,7 @@ from mapserver.merging.merger import Merger
 from mapserver.schedule import LockstepSchedule
 from mapserver.server import MapServer
 from merge.graph.merged import MergedMap, Placement
+from synthetic.world import room, take_map
 from wire.keys import Keys
 from wire.memory import MemoryBus, MemoryHub
 from wire.messages import (

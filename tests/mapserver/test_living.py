@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
@@ -16,6 +15,12 @@ from hybridmap.ruling import Ruling, Rulings
 from mapserver.answers import Answers
 from mapserver.living import LivingPlaces, without_faded
 from mapserver.merging.merger import Merger
+from synthetic.world import (
+    World,
+    room,
+    take_map,
+    take_view,
+)
 
 HERE, THERE = MapId("a", 1), MapId("b", 1)
 RETIRED = Ruling((THERE, THERE), True, "anna", 1, "rebuilt")

@@ -9,7 +9,6 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import Sensing, room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.errors import InvalidMessage, InvalidValue
 from hybridmap.explanation import RouteExplanation
@@ -22,6 +21,7 @@ from mapserver.people.explanation_json import route_values
 from mapserver.route_explaining import explain_route
 from mapserver.routes import Router
 from mapweave.explained import route_words
+from synthetic.world import Sensing, room, take_map
 from wire.explanation_messages import ExplainRequest, decode_explain_request, encode_explain_request
 from wire.packing import pack
 from wire.route_explanation import decode_route_explanation, encode_route_explanation

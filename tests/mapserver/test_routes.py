@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import Sensing, room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
@@ -15,6 +14,7 @@ from mapserver.merging.merger import Merger
 from mapserver.routes import Router
 from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_maps
+from synthetic.world import Sensing, room, take_map
 
 ME = MapId("a", 1)
 STEP = 0.8

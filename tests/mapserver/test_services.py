@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import take_node
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View
@@ -22,6 +21,7 @@ from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapserver.server import MapServer, ServerSettings
 from merge.graph.merged import MergedMap
+from synthetic.world import take_node
 from wire.bus import Reply
 from wire.keys import Keys
 from wire.log_messages import decode_record

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import World, room, take_map, take_view
 from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import MapId, Node
 from hybridmap.pose import Pose2
@@ -22,6 +21,12 @@ from mapserver.relocalizing.judgement import NOWHERE
 from mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapserver.upkeep import Upkeep
 from merge.graph.merged import MergedMap
+from synthetic.world import (
+    World,
+    room,
+    take_map,
+    take_view,
+)
 
 
 def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> None:

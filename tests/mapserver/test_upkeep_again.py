@@ -8,7 +8,6 @@ import threading
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
@@ -16,6 +15,7 @@ from mapserver.schedule import LiveSchedule
 from mapserver.upkeep import Upkeep
 from merge.incremental.again import Again
 from merge.incremental.settings import StepSettings
+from synthetic.world import room, take_map
 from tests.waiting import eventually
 
 

@@ -25,7 +25,7 @@ from wire.keys import Keys
 from wire.mapfile import read_map_file, unpack_map_file
 from wire.zenoh_bus import ZenohBus
 
-EXPLORE = 60.0
+EXPLORE = 30.0
 """Simulated seconds of exploration."""
 
 

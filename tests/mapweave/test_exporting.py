@@ -17,7 +17,6 @@ from evo.tools import file_interface
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.errors import InvalidFile, InvalidValue
 from hybridmap.node import EdgeKind, MapId, NodeId
@@ -30,6 +29,7 @@ from mapweave.g2o import G2oEdge, G2oGraph, read_g2o, write_g2o
 from mapweave.g2o_optimum import optimum_of
 from mapweave.map_part import MapPart
 from merge.graph.merged import MergedMap
+from synthetic.world import room, take_map
 from wire.mapfile import write_map_file
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
@@ -24,6 +23,7 @@ from mapweave.cli import MISSING_EXTRA, main
 from mapweave.extras import MODULES
 from mapweave.offline import merge_parts
 from merge.graph.merged import MergedMap
+from synthetic.world import room, take_map
 from tests.mapweave.command_line import commands
 from tests.simulator import needs_simulator
 from wire.mapfile import MapFile, write_map_file

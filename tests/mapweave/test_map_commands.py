@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
@@ -24,6 +23,7 @@ from mapserver.log.store import Store
 from mapserver.mapfiles import merged_of
 from mapweave.cli import main
 from mapweave.trial.children import Children, free_port
+from synthetic.world import room, take_map
 from wire.bus_settings import BusSettings
 from wire.codec import encode_change
 from wire.mapfile import MapFile, read_map_file, write_map_file

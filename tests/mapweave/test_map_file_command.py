@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from mapweave.cli import main
+from synthetic.world import room, take_map
 from wire.mapfile import MapFile, write_map_file
 
 TOUR = [Pose2(2.5, 2.0, h) for h in np.arange(0, 2 * math.pi, math.pi / 3)]

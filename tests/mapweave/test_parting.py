@@ -17,12 +17,12 @@ import pytest
 from agent.sharing.journal import Journal
 from agent.sharing.merged_postures import MergedPostures
 from agent.sharing.replication import Replicator
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from mapweave.cli import main
 from mapweave.trial.children import Children
+from synthetic.world import room, take_map
 from tests.waiting import eventually, free_port
 from wire.bus_settings import BusSettings
 from wire.keys import Keys

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.merge_fleets import FleetSettings, draw_fleet
 from hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
@@ -18,6 +17,7 @@ from merge.incremental.relaxing import RelaxSettings, relax
 from merge.incremental.verdicts import Verdict, Verdicts
 from merge.merging import merge_maps
 from merge.undoing import undo
+from synthetic.fleet import FleetSettings, draw_fleet
 
 SMALL = FleetSettings(robots=5, nodes=16, side=7.0, true_links=80, apart=6)
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_node
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.graph.links import Link, RefusedLink
 from merge.graph.verification import verify
+from synthetic.world import room, take_node
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import World, room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeKind, MapId, NodeId
@@ -16,6 +15,7 @@ from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
 from merge.graph.verification import verify
 from merge.merging import merge_maps
+from synthetic.world import World, room, take_map
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 

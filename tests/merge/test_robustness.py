@@ -6,15 +6,25 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from benchmarks.merge_fleets import FleetSettings, draw_fleet
-from benchmarks.merge_g2o import batch_optimum, chi2_of, factors_of, split
-from benchmarks.merge_grid import draw_grid
-from benchmarks.merge_rivals import RIVALS, error, oracle, precision_recall
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.belief.graduated import wrong_measurements
 from merge.graph.posegraph import Measurement, solve_graph
 from merge.merging import merge_maps
+from synthetic.city import draw_grid
+from synthetic.fleet import FleetSettings, draw_fleet
+from synthetic.merge_rivals import (
+    RIVALS,
+    error,
+    oracle,
+    precision_recall,
+)
+from synthetic.pose_graph import (
+    batch_optimum,
+    chi2_of,
+    factors_of,
+    split,
+)
 
 GATE = 16.27
 SMALL = FleetSettings(nodes=40, side=8.0)

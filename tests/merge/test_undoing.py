@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2
@@ -13,6 +12,7 @@ from hybridmap.ruling import Ruling, Rulings
 from mapserver.merging.merger import Merger
 from merge.explaining.maps import explain_maps
 from merge.graph.merged import MergedMap
+from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
 NOON = 1_772_366_400_000_000_000

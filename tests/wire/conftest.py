@@ -11,7 +11,6 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from benchmarks.synthetic import random_vectors
 from hybridmap.camera import Camera
 from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.descriptor import quantise
@@ -19,6 +18,7 @@ from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.wake import FURTHEST, LONGEST, MOST, Wake
+from synthetic.world import random_vectors
 from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet
 
 # Examples run on machines that are busy with other things.

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.errors import InvalidMessage, InvalidValue
 from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplanation, Standing, Witness
 from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ruling import Ruling
+from synthetic.world import room, take_map
 from wire.explanation_messages import (
     ExplainRequest,
     decode_explain_request,

@@ -9,8 +9,14 @@ import pytest
 from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.ekf.report import Health
 from agent.observation import Odometry
-from benchmarks.ekf_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
 from hybridmap.pose import Pose2
+from synthetic.mapping_run import (
+    AXLE,
+    SHAPES,
+    WHEEL_NOISE,
+    MappingRun,
+    draw_run,
+)
 
 FIRST, LAST, END = 150, 170, 300
 """The fault lasts from one step to the other; the run goes on until the end."""

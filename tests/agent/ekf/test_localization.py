@@ -6,11 +6,11 @@ import pytest
 from agent.ekf.localization import LocalizationFilter
 from agent.ekf.node_state import NodeState
 from agent.observation import Odometry
-from benchmarks.ekf_localization import try_start
-from benchmarks.ekf_run import AXLE, CAMERA, WHEEL_NOISE
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2, PoseGaussian
+from synthetic.localization_run import try_start
+from synthetic.mapping_run import AXLE, CAMERA, WHEEL_NOISE
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.1)
 NOWHERE = (1.0, 1.0)

@@ -6,10 +6,16 @@ import pytest
 from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.ekf.motion import WheelNoise, move_posture, move_rays
 from agent.observation import Odometry
-from benchmarks.ekf_run import AXLE, CAMERA, WHEEL_NOISE, MappingRun, draw_run
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2
+from synthetic.mapping_run import (
+    AXLE,
+    CAMERA,
+    WHEEL_NOISE,
+    MappingRun,
+    draw_run,
+)
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.1)
 STILL = Odometry(0.0, 0.0)

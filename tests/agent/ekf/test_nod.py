@@ -9,9 +9,15 @@ from agent.ekf import mapping
 from agent.ekf.mapping import FilterSettings, MappingFilter
 from agent.ekf.nod import LEAST, evident_nod
 from agent.ekf.report import Health
-from benchmarks.ekf_run import AXLE, CAMERA, WHEEL_NOISE, MappingRun, draw_run
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2
+from synthetic.mapping_run import (
+    AXLE,
+    CAMERA,
+    WHEEL_NOISE,
+    MappingRun,
+    draw_run,
+)
 
 
 def seen_pitched(camera: Camera, pose: Pose2, points: Array, pitch: float) -> Array:

@@ -8,10 +8,21 @@ import pytest
 from scipy.stats import chi2
 
 from agent.ekf.mapping import FilterSettings, MappingFilter
-from benchmarks.ekf import error, filter_error, follow, landmark_nees
-from benchmarks.ekf_batch import batch_optimum
-from benchmarks.ekf_faults import spoil
-from benchmarks.ekf_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
+from synthetic.mapping_error import (
+    error,
+    filter_error,
+    follow,
+    landmark_nees,
+)
+from synthetic.mapping_optimum import batch_optimum
+from synthetic.mapping_run import (
+    AXLE,
+    SHAPES,
+    WHEEL_NOISE,
+    MappingRun,
+    draw_run,
+)
+from synthetic.track_faults import spoil
 
 RUNS = 20
 INTERVAL = chi2.ppf([0.001, 0.999], 3 * RUNS) / RUNS

@@ -101,7 +101,7 @@ def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
     assert questions(steps) == []
     commands = [step.command for step in steps]
     assert commands[:50] == [step.command for step in live(walls, by_chance, 50, {})]
-    assert commands != [step.command for step in live(walls, by_chance, 250, {}, seed=1)]
+    assert commands[:150] != [step.command for step in live(walls, by_chance, 150, {}, seed=1)]
 
 
 def test_ours_turns_all_the_way_around(walls):

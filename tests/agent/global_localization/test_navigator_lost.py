@@ -14,12 +14,12 @@ from agent.mission import Answer, Question, WhereAmI, WhichWay
 from agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from agent.observation import Observation, Odometry
 from agent.tally import Tally
-from benchmarks.synthetic import take_map
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer
+from synthetic.world import take_map
 from tests.agent.scripted_fleet import (
     BODY,
     FREE,

@@ -14,11 +14,17 @@ from agent.global_localization.resumption import Resumption
 from agent.global_localization.settings import ResumptionSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.vision.sift import Features
-from benchmarks.synthetic import CAMERA, World, room, take_map, take_view
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import CODE_BYTES, MapId
 from hybridmap.pose import Pose2, wrap_angle
+from synthetic.world import (
+    CAMERA,
+    World,
+    room,
+    take_map,
+    take_view,
+)
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
 BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)

@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 
 from agent.localizing.recall import RecallSettings, lookalikes, recall, recall_all
-from benchmarks.synthetic import CAMERA, World, room, take_map, take_view
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Landmarks, MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import View
+from synthetic.world import (
+    CAMERA,
+    World,
+    room,
+    take_map,
+    take_view,
+)
 
 HEADINGS = np.arange(0, 2 * math.pi, math.pi / 4)
 

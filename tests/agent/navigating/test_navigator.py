@@ -13,10 +13,10 @@ from agent.navigating.follower_settings import FollowerSettings
 from agent.navigating.navigator import NavigatorSettings, Stage
 from agent.navigating.own_route import own_route
 from agent.tally import Tally
-from benchmarks.synthetic import World
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteAnswer, RouteLeg
+from synthetic.world import World
 from tests.agent.scripted_fleet import (
     BODY,
     EXACT,

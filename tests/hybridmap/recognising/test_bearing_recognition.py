@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_node, take_view
 from hybridmap.node import CODE_BYTES, Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from hybridmap.recognising.bearing_recognition import recognise_bearings, usable_depths
+from synthetic.world import room, take_node, take_view
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 

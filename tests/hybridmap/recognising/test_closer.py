@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from benchmarks.synthetic import Sensing, room, take_node, take_view
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian, averaged
 from hybridmap.recognising.closer import look_closer
 from hybridmap.recognising.planar_pose import PlanarPoseSettings
 from hybridmap.recognising.recognition import recognise
+from synthetic.world import (
+    Sensing,
+    room,
+    take_node,
+    take_view,
+)
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 WORLD = room(0, 0, 5, 4, 700, np.random.default_rng(1))

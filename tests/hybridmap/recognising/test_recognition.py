@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import Sensing, World, room, take_node, take_view
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.recognising.recognition import (
@@ -16,6 +15,13 @@ from hybridmap.recognising.recognition import (
     examine_view,
     recognise,
     register,
+)
+from synthetic.world import (
+    Sensing,
+    World,
+    room,
+    take_node,
+    take_view,
 )
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)

@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import CAMERA, random_vectors
 from hybridmap.descriptor import decode, quantise, rounding_noise
 from hybridmap.errors import InvalidValue
 from hybridmap.node import Landmarks
 from hybridmap.recognising.selection import FIXED_BYTES, SelectionSettings, choose, distinctness, worth
+from synthetic.world import CAMERA, random_vectors
 
 PLENTY = SelectionSettings(most_bytes=100_000)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidFile
 from hybridmap.node import MapId, NodeId
@@ -27,6 +26,7 @@ from merge.incremental.settings import StepSettings
 from merge.incremental.steps import Steps
 from merge.incremental.verdicts import Verdict
 from merge.merging import MergeSettings
+from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
 Log = list[tuple[MapId, ChangeBody]]

@@ -33,7 +33,7 @@ if not path.exists():
     store = Store(path)
     for agent, rooms in (("a", (0, 5)), ("b", (5, 10)), ("c", (0, 10)), ("d", (0, 5))):
         map_id = MapId(agent, 1)
-        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.6 * k) for x in rooms for k in range(10)]
+        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.6 * k) for x in rooms for k in range(6)]
         nodes, edges = take_map(world, map_id, stops, rng)
         for k, body in enumerate((*map(NodePut, nodes), *map(EdgePut, edges)), 1):
             change = Change(map_id, k, 0, body)

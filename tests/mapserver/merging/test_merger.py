@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import Sensing, World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2
@@ -20,6 +19,13 @@ from mapserver.relocalizing.relocalization import RelocalizationSettings, Reloca
 from mapserver.relocalizing.seenplaces import fuse
 from mapserver.routes import Router, RouterSettings
 from merge.graph.merged import MergedMap
+from synthetic.world import (
+    Sensing,
+    World,
+    room,
+    take_map,
+    take_view,
+)
 
 A, B = MapId("a", 1), MapId("b", 1)
 Log = list[tuple[MapId, ChangeBody]]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.synthetic import random_vectors
 from hybridmap.descriptor import decode, quantise
 from hybridmap.recognising.matching import squared_distances
 from mapserver.places.cells import Cells
 from mapserver.places.means import Means
+from synthetic.world import random_vectors
 
 Codes = NDArray[np.uint8]
 Ids = NDArray[np.int64]

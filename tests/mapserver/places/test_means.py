@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.synthetic import random_vectors
 from hybridmap.descriptor import quantise
 from mapserver.places import means as module
 from mapserver.places.means import Means
+from synthetic.world import random_vectors
 
 
 def codes_of(count: int, seed: int) -> NDArray[np.uint8]:

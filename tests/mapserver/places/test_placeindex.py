@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.synthetic import CAMERA, World, room, take_map, take_view
 from hybridmap.descriptor import decode
 from hybridmap.node import Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Pose2
@@ -14,6 +13,13 @@ from mapserver.places.cells import Cells
 from mapserver.places.landmarkindex import LandmarkIndexSettings
 from mapserver.places.placeindex import SLOT_BITS, PlaceIndex, PlaceIndexSettings
 from merge.graph.candidates import overlaps
+from synthetic.world import (
+    CAMERA,
+    World,
+    room,
+    take_map,
+    take_view,
+)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.synthetic import CAMERA, random_vectors, room, take_map, take_view
 from hybridmap.change import Change, NodePut, NodeRetired
 from hybridmap.errors import InvalidFile
 from hybridmap.node import Landmarks, MapId, Node, NodeId
@@ -23,6 +22,13 @@ from mapserver.places.fingerprint import fingerprint, landmark_prints
 from mapserver.places.landmarkindex import LandmarkIndexSettings
 from mapserver.places.placeindex import PlaceIndex, PlaceIndexSettings
 from mapserver.places.placekeeper import SUFFIX, PlaceKeeper
+from synthetic.world import (
+    CAMERA,
+    random_vectors,
+    room,
+    take_map,
+    take_view,
+)
 from wire.codec import encode_change
 
 MAP = MapId("a", 1)

@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import World, room, take_node, take_view
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
@@ -22,6 +21,12 @@ from mapserver.relocalizing.relocalization import Relocalizer
 from merge.graph.merged import MergedMap
 from merge.incremental.islands import Islands
 from merge.incremental.verdicts import Verdicts
+from synthetic.world import (
+    World,
+    room,
+    take_node,
+    take_view,
+)
 from wire.messages import decode_relocalize_answer, encode_relocalize_answer
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import CAMERA, Sensing, room, take_node, take_view
 from hybridmap.camera import Camera
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -19,6 +18,13 @@ from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.relocalizing.seenplaces import Sighting, hidden, is_lonely
 from merge.graph.merged import MergedMap, Placement
 from merge.graph.posegraph import solve_graph
+from synthetic.world import (
+    CAMERA,
+    Sensing,
+    room,
+    take_node,
+    take_view,
+)
 
 NOTHING = np.zeros((0, 2))
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)

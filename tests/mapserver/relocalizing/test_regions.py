@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_node, take_view
 from hybridmap.change import Change, NodePut
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -24,6 +23,7 @@ from mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapserver.upkeep import PREPARED_AT_ONCE, Upkeep
 from merge.graph.merged import MergedMap, Placement
 from merge.graph.posegraph import Measurement, solve_graph
+from synthetic.world import room, take_node, take_view
 from tests.waiting import eventually
 
 ROOM = room(0, 0, 5, 4, 700, np.random.default_rng(1))

@@ -16,35 +16,35 @@ robots = 2
 kind = "office"
 rooms = 3
 [[events]]
-at = 12.0
+at = 8.0
 do = "worsen"
 robot = "r0"
 loss = 0.3
 delay = 0.3
 [[events]]
-at = 16.0
+at = 11.0
 do = "kill_server"
 [[events]]
-plus = 6.0
+plus = 4.0
 do = "start_server"
 [[events]]
-plus = 2.0
+plus = 1.0
 do = "cut"
 robot = "r0"
 [[events]]
-plus = 2.0
+plus = 1.0
 do = "kill_agent"
 robot = "r1"
 [[events]]
-plus = 3.0
+plus = 2.0
 do = "start_agent"
 robot = "r1"
 [[events]]
-plus = 8.0
+plus = 5.0
 do = "restore"
 robot = "r0"
 [[events]]
-plus = 2.0
+plus = 1.0
 do = "light"
 factor = 0.7
 [[events]]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -13,6 +12,7 @@ from hybridmap.pose import Pose2, PoseGaussian
 from merge.belief.credence import credences, prior_odds, probability, standpoints
 from merge.graph.links import Link
 from merge.merging import merge_maps
+from synthetic.world import room, take_map
 
 
 def fleet(seed: int, false_share: float, links: int = 60) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
@@ -14,6 +13,7 @@ from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.verification import verify
 from merge.merging import merge_maps
+from synthetic.world import room, take_map
 
 A, B, GUEST = MapId("a", 1), MapId("b", 1), MapId("guest", 1)
 SIGMAS = np.array([0.02, 0.02, 0.01])

@@ -5,8 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.merge_fleets import FleetSettings, draw_fleet
-from benchmarks.merge_rivals import error, joined_falsely, oracle
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.belief.witnesses import FalseWitnesses, Support, chances, crowds, neighbours, support_of
@@ -14,6 +12,8 @@ from merge.graph.fragments import Fragment
 from merge.graph.links import Link
 from merge.graph.posegraph import Measurement, solve_graph
 from merge.merging import merge_maps
+from synthetic.fleet import FleetSettings, draw_fleet
+from synthetic.merge_rivals import error, joined_falsely, oracle
 
 FLOOR = 12.0
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import EdgePut, NodePut, NodeRetired
 from hybridmap.errors import InvalidValue
 from hybridmap.explanation import Standing
@@ -29,6 +28,7 @@ from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import LEAST_SIGMAS, Measurement, solve_graph
 from merge.graph.verification import VerificationSettings
+from synthetic.world import room, take_map
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 

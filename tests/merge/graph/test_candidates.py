@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from benchmarks.synthetic import room, take_map, take_node
 from hybridmap.descriptor import decode
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.graph.candidates import CandidateSettings, choose_pairs, overlap, overlaps
+from synthetic.world import room, take_map, take_node
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 

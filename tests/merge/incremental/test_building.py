@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.merge_building import Building
 from mapserver.merging.merger import Merger
+from synthetic.building import Building
 
 
 @pytest.mark.slow

@@ -7,8 +7,6 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from benchmarks.life_drives import Drive, DriveSettings, drives
-from benchmarks.merge_fleets import FleetSettings, link_between
 from hybridmap.change import NodeRetired
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -23,6 +21,8 @@ from merge.incremental.settings import StepSettings
 from merge.incremental.verdicts import Verdicts
 from merge.merging import merge_maps
 from merge.undoing import undo
+from synthetic.drives import Drive, DriveSettings, drives
+from synthetic.fleet import FleetSettings, link_between
 from tests.merge.lives import Life
 
 FLOOR = FleetSettings(nodes=24, side=5.0)

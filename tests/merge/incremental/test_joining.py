@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.merge_building import Building
-from benchmarks.merge_fleets import BARE, CAMERA
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
@@ -21,13 +19,15 @@ from merge.incremental.pools import Pools
 from merge.incremental.settings import StepSettings
 from merge.incremental.verdicts import Verdicts
 from merge.merging import merge_maps
+from synthetic.building import Building
+from synthetic.fleet import BARE, CAMERA
 from tests.merge.lives import DENSE, Life, polished
 
 
 def test_a_first_merge_in_steps_is_the_merge_made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten maps of a building, all at once: pools that are ranked by what was found before, and few rounds."""
     building = Building.draw(8, 50, 3)
-    monkeypatch.setattr("benchmarks.merge_building.take_node", bare_node)
+    monkeypatch.setattr("synthetic.building.take_node", bare_node)
     maps = {MapId(f"r{k}", 1): HybridMap(body for _, body in building.log(k)) for k in range(8)}
     verdicts = Verdicts()
     _, links = building.knowledge(np.ones(building.rooms.shape, np.bool_))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -20,6 +19,15 @@ from merge.graph.links import Link
 from merge.life.fading import Fader, FadingSettings, found_again, presence, things
 from merge.life.looks import Look, expected
 from merge.life.renewal import RenewalSettings
+from synthetic.world import (
+    CAMERA,
+    Sensing,
+    World,
+    random_vectors,
+    room,
+    take_map,
+    take_node,
+)
 
 S = FadingSettings()
 L = S.looks
@@ -193,7 +201,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
 def test_only_what_is_new_is_looked_at_and_tells_what_all_would(monkeypatch: pytest.MonkeyPatch) -> None:
     """From drive to drive, nodes that others stand for included, as a fader that sees the last map alone."""
     rng = np.random.default_rng(4)
-    world = room(0, 0, 12, 4, 1400, rng)
+    world = room(0, 0, 8, 4, 950, rng)
     thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
     other = replace(world, vectors=world.vectors.copy())
     other.vectors[thing] = random_vectors(len(thing), rng)
@@ -209,7 +217,7 @@ def test_only_what_is_new_is_looked_at_and_tells_what_all_would(monkeypatch: pyt
     counts, faded, agree = [], 0, []
     for epoch, now in enumerate([world, *[other] * 6], start=1):
         # The first drives go through all of the room, the last ones through its western end.
-        xs = np.arange(1.0, 11.0 if epoch < 5 else 3.0, 0.5)
+        xs = np.arange(1.0, 7.0 if epoch < 5 else 2.5, 0.5)
         tour = [Pose2(x, 2.0 + rng.normal(0, 0.04), rng.normal(0, 0.03)) for x in xs]
         _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
         judged.clear()

@@ -9,7 +9,6 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map, take_view
 from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
@@ -28,6 +27,7 @@ from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.verification import verify
 from merge.life.renewal import RenewalSettings
+from synthetic.world import room, take_map, take_view
 from wire.mapfile import pack_map_file, unpack_map_file
 
 OLD, NEW, OTHER = MapId("r0", 1), MapId("r0", 2), MapId("r1", 1)

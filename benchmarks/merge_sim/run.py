@@ -1,0 +1,213 @@
+"""One run of `benchmarks.merge_sim`, as a process of its own: a trial, then what its merged map is worth.
+
+    python -m benchmarks.merge_sim.run SCENARIO SEED [--set KEY=VALUE ...]
+
+Prints one JSON object. It is a process so that a run that is killed, or runs out of memory, is one run less.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.merge_sim.views import views_shared
+from hybridmap.errors import MapweaveError
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import EdgeKind, MapId, NodeId
+from hybridmap.pose import Array, Pose2
+from mapweave.scoring import FALSE_LINK, FALSE_LINK_TURN, align, is_false, posture_error
+from mapweave.trial.recording import Recording
+from mapweave.trial.run import TrialOptions, run_trial
+from mapweave.trial.scenario import Scenario, load_scenario, scenario_path
+from mapweave.trial.score import node_truth
+from merge.graph.links import Link
+from merge.graph.verification import verify
+from sim.world import PanelSet
+
+VIEW = 0.5
+"""Two images share a view if each shows at least this share of what the other one shows."""
+SIDE = math.radians(45.0)
+"""What two images show from directions further apart than this, they do not show from one side."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run has come to.
+
+    Attributes:
+        scenario: its name.
+        seed: of everything.
+        nodes: of the merged map.
+        maps: that have nodes.
+        components: of the merged map.
+        merged_ate_m: root mean square error of the nodes after one rigid alignment a component, m.
+        links: between maps.
+        false_links: of these, off by more than 0.5 m or 15 degrees.
+        false_merges: pairs of maps in one component that stand to each other wrongly, by as much.
+        shared_views: pairs of nodes of different maps that truly share a view.
+        linked_views: of these, pairs that a true link joins.
+        one_side: pairs that share a view which both have from one side: what is counted lies within 45
+            degrees of the other's line of sight.
+        verified_one_side: of these, pairs that are truly recognised when one asks for them.
+        linked_one_side: of these, pairs that a true link joins.
+        place_recall: as `mapweave sim run` has it: share of the chances to join a node's place to another
+            map's that are taken; None without any.
+        sim_s: simulated time, s.
+        wall_s: how long that took, s.
+    """
+
+    scenario: str
+    seed: int
+    nodes: int
+    maps: int
+    components: int
+    merged_ate_m: float | None
+    links: int
+    false_links: int
+    false_merges: int
+    shared_views: int
+    linked_views: int
+    one_side: int
+    verified_one_side: int
+    linked_one_side: int
+    place_recall: float | None
+    sim_s: float
+    wall_s: float
+
+
+def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
+    """Simulate and score.
+
+    Raises:
+        MapweaveError: the trial could not be run.
+    """
+    trial = run_trial(scenario, TrialOptions(seed, out, processes=False, film_every=0.0, quiet=True))
+    recording, figures = trial.recording, trial.figures
+    truth = node_truth(recording)
+    whole = HybridMap(recording.merged.changes)
+    links = [edge for edge in whole.edges.values() if edge.kind is EdgeKind.MERGED]
+    views = shared_views(recording, scenario, seed, truth)
+    one_side = shared_views(recording, scenario, seed, truth, SIDE)
+    found = [verify(whole.nodes[a], whole.nodes[b]) for a, b in sorted(sorted(pair) for pair in one_side)]
+    right = {frozenset((link.a, link.b)) for link in links if not is_false(link, truth)}
+    return Run(
+        scenario=scenario.name,
+        seed=seed,
+        nodes=figures.nodes,
+        maps=figures.maps,
+        components=figures.components,
+        merged_ate_m=figures.merged_ate_m,
+        links=figures.links,
+        false_links=figures.false_links,
+        false_merges=false_merges(
+            {
+                node: (component, posture.mean)
+                for node, (component, posture) in recording.merged.postures.items()
+            },
+            truth,
+        ),
+        shared_views=len(views),
+        linked_views=len(views & right),
+        one_side=len(one_side),
+        verified_one_side=sum(isinstance(one, Link) and not is_false(one.edge(), truth) for one in found),
+        linked_one_side=len(one_side & right),
+        place_recall=figures.link_recall,
+        sim_s=figures.sim_s,
+        wall_s=round(figures.wall_s, 1),
+    )
+
+
+def shared_views(
+    recording: Recording,
+    scenario: Scenario,
+    seed: int,
+    truth: Mapping[NodeId, Pose2],
+    most_angle: float = math.pi,
+) -> set[frozenset[NodeId]]:
+    """Pairs of nodes of different maps whose images truly show the same surfaces.
+
+    Args:
+        recording: of the trial; the furniture has stood still.
+        scenario: that was tried.
+        seed: of its world.
+        truth: `world_from_robot` of each node.
+        most_angle: rad, between the lines of sight to what counts as shared.
+    """
+    panels = PanelSet.of(scenario.world(seed).panels)
+    nodes = sorted(truth)
+    camera = scenario.robots[0].camera.intrinsics
+    both = views_shared(panels, camera, [truth[node] for node in nodes], VIEW, most_angle) >= VIEW
+    pairs = ((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(both, 1)))
+    return {frozenset(pair) for pair in pairs if pair[0].map != pair[1].map}
+
+
+def false_merges(postures: Mapping[NodeId, tuple[int, Pose2]], truth: Mapping[NodeId, Pose2]) -> int:
+    """How many pairs of maps are joined wrongly.
+
+    The part of a map in a component is laid over the truth by itself. Two maps in one component are joined
+    wrongly if a node of the one, laid over the truth with its own map and with the other's, is off by more
+    than 0.5 m or 15 degrees: the median of both maps' nodes decides.
+
+    Args:
+        postures: component and merged posture of each node.
+        truth: `world_from_robot` of each.
+    """
+    parts: dict[int, dict[MapId, list[NodeId]]] = {}
+    for node, (component, _) in sorted(postures.items()):
+        if node in truth:
+            parts.setdefault(component, {}).setdefault(node.map, []).append(node)
+    wrong: set[tuple[MapId, MapId]] = set()
+    for maps in parts.values():
+        laid = {one: _world_from_merged(nodes, postures, truth) for one, nodes in maps.items()}
+        for one, other in combinations(sorted(maps), 2):
+            off = [
+                posture_error(laid[one] @ postures[node][1], laid[other] @ postures[node][1])
+                for node in (*maps[one], *maps[other])
+            ]
+            metres, turn = np.median(np.array(off), axis=0)
+            if metres > FALSE_LINK or turn > FALSE_LINK_TURN:
+                wrong.add((one, other))
+    return len(wrong)
+
+
+def _world_from_merged(
+    nodes: Sequence[NodeId],
+    postures: Mapping[NodeId, tuple[int, Pose2]],
+    truth: Mapping[NodeId, Pose2],
+) -> Pose2:
+    if len(nodes) == 1:
+        return truth[nodes[0]] @ postures[nodes[0]][1].inverse()
+    estimated: Array = np.array([[postures[n][1].x, postures[n][1].y] for n in nodes])
+    return align(estimated, np.array([[truth[n].x, truth[n].y] for n in nodes]))
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.merge_sim.run", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("scenario", help="a .toml file, or a name from `mapweave sim list`")
+    parser.add_argument("seed", type=int, help="of everything")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
+    arguments = parser.parse_args()
+    try:
+        scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
+        with tempfile.TemporaryDirectory() as folder:
+            run = run_one(scenario, arguments.seed, Path(folder))
+    except MapweaveError as problem:
+        print(problem, file=sys.stderr)
+        raise SystemExit(1) from None
+    print(json.dumps(asdict(run), allow_nan=False))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""The scene of the parking benchmark: a robot maps a goal in the arena by itself, and is put down behind it.
+
+The simulator's truth draws the scene and scores it; the robot never sees it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.exploring.exploration import Phase
+from agent.mission import Answer, Explore, Question, WhereAmI, WhichWay
+from agent.pipeline import Pipeline
+from benchmarks.servo.planner import shortest_length
+from benchmarks.servo.world import CAMERA as PLANNER_CAMERA
+from benchmarks.servo.world import Task
+from hybridmap.change import NodePut
+from hybridmap.errors import MapweaveError
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, Node
+from hybridmap.pose import Pose2
+from mapserver.merging.merger import Merger
+from mapserver.relocalizing.relocalization import Relocalizer
+from mapserver.routes import Router
+from sim.floorplan import FloorPlan
+from sim.places import is_clear
+from sim.simulation import Simulation
+from sim.worlds.catalog import make_world
+
+ROBOT = "r0"
+NEAREST_VIEW, FARTHEST_VIEW = 1.5, 5.0
+"""m from the goal to the wall that it looks at."""
+NEAREST, FARTHEST, AHEAD = 0.3, 2.5, 0.1
+"""m; starts are so far from the goal, and at most so far ahead of it."""
+MOST_TURNED = math.pi / 4
+"""rad; the start's heading is within this of the goal's."""
+LEAST_SEEN = 6
+"""Landmarks of the goal in the image at the start."""
+ROOM = 0.1
+"""m of free floor around the footprint at the goal, at the start and between them."""
+PLANNED = 24
+"""Landmarks of which the planner knows; with more it would find no fewer ways."""
+MAPPING_TICKS = 3000
+"""The robot has five minutes to map what is around the goal."""
+
+
+class NoGoal(MapweaveError):
+    """The arena has no place to park at."""
+
+
+class Scene:
+    """One arena, one robot, one goal that the robot has mapped.
+
+    Attributes:
+        description: of the robot.
+        own_map: what the robot has mapped.
+        goal: the node at which it shall park.
+        world_from_goal: where the robot really stood when it took the goal's image.
+        mapping_s: simulated time that the mapping took, s.
+    """
+
+    def __init__(self, seed: Sequence[int], one_view: bool) -> None:
+        """Build the arena and let the robot map what it sees from a place in it.
+
+        Args:
+            seed: other seeds, other prints on the walls, another goal, other wheels, other noise.
+            one_view: whether it maps the goal's view alone; else it looks all around the place, as it does
+                when it explores.
+
+        Raises:
+            NoGoal: no place with a wall at the right distance, or the robot made no node of the view.
+        """
+        rng = np.random.default_rng([*seed, 0x9A4C])
+        number = int(rng.integers(2**31))
+        self._world, self._number = make_world("arena", number), number
+        self.plan: FloorPlan = self._world.plan
+        with self.simulate(_goal(self.plan, rng)) as simulation:
+            self.description = simulation.describe(ROBOT)
+            self.own_map, self.goal = self._map(simulation, one_view)
+            self.mapping_s = simulation.stamp_ns / 1e9
+            self.world_from_goal = simulation.truth_at(ROBOT, self.goal.stamp_ns)
+        merger = Merger()
+        for change in self.own_map.contents():
+            merger.apply(self.goal.id.map, change)
+        merged = merger.merged()
+        self._relocalizer = Relocalizer(merger.index, merger.node, merged)
+        self._router = Router(merged)
+
+    def simulate(self, world_from_robot: Pose2) -> Simulation:
+        """The arena with the same robot, put down somewhere: no start depends on the starts before it."""
+        return Simulation(self._world, [ROBOT], self._number, [world_from_robot])
+
+    def answer(self, question: Question) -> Answer:
+        """What the map server says to a robot's question."""
+        match question:
+            case WhereAmI():
+                return Answer(question.number, self._relocalizer.answer(question.view))
+            case WhichWay():
+                way = self._router.route(
+                    question.start, question.goal, question.blocked,
+                    start_from_robot=question.start_from_robot,
+                )  # fmt: skip
+                return Answer(question.number, way)
+        return Answer(question.number, None, "there are no other robots")
+
+    def draw_start(self, rng: np.random.Generator) -> Pose2:
+        """A start, `goal_from_robot`, by the issue's rule; whether there is a path is not asked."""
+        radius = self.description.radius + ROOM
+        here = (self.world_from_goal.x, self.world_from_goal.y)
+        for _ in range(10_000):
+            distance, direction = rng.uniform(NEAREST, FARTHEST), rng.uniform(-math.pi, math.pi)
+            turn = float(rng.uniform(-MOST_TURNED, MOST_TURNED))
+            start = Pose2(distance * math.cos(direction), distance * math.sin(direction), turn)
+            there = self.world_from_goal @ start
+            if start.x > AHEAD or self.seen(start) < LEAST_SEEN:
+                continue
+            if is_clear(self.plan, [here, (there.x, there.y)], radius):
+                return start
+        raise NoGoal("no start behind the goal sees six of its landmarks")
+
+    def seen(self, goal_from_robot: Pose2) -> int:
+        """How many of the goal's landmarks are in the image at a posture, as far as geometry tells."""
+        return int(self.in_view(goal_from_robot).sum())
+
+    def in_view(self, goal_from_robot: Pose2) -> NDArray[np.bool_]:
+        """(N,) which of the goal's landmarks are in the image at a posture."""
+        camera = self.goal.camera
+        pixels = camera.project(goal_from_robot.inverse().apply(self.goal.points_in_robot))
+        return camera.contains(pixels)
+
+    def shortest(self, start: Pose2) -> float | None:
+        """Length of the shortest path that keeps four landmarks in view, m; None if there is none."""
+        points = self.goal.points_in_robot
+        order = np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable")
+        few = points[order[np.linspace(0, len(order) - 1, min(PLANNED, len(order))).round().astype(int)]]
+        few[:, 2] += PLANNER_CAMERA.mount_height - self.goal.camera.mount_height
+        return shortest_length(Task(start, few))
+
+    def _map(self, simulation: Simulation, one_view: bool) -> tuple[HybridMap, Node]:
+        """Explore until the view from the start is a node, or all the views from there are."""
+        pipeline = Pipeline(MapId(ROBOT, 1), self.description)
+        pipeline.set_mission(Explore())
+        observation, made, answers = simulation.observe(ROBOT), list[Node](), tuple[Answer, ...]()
+        for _ in range(MAPPING_TICKS):
+            step = pipeline.step(observation, answers)
+            answers = tuple(Answer(q.number, None, "there is no map server yet") for q in step.questions)
+            made += [change.node for change in step.changes if isinstance(change, NodePut)]
+            leaves = step.status.finished or step.status.doing == Phase.TRAVELLING
+            if made and (one_view or leaves):
+                return pipeline.map, made[0]
+            observation = simulation.step({ROBOT: step.command})[ROBOT]
+        raise NoGoal(f"{self._world.name}: the robot made no node of the view: {step.status.detail}")
+
+
+def _goal(plan: FloorPlan, rng: np.random.Generator) -> Pose2:
+    """A free place that looks at a wall 1.5 to 5 m away, with room behind it to start from."""
+    ways = np.arange(0.0, FARTHEST_VIEW + 0.5, 0.05)
+    for _ in range(1000):
+        pose = plan.random_free_pose(rng, 0.5)
+        line = pose.apply(np.column_stack([ways, np.zeros_like(ways)]))
+        free = plan.clearances(line) > 0.0
+        view = float(ways[int(free.argmin())]) if not free.all() else math.inf
+        behind = pose.apply(np.array([-1.2, 0.0]))
+        if NEAREST_VIEW <= view <= FARTHEST_VIEW and plan.is_free(float(behind[0]), float(behind[1]), 0.3):
+            return pose
+    raise NoGoal("the arena has no place to park at")

@@ -1,0 +1,163 @@
+"""How long a server with a large store takes to start, until it answers lost robots rightly.
+
+    python -m benchmarks.relocalize_start [--nodes N] [--seed N] [--store FOLDER] [--json]
+
+Fills a store with the logs of a fleet (benchmarks.relocalize_start.store), then starts a real `mapweave
+server` on it twice: with nothing but the store, and with the place index that the first one saved when it
+was ended. Robots ask over Zenoh where views near real places were taken, from the beginning; the clock
+stops when an answer comes back (`answer_s`), and runs from the start of the process. Then all questions are
+asked once, while the server still compares the maps: it does so beside the answers, and is not waited for.
+
+Filling takes about 3 ms of processor a node, and 4.5 kB of disk; with --store it is kept, and used again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.relocalize.distractors import gather
+from benchmarks.relocalize.places import Place, mapped, mapped_sites
+from benchmarks.relocalize.queries import Query, known
+from benchmarks.relocalize.score import judged, share
+from benchmarks.relocalize_start.store import fill
+from hybridmap.query import RelocalizeAnswer
+from mapserver.places.placekeeper import SUFFIX
+from mapweave.trial.children import Children, free_port
+from wire.bus_settings import BusSettings
+from wire.keys import Keys
+from wire.log_messages import decode_record
+from wire.messages import decode_relocalize_answer, encode_view
+from wire.zenoh_bus import ZenohBus
+
+REAL, DONORS = 1000, 800
+"""Views behind the nodes: those of benchmarks.relocalize, which keeps its pictures."""
+QUESTIONS = 100
+FLEET, NAME = "start", "s0"
+PATIENCE = 10.0
+"""For one answer, s."""
+LONGEST = 1800.0
+"""Until the first answer, s."""
+
+
+def start(folder: Path, queries: Sequence[Query], places: Sequence[Place], bar: Progress) -> dict[str, float]:
+    """Start a server, ask, and end it.
+
+    Returns:
+        Seconds from the start of the process: `answer_s`, of which of processors `answer_cpu_s`. Of all
+        questions then, while maps are compared: `right_share` of the answers "here" (`here_share`), their
+        times, and how many told a posture in a merged frame (`in_frame_share`). `peak_mb` of memory.
+    """
+    truth = {place.node.id: place for place in places}
+    endpoint, task = f"tcp/127.0.0.1:{free_port()}", bar.add_task("a server starts", total=len(queries))
+    with Children(folder / "logs") as children:
+        began = time.monotonic()
+        children.start(
+            NAME, ["server", "--fleet", FLEET, "--listen", endpoint, "--data", str(folder), "--name", NAME]
+        )
+        pid, bus = children.pid(NAME), ZenohBus(BusSettings(endpoints=(endpoint,)))
+        try:
+            while _ask(bus, queries[0]) is None:
+                children.check()
+                if time.monotonic() - began > LONGEST:
+                    raise SystemExit(f"no answer within {LONGEST:g} s")
+                time.sleep(0.05)
+            out = {"answer_s": time.monotonic() - began, "answer_cpu_s": _cpu(pid)}
+            took, replies, framed = [], [], 0
+            for query in queries:
+                asked = time.monotonic()
+                answer = _ask(bus, query)
+                if answer is not None:
+                    took.append(time.monotonic() - asked)
+                    reply = judged(query, answer, truth)
+                    replies.append(reply)
+                    best = answer.candidates[:1]
+                    framed += bool(best and best[0].merged_from_robot is not None)
+                bar.advance(task)
+            status = decode_record(bus.ask(Keys(FLEET).server_status(NAME), b"", PATIENCE)[0].payload)
+            here = [reply for reply in replies if reply.certainty == "found"]
+            out |= {
+                "answered_share": len(took) / len(queries), "here_share": len(here) / max(len(replies), 1),
+                "right_share": share(here, lambda reply: reply.near),
+                "in_frame_share": framed / max(sum(math.isfinite(r.error_m) for r in replies), 1),
+                "p50_ms": 1e3 * float(np.median(took)), "p95_ms": 1e3 * float(np.percentile(took, 95)),
+                "settled": float(bool(status["settled"])), "peak_mb": _peak_mb(pid),
+            }  # fmt: skip
+        finally:
+            bus.close()
+        began = time.monotonic()
+        children.end(NAME, 600.0)
+        out["end_s"] = time.monotonic() - began
+    return out
+
+
+def _ask(bus: ZenohBus, query: Query) -> RelocalizeAnswer | None:
+    """The answer; None while the server does not listen yet, or is busy."""
+    replies = bus.ask(Keys(FLEET).any_relocalize(), encode_view(query.picture.view), PATIENCE)
+    good = [reply for reply in replies if not reply.error]
+    return decode_relocalize_answer(good[0].payload) if good else None
+
+
+def _cpu(pid: int) -> float:
+    """Seconds of processors that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _peak_mb(pid: int) -> float:
+    """Most memory that a process has held."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.relocalize_start", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--nodes", type=int, default=10_000, help="in the store (default 10000)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--store", type=Path, help="folder for the store, which is kept there and used again")
+    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
+    arguments = parser.parse_args()
+    if arguments.nodes < REAL or arguments.seed < 0:
+        parser.error(f"at least {REAL} nodes and a seed that is not negative are needed")
+    console, seed = Console(stderr=arguments.json), arguments.seed
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="mapweave-start") as temporary, Progress(console=console) as bar:
+        folder = arguments.store or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        path, sites = folder / f"{NAME}.sqlite", mapped_sites(seed)
+        saved = path.with_name(path.name + SUFFIX)
+        task = bar.add_task("views", total=REAL + DONORS + QUESTIONS)
+        places = mapped(sites, REAL, seed, lambda: bar.advance(task))
+        queries = known("near", QUESTIONS, sites, places, seed, lambda: bar.advance(task))
+        if not path.exists():
+            distractors = gather(DONORS, places, seed, lambda: bar.advance(task))
+            filling = bar.add_task("the store is filled", total=arguments.nodes)
+            fill(path, places, distractors, arguments.nodes, lambda more: bar.advance(filling, more))
+        bar.update(task, completed=REAL + DONORS + QUESTIONS)
+        saved.unlink(missing_ok=True)
+        for name in ("store_alone", "with_saved_index"):
+            found[name] = {key: round(one, 3) for key, one in start(folder, queries, places, bar).items()}
+        found |= {"store_mb": round(path.stat().st_size / 1e6, 1)}
+        found |= {"saved_index_mb": round(saved.stat().st_size / 1e6, 1)}
+    table = Table("", "store alone", "with the saved index", title=f"{arguments.nodes} nodes")
+    for key in found["store_alone"]:
+        table.add_row(key, f"{found['store_alone'][key]:g}", f"{found['with_saved_index'][key]:g}")
+    console.print(table)
+    if arguments.json:
+        run = {"nodes": arguments.nodes, "seed": seed, "load": round(os.getloadavg()[0], 1)}
+        print(json.dumps({**found, **run}))
