@@ -14,7 +14,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV), 1.5 GB (a minute or two) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	@$(BIN)/python -c 'from agent.ekf import kernels; kernels.load()'  # compiles the filters once, not in the first drive
+	@$(BIN)/python -c 'from hybridmap.recognising.kernels import kernels; kernels()'  # compiles once, not when a robot is lost
 	@touch $(STAMP)
 
 demo: setup
