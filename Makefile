@@ -14,7 +14,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV), 1.5 GB (a minute or two) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	@$(BIN)/python -c 'from hybridmap.recognising.kernels import kernels; kernels()'  # compiles once, not when a robot is lost
+	@$(BIN)/python -c 'import agent.runner; from hybridmap import jit; jit.load()'  # compiles once, not while a robot waits
 	@touch $(STAMP)
 
 demo: setup

@@ -17,6 +17,11 @@ from hybridmap.recognising.recognition import (
     recognise,
     register,
 )
+from tests.hybridmap.kernel_forms import form
+
+__all__ = ["form"]
+
+pytestmark = pytest.mark.usefixtures("form")
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 
