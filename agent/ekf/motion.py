@@ -178,7 +178,7 @@ def propagate(
     root = by_input @ input_root
     # A product with its own transpose is symmetric to the last bit.
     out += root @ root.T
-    out[[0, 1, 2], [0, 1, 2]] += variances
+    out.ravel()[: 3 * size + 3 : size + 1] += variances
     return out
 
 
