@@ -30,6 +30,7 @@ from agent.servo.proximity import guard
 from agent.tally import Tally
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
+from hybridmap import jit
 from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
@@ -126,6 +127,7 @@ class Pipeline:
             contents: of the map, as `Journal.resume` gives it.
             next_number: the first that no node or edge of the map has ever had.
         """
+        jit.load()  # a robot that drives must not wait for a compiler
         self._map_id = map_id
         self._settings = settings or PipelineSettings()
         self._description = description

@@ -13,7 +13,6 @@ import struct
 import zlib
 from dataclasses import dataclass
 from functools import cache
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,18 +86,20 @@ def unpack_features(data: bytes, camera: Camera) -> tuple[NDArray[np.float32], N
 
 
 @cache
-def _code_columns() -> Columns:
-    return Columns(tuple(Column(frequencies) for frequencies in landmark_tables().codes))
-
-
-@cache
-def _all_columns() -> Columns:
-    return Columns((*_code_columns().columns, *_depth_columns()))
+def _code_columns() -> tuple[Column, ...]:
+    return tuple(Column(frequencies) for frequencies in landmark_tables().codes)
 
 
 @cache
 def _depth_columns() -> tuple[Column, Column]:
     return Column(landmark_tables().shares), Column(landmark_tables().cells)
+
+
+@cache
+def _read_columns() -> tuple[Columns, Columns, Columns]:
+    """Of codes, shares and cells."""
+    shares, cells = _depth_columns()
+    return Columns.of(_code_columns()), Columns.of([shares]), Columns.of([cells])
 
 
 def _pack(rounded: Rounded, codes: NDArray[np.uint8], with_depths: bool) -> bytes:
@@ -118,7 +119,7 @@ def _pack(rounded: Rounded, codes: NDArray[np.uint8], with_depths: bool) -> byte
     if with_depths:
         _push_depths(lanes, rounded)
     for k in reversed(range(CODE_BYTES)):
-        lanes.push(codes[:, k].astype(np.int64), _code_columns().columns[k])
+        lanes.push(codes[:, k].astype(np.int64), _code_columns()[k])
     flags = ASCENDING * ascending + WITH_DEPTHS * with_depths
     head = HEAD.pack(VERSION, flags, count, least_x, reach_x, least_y, reach_y)
     rows = row, np.ones_like(row)
@@ -172,47 +173,13 @@ _Parts = tuple[Ints, Ints, NDArray[np.uint8], Ints, Ints]
 
 
 def _read(data: bytes, lay: _Layout) -> _Parts:
-    compiled = _compiled()
-    if compiled is None:
-        return _read_by_columns(data, lay)
-    n, some = lay.count, lay.count if lay.with_depths else 0
-    high, states, share, depth = (np.zeros(k, np.int64) for k in (n, n, some, some))
-    codes = np.empty((n, CODE_BYTES), np.uint8)
-    verdict = compiled.unpack(
-        np.frombuffer(bytearray(data) + bytes(5), np.uint8), lay.size,
-        0 if lay.steps is None or not n else n + lay.steps,
-        *_all_columns().tables, FINE_BITS, high, states, codes, share, depth,
-    )  # fmt: skip
-    if verdict == compiled.CUT_OFF:
-        raise InvalidMessage("landmarks: cut off")
-    if verdict == compiled.WRONG_ROWS:
-        raise InvalidMessage(f"landmarks: the rows are not those of {n} landmarks")
-    if verdict == compiled.LEFT_OVER:
-        raise InvalidMessage("landmarks: more than there should be")
-    if not lay.with_depths:
-        share = depth = np.zeros(n, np.int64)
-    return states - (1 << lay.size), high, codes, share, depth
-
-
-def _read_by_columns(data: bytes, lay: _Layout) -> _Parts:
-    """The same where nothing can be compiled."""
     bits, nothing = BitReader(data), np.zeros(lay.count, np.int64)
     high = nothing if lay.steps is None else _read_row(bits, lay.count, lay.steps)
     lanes = LaneReader(bits, lay.count, lay.size)
-    codes = np.ascontiguousarray(lanes.pop_columns(_code_columns()).T)
+    codes = np.ascontiguousarray(lanes.pop(_read_columns()[0]).T)
     share, depth = _pop_depths(lanes) if lay.with_depths else (nothing, nothing)
     bits.end()
     return lanes.states - (1 << lay.size), high, codes, share, depth
-
-
-@cache
-def _compiled() -> ModuleType | None:
-    """wire.compiled_lanes, where this installation has a compiler for it."""
-    try:
-        from wire import compiled_lanes
-    except ImportError:
-        return None
-    return compiled_lanes
 
 
 def _push_depths(lanes: LaneWriter, rounded: Rounded) -> None:
@@ -226,12 +193,12 @@ def _push_depths(lanes: LaneWriter, rounded: Rounded) -> None:
 
 
 def _pop_depths(lanes: LaneReader) -> tuple[Ints, Ints]:
-    shares, cells = _depth_columns()
-    share = lanes.pop(shares)
+    _, shares, cells = _read_columns()
+    share = lanes.pop(shares)[0].astype(np.int64)
     known = np.flatnonzero(share)
     fine = FINE_BITS[share[known]]
     depth = np.zeros(len(share), np.int64)
-    cell = lanes.pop(cells, known)
+    cell = lanes.pop(cells, known)[0].astype(np.int64)
     depth[known] = (cell << fine) | lanes.pop_plain(fine, known)
     return share, depth
 

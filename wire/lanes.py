@@ -4,25 +4,31 @@ Each lane is a state in [2^m, 2^(m+1)) to which symbols are pushed and from whic
 first out (Duda, arXiv:1311.2540, the variant with ranges; side by side after Giesen, arXiv:1402.3392). A
 symbol of frequency f of 2^12 costs 12 - log2(f) bits. What does not fit into the state any more goes to the
 stream bit by bit; so a lane costs its m bits at the end and hardly half a bit more, and its first state may
-hold m bits of something else. All lanes move together: a column is a few operations on arrays.
+hold m bits of something else. All lanes move together: a column is a few operations on arrays, which numba
+compiles where it is installed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import InvalidMessage
+from hybridmap.jit import compiled
 from hybridmap.landmark_tables import TOTAL_BITS
 
 TOTAL = 1 << TOTAL_BITS
-Ints = NDArray[np.int64]
-Small = NDArray[np.uint16]
+Ints = Annotated[NDArray[np.int64], 1]
+Small = Annotated[NDArray[np.uint16], 2]
+Bytes = Annotated[NDArray[np.uint8], 2]
 Lanes = Ints | slice
 EVERY = slice(None)
+CUT_OFF = "landmarks: cut off"
 
 
 def log2(numbers: Ints) -> Ints:
@@ -61,28 +67,67 @@ class Column:
         return np.arange(TOTAL) - self.starts[self.symbols]
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Columns that are read one after the other.
+class Columns(NamedTuple):
+    """Columns that are read one after the other, by the slot of a state; see Column.
+
+    They are small, because all of them are needed for each landmark.
 
     Attributes:
-        columns: K of them, in the order of reading.
+        symbols: (K, 4096).
+        widths: (K, 4096).
+        places: (K, 4096).
+        missing: (K, 4096) bits that a state lacks at least after a symbol has been taken out of it.
     """
 
-    columns: tuple[Column, ...]
+    symbols: Small
+    widths: Small
+    places: Small
+    missing: Small
 
-    @cached_property
-    def tables(self) -> tuple[Small, Small, Small, NDArray[np.uint8]]:
-        """Four (K, 4096): symbols, widths and places as of Column, and bits that a state lacks, or one more.
-
-        They are small, because all of them are needed for each landmark.
-        """
+    @staticmethod
+    def of(columns: Sequence[Column]) -> Columns:
+        """Some columns, in the order of reading."""
         symbols, widths, places = (
-            np.stack([getattr(column, name) for column in self.columns]).astype(np.uint16)
+            np.stack([getattr(column, name) for column in columns]).astype(np.uint16)
             for name in ("symbols", "widths", "places")
         )
         missing = np.maximum(TOTAL_BITS - 1 - log2(widths.astype(np.int64)), 0)
-        return symbols, widths, places, missing.astype(np.uint8)
+        return Columns(symbols, widths, places, missing.astype(np.uint16))
+
+
+@compiled
+def pop_columns(
+    columns: Columns, windows: Ints, at: int, end: int, size: int, states: Ints, symbols: Bytes
+) -> int:
+    """Take one symbol out of each lane for each of K columns.
+
+    Args:
+        columns: to read.
+        windows: of the bits, see BitReader.
+        at: bit from which on it reads.
+        end: bits that there are.
+        size: m, of the lanes.
+        states: (N,) of the lanes, changed.
+        symbols: (K, N) is filled.
+
+    Returns:
+        The bit behind what it has read; beyond the end if there were not enough.
+    """
+    full = 1 << size
+    for k in range(len(symbols)):
+        slots = states & (TOTAL - 1)
+        symbols[k] = columns.symbols[k][slots]
+        left = columns.widths[k][slots] * (states >> TOTAL_BITS) + columns.places[k][slots]
+        bits = columns.missing[k][slots].astype(np.int64)
+        bits += (left << bits) < full
+        ends = np.cumsum(bits) + at
+        if len(ends):
+            at = ends[-1]
+        if at > end:
+            break
+        begins = ends - bits
+        states[:] = (left << bits) | (windows[begins >> 3] >> (40 - bits - (begins & 7)) & ((1 << bits) - 1))
+    return at
 
 
 @dataclass(eq=False)
@@ -130,36 +175,29 @@ class LaneReader:
         self._bits, self._size = bits, size
         self.states = bits.read(np.full(count, size, np.int64)) + (1 << size)
 
-    def pop(self, column: Column, lanes: Lanes = EVERY) -> Ints:
-        """One symbol of each lane."""
-        states = self.states[lanes]
-        slots = states & (TOTAL - 1)
-        self._refill(lanes, column.widths[slots] * (states >> TOTAL_BITS) + column.places[slots])
-        symbols: Ints = column.symbols[slots]
-        return symbols
-
-    def pop_columns(self, columns: Columns) -> NDArray[np.uint8]:
+    def pop(self, columns: Columns, lanes: Lanes = EVERY) -> Bytes:
         """(K, N) one symbol of each lane for each of K columns.
 
         Raises:
             InvalidMessage: there are not enough bits.
         """
-        out = np.empty((len(columns.columns), len(self.states)), np.uint8)
-        for k, column in enumerate(columns.columns):
-            out[k] = self.pop(column)
-        return out
+        bits, states = self._bits, self.states[lanes]
+        symbols = np.empty((len(columns.symbols), len(states)), np.uint8)
+        bits.at = pop_columns(columns, bits.windows, bits.at, bits.length, self._size, states, symbols)
+        if bits.at > bits.length:
+            raise InvalidMessage(CUT_OFF)
+        self.states[lanes] = states
+        return symbols
 
     def pop_plain(self, widths: Ints, lanes: Lanes = EVERY) -> Ints:
         """A number of 0 to 12 bits of each lane."""
         states, left = self.states[lanes], TOTAL_BITS - widths
         slots = states & (TOTAL - 1)
         numbers = slots >> left
-        self._refill(lanes, ((states >> TOTAL_BITS) << left) + slots - (numbers << left))
-        return numbers
-
-    def _refill(self, lanes: Lanes, states: Ints) -> None:
+        states = ((states >> TOTAL_BITS) << left) + slots - (numbers << left)
         missing = self._size - log2(states)
         self.states[lanes] = (states << missing) | self._bits.read(missing)
+        return numbers
 
 
 class BitReader:
@@ -188,7 +226,7 @@ class BitReader:
         """
         ends = np.cumsum(widths) + self.at
         if len(ends) and ends[-1] > self.length:
-            raise InvalidMessage("landmarks: cut off")
+            raise InvalidMessage(CUT_OFF)
         begins = ends - widths
         numbers: Ints = self.windows[begins >> 3] >> (40 - widths - (begins & 7)) & ((1 << widths) - 1)
         if len(ends):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf import kernels
+from agent.ekf.innovations import leave_one_out, whiten
 from agent.ekf.report import Health
 from hybridmap.pose import Array
 
@@ -28,7 +28,7 @@ class Judgement(NamedTuple):
     Attributes:
         innovations: (m, 2) slopes, measured minus expected.
         believed: (m,) which of them to correct by.
-        whitening: (2k, 2k) what whitens the innovations of these k (agent.ekf.algebra.whiten).
+        whitening: (2k, 2k) what whitens the innovations of these k (agent.ekf.innovations.whiten).
         health: what they tell of the filter.
         reason: what is wrong, in words; empty if nothing is.
     """
@@ -114,12 +114,11 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
         gate: chi-square threshold.
 
     Returns:
-        (N,) accepted; what whitens the accepted ones (agent.ekf.algebra.whiten), (2K, 2K); and the median of
-        their distances from what all others say, MEDIAN if the noise is as it is said and without any.
+        (N,) accepted; what whitens the accepted ones (agent.ekf.innovations.whiten), (2K, 2K); and the median
+        of their distances from what all others say, MEDIAN if the noise is as it is said and without any.
     """
-    innovations = np.ascontiguousarray(innovations)
-    whitening = kernels.whiten(covariance)
-    distances = kernels.leave_one_out(innovations, whitening)
+    whitening = whiten(covariance)
+    distances = leave_one_out(innovations, whitening)
     if distances.max() <= gate:
         return np.ones(len(innovations), np.bool_), whitening, _median(distances)
     return believe_some(innovations, covariance, gate)
@@ -130,8 +129,8 @@ def believe_some(innovations: Array, covariance: Array, gate: float) -> tuple[Ma
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:
         chosen = np.flatnonzero(np.repeat(accepted, 2))
-        whitening = kernels.whiten(np.ascontiguousarray(covariance[np.ix_(chosen, chosen)]))
-        distances = kernels.leave_one_out(innovations[accepted], whitening)
+        whitening = whiten(covariance[np.ix_(chosen, chosen)])
+        distances = leave_one_out(innovations[accepted], whitening)
         if not len(distances) or distances.max() <= gate:
             return accepted, whitening, _median(distances)
         accepted[np.flatnonzero(accepted)[int(np.argmax(distances))]] = False

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf import kernels
 from agent.ekf.anchored import see
 from agent.ekf.gating import believe
+from agent.ekf.innovations import whiten
 from agent.ekf.node_state import NEAREST_SCALE, NodeState
 from hybridmap.pose import Array
 
@@ -91,7 +91,7 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
                 return Fit(state, accepted, first, float("nan"))
         else:
             both = np.flatnonzero(np.repeat(accepted, 2))
-            whitening = kernels.whiten(np.ascontiguousarray(spread[np.ix_(both, both)]))
+            whitening = whiten(spread[np.ix_(both, both)])
         root = columns[:, np.repeat(accepted, 2)] @ whitening.T
         white = whitening @ innovations[accepted].ravel()
         step = root @ white

@@ -12,16 +12,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf import kernels
 from agent.ekf.gating import MEDIAN, Judgement, believe, believe_some, pixel_gate
+from agent.ekf.innovations import Examined, innovation_covariance, whiten
 from agent.ekf.landmarks import Ids, LandmarkEstimates
-from agent.ekf.motion import WheelNoise
+from agent.ekf.motion import WheelNoise, move_posture, transform_rays
 from agent.ekf.moving_state import MovingState, Step
 from agent.ekf.nod import evident_nod
 from agent.ekf.pixel_noise import PixelNoise
 from agent.ekf.report import Health, UpdateReport
 from agent.ekf.settings import FilterSettings
-from agent.ekf.sighting import Pinhole, Sighting
+from agent.ekf.sighting import Pinhole, Sighting, slots_of
 from agent.ekf.watch import Watch
 from agent.ekf.wheel_trust import WheelTrust
 from agent.observation import Odometry
@@ -57,7 +57,6 @@ class MappingFilter:
             wheel_noise: standard deviation of a wheel's way as a share of the way.
             settings: see there.
         """
-        kernels.load()
         self.settings = settings or FilterSettings()
         self.ids: Ids = np.zeros(0, np.int64)
         self.lost = 0
@@ -74,13 +73,13 @@ class MappingFilter:
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are let go."""
         state, mount, s = self.state, self._camera.mount_forward, self.settings
-        posture, rays, stays, gone = kernels.drive(
-            state.posture, state.rays, (odometry.forward, odometry.turn), mount, s.nearest, s.widest_slope
-        )
+        posture, _, _ = move_posture(state.posture, odometry)
+        rays, scale = transform_rays(state.rays, odometry, mount)
+        stays = (scale > 1e-3) & (rays[:, 2] * s.nearest <= 1.0) & (np.abs(rays[:, 0]) <= s.widest_slope)
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
         taken = Step(state, odometry, root, aside, self._posture_variances, mount, odometry, posture, rays)
-        if gone:
-            self.lost += gone
+        if not stays.all():
+            self.lost += int(np.count_nonzero(~stays))
             self.ids = self.ids[stays]
             taken = taken.kept(stays)
         self._step = taken
@@ -138,12 +137,12 @@ class MappingFilter:
             return UpdateReport.blind(ids, "no landmark of the filter is in view")
         by_wheels = self._step
         self._step, found = seen.compared(by_wheels, self._settled, self._noise.variances, s)
-        if not found[2] <= self._gate:
-            nod = evident_nod(found[0], self._spread(seen.slots), seen.slopes)
+        if not found.worst <= self._gate:
+            nod = evident_nod(found.innovations, self._spread(seen.slots), seen.slopes)
             if nod is not None:
                 seen = seen._replace(slopes=seen.slopes - nod)
                 self._step, found = seen.compared(by_wheels, self._settled, self._noise.variances, s)
-        judged = self._judge(seen, *found)
+        judged = self._judge(seen, found)
         nis, health, reason = math.nan, judged.health, judged.reason
         if judged.agreeing:
             nis, slip = self._correct(seen, judged)
@@ -198,8 +197,7 @@ class MappingFilter:
         if ids is None:
             return pixels
         # The last row is of those that are not held, whose slot is -1.
-        slots = kernels.slots_of(self.ids, np.ascontiguousarray(ids, np.int64))
-        return np.asarray(np.vstack([pixels, [math.nan, math.nan]])[slots], np.float64)
+        return np.asarray(np.vstack([pixels, [math.nan, math.nan]])[slots_of(self.ids, ids)], np.float64)
 
     def landmarks(self) -> LandmarkEstimates:
         """All landmarks as they are known now."""
@@ -223,14 +221,12 @@ class MappingFilter:
 
     def _spread(self, slots: NDArray[np.intp]) -> Array:
         """(2m, 2m) joint covariance of the innovations of some landmarks."""
-        spread: Array = kernels.spread(self.state.covariance, slots, self._noise.variances)
-        return spread
+        return innovation_covariance(self.state.covariance, slots, self._noise.variances)
 
-    def _judge(
-        self, seen: Sighting, innovations: Array, whitening: Array, worst: float, median: float
-    ) -> Judgement:
+    def _judge(self, seen: Sighting, examined: Examined) -> Judgement:
         """Which of the landmarks seen to correct by, and what that tells of the wheels and the pixels."""
         s, slots = self.settings, seen.slots
+        innovations, whitening, worst, median = examined
         believed = np.ones(len(slots), np.bool_)
         if not worst <= self._gate:
             believed, whitening, median = believe_some(innovations, self._spread(slots), self._gate)
@@ -289,8 +285,8 @@ class MappingFilter:
                     slip = slip or "the wheels were refuted a moment ago, and are again"
             else:
                 break
-            residual = kernels.innovations(self._rays, slots, slopes)
-            whitening = kernels.whiten(self._spread(slots))
+            residual = slopes - self._rays[slots, :2]
+            whitening = whiten(self._spread(slots))
         state, squares = self.state.corrected(slots, residual, whitening)
         self._settle(state)
         return squares / residual.size, slip

@@ -90,16 +90,41 @@ def move_posture(posture: Array, odometry: Odometry, aside: float = 0.0) -> tupl
     return after, by_posture, by_input
 
 
+def transform_rays(
+    rays: Array, odometry: Odometry, mount_forward: float, aside: float = 0.0
+) -> tuple[Array, Array]:
+    """See landmarks from where the camera stands after one step of the wheels.
+
+    Args:
+        rays: (N, 3) [a, b, w 1/m] in the camera before the step.
+        odometry: the step.
+        mount_forward: of the optical centre ahead of the axle, m.
+        aside: u3, how far the robot slips to the left of its way, m.
+
+    Returns:
+        (N, 3) rays in the camera after the step; (N,) D, depth after over depth before, not positive for
+        landmarks now behind the camera, whose rays mean nothing.
+    """
+    c, s = math.cos(odometry.turn), math.sin(odometry.turn)
+    tx, ty = _camera_way(odometry, mount_forward, aside)
+    a, w = rays[:, 0], rays[:, 2]
+    ahead, right = 1.0 - tx * w, a + ty * w
+    scale = c * ahead - s * right
+    after = rays.copy()
+    after[:, 0] = s * ahead + c * right
+    after /= np.maximum(scale, 1e-9)[:, None]
+    return after, scale
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class RayMotion:
-    """Landmarks after a step of the wheels.
+    """Landmarks after a step of the wheels, and its derivatives.
 
     Attributes:
         rays: (N, 3) [a, b, w 1/m] in the camera after the step.
         by_ray: (N, 3, 3) Jacobian by the landmark before.
         by_input: (N, 3, 3) Jacobian by (u1, u2, u3).
-        scale: (N,) D, depth after over depth before; not positive for landmarks now behind the camera,
-            whose other figures mean nothing.
+        scale: (N,) D, depth after over depth before; where it is not positive the other figures mean nothing.
     """
 
     rays: Array
@@ -109,43 +134,57 @@ class RayMotion:
 
 
 def move_rays(rays: Array, odometry: Odometry, mount_forward: float, aside: float = 0.0) -> RayMotion:
-    """See landmarks from where the camera stands after one step of the wheels.
-
-    Args:
-        rays: (N, 3) [a, b, w 1/m] in the camera before the step.
-        odometry: the step.
-        mount_forward: of the optical centre ahead of the axle, m.
-        aside: u3, how far the robot slips to the left of its way, m.
-    """
+    """See landmarks after one step of the wheels, as `transform_rays`, with the Jacobians."""
+    after, scale = transform_rays(rays, odometry, mount_forward, aside)
     u1, u2, m = odometry.forward, odometry.turn, mount_forward
-    c, s = math.cos(u2), math.sin(u2)
-    ch, sh = math.cos(0.5 * u2), math.sin(0.5 * u2)
+    c, s, ch, sh = math.cos(u2), math.sin(u2), math.cos(0.5 * u2), math.sin(0.5 * u2)
     along, across = u1 * ch - aside * sh, u1 * sh + aside * ch
-    tx, ty = along + m * (c - 1.0), across + m * s
+    tx, ty = _camera_way(odometry, mount_forward, aside)
     # Derivatives of the camera's way by (u1, u2, u3).
     tx_by = np.array([ch, -0.5 * across - m * s, -sh])
     ty_by = np.array([sh, 0.5 * along + m * c, ch])
-    a, w = rays[:, 0], rays[:, 2]
-    ahead, right = 1.0 - tx * w, a + ty * w
-    scale = c * ahead - s * right
-    inverse = 1.0 / np.where(np.abs(scale) > 1e-9, scale, 1e-9)
-    after = rays.copy()
-    after[:, 0] = s * ahead + c * right
-    after *= inverse[:, None]
+    w, safe = rays[:, 2:], np.maximum(scale, 1e-9)[:, None, None]
     # Each new coordinate is a quotient n / D, so its derivative is (dn - (n / D) dD) / D.
-    by_ray = np.empty((len(rays), 3, 3))
-    by_ray[:, :, 0] = s * after
-    by_ray[:, :, 1] = 0.0
-    by_ray[:, :, 2] = (c * tx + s * ty) * after
-    by_ray[:, 0, 0] += c
-    by_ray[:, 0, 2] += c * ty - s * tx
-    by_ray[:, 1, 1] = 1.0
-    by_ray[:, 2, 2] += 1.0
-    by_ray *= inverse[:, None, None]
-    scale_by = -w[:, None] * (c * tx_by + s * ty_by)
-    scale_by[:, 1] -= s * ahead + c * right
-    by_input = -after[:, :, None] * scale_by[:, None, :]
-    by_input[:, 0, :] += w[:, None] * (c * ty_by - s * tx_by)
+    by_ray = after[:, :, None] * np.array([s, 0.0, c * tx + s * ty])
+    by_ray += np.array([[c, 0.0, c * ty - s * tx], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    by_ray /= safe
+    scale_by = w * (-c * tx_by - s * ty_by)
+    scale_by[:, 1] -= after[:, 0] * scale
+    by_input = after[:, :, None] * -scale_by[:, None, :]
+    by_input[:, 0] += w * (c * ty_by - s * tx_by)
     by_input[:, 0, 1] += scale
-    by_input *= inverse[:, None, None]
+    by_input /= safe
     return RayMotion(after, by_ray, by_input, scale)
+
+
+def propagate(
+    covariance: Array, by_state: Array, by_input: Array, input_root: Array, variances: Array
+) -> Array:
+    """A P A^T + B S B^T + Q of a motion whose A is block diagonal, symmetric to the last bit.
+
+    Args:
+        covariance: (3 + 3n, 3 + 3n) P before, of [posture, (a, b, w) of each landmark].
+        by_state: (1 + n, 3, 3) blocks of A: of the posture, then of each landmark.
+        by_input: (3 + 3n, 3) B, by (u1, u2, u3).
+        input_root: (3, 3) root of the covariance S of these.
+        variances: (3,) of the posture, the diagonal of Q.
+    """
+    blocks, size = len(by_state), len(covariance)
+    # Blocks times rows, never the dense product; P is symmetric, so that (A P)^T = P A^T.
+    half = (by_state @ covariance.reshape(blocks, 3, size)).reshape(size, size)
+    moved = (by_state @ half.T.reshape(blocks, 3, size)).reshape(size, size)
+    out: Array = moved + moved.T
+    out *= 0.5
+    root = by_input @ input_root
+    # A product with its own transpose is symmetric to the last bit.
+    out += root @ root.T
+    out.ravel()[: 3 * size + 3 : size + 1] += variances
+    return out
+
+
+def _camera_way(odometry: Odometry, mount_forward: float, aside: float) -> tuple[float, float]:
+    """(tx forward, ty left) m, of the optical centre in one step of the wheels."""
+    u1, u2 = odometry.forward, odometry.turn
+    ch, sh = math.cos(0.5 * u2), math.sin(0.5 * u2)
+    tx = u1 * ch - aside * sh + mount_forward * (math.cos(u2) - 1.0)
+    return tx, u1 * sh + aside * ch + mount_forward * math.sin(u2)

@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf import kernels
+from agent.ekf.innovations import Examined, examine, measured_entries, turn_by_image, wheel_errors
+from agent.ekf.motion import move_posture, move_rays, propagate
 from agent.observation import Odometry
 from hybridmap.pose import Array, Pose2, PoseGaussian
-
-Examined = tuple[Array, Array, float, float]
-"""An image beside what was expected of it: what agent.ekf.algebra.examine returns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,20 +71,26 @@ class MovingState:
     def corrected(
         self, slots: NDArray[np.intp], residual: Array, whitening: Array
     ) -> tuple[MovingState, float]:
-        """Kalman update by direct measurements of the slopes of some landmarks.
+        """Kalman update by direct measurements of the slopes (a, b) of some landmarks.
+
+        With G = W P_M, P_M the rows of P that are measured, the state becomes x + G^T W r and its covariance
+        P - G^T G.
 
         Args:
-            slots: (m,) which landmarks.
-            residual: (m, 2) measured minus expected.
-            whitening: (2m, 2m) what whitens the residuals.
+            slots: (m,) which landmarks, each once.
+            residual: (m, 2) r, measured minus expected.
+            whitening: (2m, 2m) W of the residuals' covariance (agent.ekf.innovations.whiten).
 
         Returns:
-            The state after, and the residuals' squared Mahalanobis norm.
+            The state after, its covariance symmetric to the last bit; and r^T S^-1 r.
         """
-        posture, rays, covariance, squares = kernels.condition(
-            self.posture, self.rays, self.covariance, slots, whitening, residual
-        )
-        return MovingState(posture, rays, covariance), squares
+        root = whitening @ self.covariance[measured_entries(slots)]
+        white = whitening @ residual.ravel()
+        step = white @ root
+        # A product with its own transpose is symmetric to the last bit.
+        covariance = self.covariance - root.T @ root
+        state = MovingState(self.posture + step[:3], self.rays + step[3:].reshape(-1, 3), covariance)
+        return state, float(white @ white)
 
 
 @dataclass(eq=False, slots=True)
@@ -114,22 +118,12 @@ class Step:
     at: Odometry
     posture: Array
     rays: Array
-    _state: MovingState | None = None
-    _by_input: Array | None = None
+    _after: tuple[MovingState, Array] | None = None
 
     @property
     def state(self) -> MovingState:
         """After the step: P- = A P A^T + B S B^T + Q of paper-notes; computed when first asked for."""
-        if self._state is None:
-            at, measured = self.at, self.measured
-            posture, rays, self._by_input, covariance = kernels.advance(
-                self.before.posture, self.before.rays, self.before.covariance, (at.forward, at.turn),
-                (measured.forward, measured.turn), self.mount_forward, self.wheel_root, self.side_slip,
-                self.posture_variances,
-            )  # fmt: skip
-            self.posture, self.rays = posture, rays
-            self._state = MovingState(posture, rays, covariance)
-        return self._state
+        return self._advanced()[0]
 
     def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> Step:
         """The same step linearised elsewhere, or with the wheels believed less."""
@@ -158,17 +152,9 @@ class Step:
         Returns:
             The step, its covariance computed; and the image beside it.
         """
-        before, measured = self.before, self.measured
-        turn, posture, rays, by_input, covariance, *examined = kernels.glance(
-            before.posture, before.rays, before.covariance, (measured.forward, measured.turn),
-            self.mount_forward, self.wheel_root, self.side_slip, self.posture_variances,
-            self.rays, slots, slopes, variances, most,
-        )  # fmt: skip
-        step = Step(
-            before, measured, self.wheel_root, self.side_slip, self.posture_variances, self.mount_forward,
-            Odometry(measured.forward, turn), posture, rays, MovingState(posture, rays, covariance), by_input,
-        )  # fmt: skip
-        return step, tuple(examined)
+        more = turn_by_image(self.rays, slots, slopes, self.wheel_root, most)
+        step = self.again(at=Odometry(self.measured.forward, self.measured.turn + more))
+        return step, examine(step.state.rays, step.state.covariance, slots, slopes, variances)
 
     def in_hindsight(
         self, slots: NDArray[np.intp], residual: Array, whitening: Array
@@ -180,14 +166,33 @@ class Step:
             residual: (m, 2) measured minus expected.
             whitening: (2m, 2m) what whitens the residuals.
         """
-        _ = self.state
-        forward, turn, surprise = kernels.wheel_errors(
-            self._by_input, self.wheel_root, slots, whitening, residual
-        )
+        by_input = self._advanced()[1]
+        forward, turn, surprise = wheel_errors(by_input, self.wheel_root, slots, whitening, residual)
         return Odometry(self.measured.forward + forward, self.measured.turn + turn), surprise
 
     def kept(self, mask: NDArray[np.bool_]) -> Step:
         """The step of only some of the landmarks."""
         if mask.all():
             return self
-        return replace(self, before=self.before.kept(mask), rays=self.rays[mask], _state=None, _by_input=None)
+        return replace(self, before=self.before.kept(mask), rays=self.rays[mask], _after=None)
+
+    def _advanced(self) -> tuple[MovingState, Array]:
+        """The state after the step, and the Jacobian of its mean by (u1, u2, u3), (3 + 3n, 3).
+
+        The mean is exact where the step is linearised, and of first order from there to what the wheels say.
+        """
+        if self._after is not None:
+            return self._after
+        before, at = self.before, self.at
+        posture, by_posture, posture_by_input = move_posture(before.posture, at)
+        moved = move_rays(before.rays, at, self.mount_forward)
+        by_state = np.concatenate([by_posture[None], moved.by_ray])
+        by_input = np.concatenate([posture_by_input, moved.by_input.reshape(-1, 3)])
+        input_root = np.zeros((3, 3))
+        input_root[:2, :2], input_root[2, 2] = self.wheel_root, self.side_slip
+        covariance = propagate(before.covariance, by_state, by_input, input_root, self.posture_variances)
+        further = np.array([self.measured.forward - at.forward, self.measured.turn - at.turn])
+        shift = by_input[:, :2] @ further
+        self.posture, self.rays = posture + shift[:3], moved.rays + shift[3:].reshape(-1, 3)
+        self._after = MovingState(self.posture, self.rays, covariance), by_input
+        return self._after

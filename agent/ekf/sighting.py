@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf import kernels
+from agent.ekf.innovations import Examined, examine
 from agent.ekf.landmarks import Ids
-from agent.ekf.moving_state import Examined, MovingState, Step
+from agent.ekf.moving_state import MovingState, Step
 from agent.ekf.report import Health, UpdateReport
 from agent.ekf.settings import FilterSettings
 from hybridmap.camera import Camera
@@ -36,6 +36,17 @@ class Pinhole:
     def pixels(self, slopes: Array) -> Array:
         """(N, 2) px of slopes (N, 2)."""
         return np.asarray(self.centre + self.focal * slopes, np.float64)
+
+
+def slots_of(held: Ids, ids: Ids) -> NDArray[np.intp]:
+    """(N,) places in the state of landmarks by their ids; -1 for those that it does not hold.
+
+    Args:
+        held: (n,) ids of the state's landmarks, each once.
+        ids: (N,) of which landmarks.
+    """
+    places = {landmark: slot for slot, landmark in enumerate(held.tolist())}
+    return np.array([places.get(landmark, -1) for landmark in ids.tolist()], np.intp)
 
 
 class Sighting(NamedTuple):
@@ -65,14 +76,9 @@ class Sighting(NamedTuple):
             pixels: (N, 2) px, undistorted; rows with NaN are not seen.
             pinhole: of the camera.
         """
-        slots, rows, slopes = kernels.sighted(
-            held,
-            np.ascontiguousarray(ids, np.int64),
-            np.ascontiguousarray(pixels, np.float64),
-            pinhole.centre,
-            pinhole.focal,
-        )
-        return Sighting(ids, slots, rows, slopes, pinhole.focal)
+        places = slots_of(held, ids)
+        rows = np.flatnonzero((places >= 0) & np.isfinite(pixels).all(axis=1))
+        return Sighting(ids, places[rows], rows, pinhole.slopes(pixels[rows]), pinhole.focal)
 
     def compared(
         self, step: Step | None, settled: MovingState, variances: Array, settings: FilterSettings
@@ -91,11 +97,12 @@ class Sighting(NamedTuple):
         if step is not None and settings.relinearisations and len(self.slots) >= settings.least_agreeing:
             return step.glanced(self.slots, self.slopes, variances, settings.slip_sigmas)
         expected = settled if step is None else step.state
-        return step, kernels.examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)
+        return step, examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)
 
     def report(
         self, believed: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
     ) -> UpdateReport:
         """Of an update by what is seen: believed (m,), innovations (m, 2) slopes measured minus expected."""
-        accepted, innovations_px = kernels.told(len(self.ids), self.rows, believed, innovations, self.focal)
+        accepted, innovations_px = np.zeros(len(self.ids), np.bool_), np.full((len(self.ids), 2), np.nan)
+        accepted[self.rows], innovations_px[self.rows] = believed, innovations * self.focal
         return UpdateReport(self.ids, accepted, innovations_px, mean_nis, health, reason)

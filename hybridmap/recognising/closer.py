@@ -14,7 +14,7 @@ from hybridmap.node import Node
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.query import View
 from hybridmap.recognising.planar_pose import PlanarPoseSettings
-from hybridmap.recognising.pose_refinement import Stack, refine
+from hybridmap.recognising.pose_refinement import refine, stack_sightings
 from hybridmap.recognising.recognition import Recognition
 from hybridmap.recognising.sightings import Sightings
 
@@ -62,7 +62,9 @@ def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSett
         sigma = fresh
         covariances = landmarks.covariances_in_robot(node.camera, sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
-        fix = refine(Stack.build([sightings]), best.mean, pose.scale_sigma, None, pose.rounds, SHIFT_SIGMA)
+        fix = refine(
+            stack_sightings([sightings]), best.mean, pose.scale_sigma, None, pose.rounds, SHIFT_SIGMA
+        )
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
             break
         best = fix.node_from_robot

@@ -16,7 +16,6 @@ from hybridmap.descriptor import rounding_noise
 from hybridmap.errors import InvalidValue
 from hybridmap.landmark_tables import landmark_tables
 from hybridmap.node import CODE_BYTES
-from hybridmap.recognising.kernels import kernels
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,10 @@ class Matches:
 
 
 def squared_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N, D) and (M, D) -> (N, M) squared Euclidean distances, by one matrix product."""
+    """(N, D) and (M, D) -> (N, M) squared Euclidean distances, by one matrix product.
+
+    Whole numbers stay exact as long as no square is beyond 2^24.
+    """
     out: NDArray[np.float32] = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1)[None] - 2 * (a @ b.T)
     np.maximum(out, 0, out=out)
     return out
@@ -79,8 +81,7 @@ def _mutual(squared: NDArray[np.float32], s: MatchSettings) -> Matches:
     """Pairs that are each other's nearest and distinctly so, of (N, M) squared distances."""
     if squared.size == 0:
         return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-    rows, columns = kernels().two_nearest(np.ascontiguousarray(squared))
-    (best_in_b, best, second), (best_in_a, _, second_in_a) = rows, columns
+    (best_in_b, best, second), (best_in_a, _, second_in_a) = two_nearest(squared), two_nearest(squared.T)
     mutual = best_in_a[best_in_b] == np.arange(len(best))
     distinct = best < s.ratio**2 * np.minimum(second, second_in_a[best_in_b])
     kept = np.flatnonzero(mutual & distinct & (best <= s.most_distance**2))
@@ -89,6 +90,21 @@ def _mutual(squared: NDArray[np.float32], s: MatchSettings) -> Matches:
         np.stack([kept, best_in_b[kept]], axis=1).astype(np.int64),
         np.sqrt(np.maximum(best[kept], 0)).astype(np.float32),
     )
+
+
+def two_nearest(
+    table: NDArray[np.float32],
+) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+    """The nearest of each row of an (N, M) table of distances, N and M at least 1.
+
+    Returns:
+        (N,) which, of equals the first; its distance; and the second nearest's, infinite if there is none.
+    """
+    rows = np.arange(len(table))
+    which = table.argmin(axis=1)
+    others = table.copy()
+    others[rows, which] = np.inf
+    return which, table[rows, which], others.min(axis=1)
 
 
 def match(
@@ -110,6 +126,6 @@ def match(
     for codes in (codes_a, codes_b):
         if codes.ndim != 2 or codes.shape[1] != CODE_BYTES or codes.dtype != np.uint8:
             raise InvalidValue(f"codes must be (N, {CODE_BYTES}) uint8, not {codes.shape} {codes.dtype}")
-    steps = kernels().squared_steps(np.ascontiguousarray(codes_a), np.ascontiguousarray(codes_b))
-    squared = steps.astype(np.float32) * np.float32(landmark_tables().step ** 2)
+    steps = squared_distances(codes_a.astype(np.float32), codes_b.astype(np.float32))
+    squared = steps * np.float32(landmark_tables().step ** 2)
     return _mutual(squared - np.float32(rounding_noise()), settings or MatchSettings()).pairs

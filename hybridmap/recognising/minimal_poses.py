@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array
-from hybridmap.recognising.kernels import kernels
 from hybridmap.recognising.pose_arrays import inverse_poses
 from hybridmap.recognising.sightings import Sightings
 
@@ -37,12 +36,21 @@ def hypotheses(sightings: Sightings, count: int, rng: np.random.Generator) -> Ar
 
 
 def _from_three_bearings(sightings: Sightings, chosen: NDArray[np.int64]) -> Array:
-    """(H, 3) postures from (H, 3) chosen sightings, by their horizontal bearings alone."""
-    sets = np.empty((*chosen.shape, 3))
-    sets[..., :2] = sightings.points[chosen, :2]
-    sets[..., 2] = sightings.slopes[chosen, 0]
-    poses: Array = kernels().from_three_bearings(sets, sightings.camera.mount_forward)
-    return poses
+    """(H, 3) postures from (H, 3) chosen sightings, by their horizontal bearings; NaN where degenerate."""
+    px, py = sightings.points[:, 0][chosen], sightings.points[:, 1][chosen]
+    a = sightings.slopes[:, 0][chosen]
+    rows = np.stack([py - a * px, -px - a * py, a])
+    (f0, f1, f2), (g0, g1, g2) = rows[..., 0] - rows[..., 1], rows[..., 0] - rows[..., 2]
+    n0, n1, n2 = f1 * g2 - f2 * g1, f2 * g0 - f0 * g2, f0 * g1 - f1 * g0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / np.hypot(n0, n1)
+        # The null vector's sign is open: the points are in front of the camera.
+        sign = np.sign(n0 * px.sum(axis=1) + n1 * py.sum(axis=1) - 3.0 * n2)
+        scale *= np.where(sign == 0.0, np.nan, sign)
+        c, s, big_a = n0 * scale, n1 * scale, n2 * scale
+    big_b = rows[0, :, 0] * c + rows[1, :, 0] * s + rows[2, :, 0] * big_a
+    ahead = big_a - sightings.camera.mount_forward
+    return np.stack([c * ahead - s * big_b, s * ahead + c * big_b, np.arctan2(s, c)], axis=1)
 
 
 def _depths(sightings: Sightings) -> tuple[Array, Array]:
@@ -68,9 +76,14 @@ def _depths(sightings: Sightings) -> tuple[Array, Array]:
 def _from_two_depths(sightings: Sightings, chosen: NDArray[np.int64], depths: Array) -> Array:
     """(H, 3) postures that carry two points of the robot's plane onto two points of the frame's."""
     ahead = depths[chosen]
-    here = np.empty((*chosen.shape, 2))
-    here[..., 0] = ahead + sightings.camera.mount_forward
-    here[..., 1] = ahead * sightings.slopes[chosen, 0]
-    poses: Array = kernels().from_two_points(np.ascontiguousarray(sightings.points[chosen, :2]), here)
+    qx, qy = ahead + sightings.camera.mount_forward, ahead * sightings.slopes[:, 0][chosen]
+    px, py = sightings.points[:, 0][chosen], sightings.points[:, 1][chosen]
+    heading = np.arctan2(py[:, 1] - py[:, 0], px[:, 1] - px[:, 0])
+    heading -= np.arctan2(qy[:, 1] - qy[:, 0], qx[:, 1] - qx[:, 0])
+    c, s = np.cos(heading), np.sin(heading)
+    # The middle of the two comes upon the middle.
+    x = 0.5 * (px.sum(axis=1) - c * qx.sum(axis=1) + s * qy.sum(axis=1))
+    y = 0.5 * (py.sum(axis=1) - s * qx.sum(axis=1) - c * qy.sum(axis=1))
+    poses = np.stack([x, y, heading], axis=1)
     poses[chosen[:, 0] == chosen[:, 1]] = np.nan
     return poses

@@ -17,7 +17,8 @@ from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.recognising.minimal_poses import hypotheses
 from hybridmap.recognising.mirror import mirrored
-from hybridmap.recognising.pose_refinement import PlanarFix, Stack, improve, refine
+from hybridmap.recognising.pose_refinement import PlanarFix, improve, refine, stack_sightings
+from hybridmap.recognising.projection import Stack
 from hybridmap.recognising.sightings import Sightings
 
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
@@ -115,7 +116,7 @@ def solve_sightings(
         poses = np.concatenate([prior.mean.vector[None], poses])
     if len(poses) == 0:
         return None
-    stack = Stack.build(parts)
+    stack = stack_sightings(parts)
     if total > 2 * PREVIEW:
         # Most hypotheses are wrong, which a part of the sightings shows as well as all of them.
         few = [part.take(slice(None, None, total // PREVIEW)) for part in parts]

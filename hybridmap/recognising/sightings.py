@@ -7,7 +7,6 @@ axle and looks along the robot's x axis: with q the point in the robot frame,
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,22 +15,8 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Array
-from hybridmap.recognising.kernels import kernels
 from hybridmap.recognising.pose_arrays import inverse_poses
-
-NEAREST = 0.05
-"""Points less than this ahead of the optical centre count as not visible, m."""
-
-NO_DEPTH_SIGMA = 1e3
-"""Stands for "depth not measured", m."""
-
-DEPTH_DECADES = math.log(100.0)
-"""A wrong match's depth may be anything over two decades, evenly in its logarithm."""
-
-LOG_DECADES = math.log(DEPTH_DECADES)
-
-GATES = (9.21, 11.34)
-"""Chi-square 99 % points for 2 and 3 degrees of freedom."""
+from hybridmap.recognising.projection import Optics, Poses, Seen, log_ratios
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,19 +110,21 @@ class Sightings:
         Returns:
             (H, N) nats; 0 for sightings outside the 99 % gate or behind the camera.
         """
-        camera = self.camera
+        camera, measured = self.camera, self.depth_measured
         if self.inverted:
             poses = inverse_poses(poses)
-        optics = (
-            camera.fx,
-            camera.fy,
-            camera.mount_height,
-            camera.mount_forward,
-            camera.width * camera.height,
+        area = float(camera.width * camera.height)
+        seen = Seen(
+            self.points,
+            self.covariances,
+            self.slopes,
+            np.where(measured, self.depths, 1.0),
+            np.where(measured, self.depth_sigmas, 1.0) ** 2,
+            measured,
+            float(self.pixel_sigma**2),
+            Optics(camera.fx, camera.fy, camera.mount_height, camera.mount_forward, area),
         )
-        out: Array = kernels().log_ratios(
-            self.points, self.covariances, self.slopes, self.pixel_sigma**2, self.depths, self.depth_sigmas,
-            self.depth_measured, np.array(optics, np.float64), np.ascontiguousarray(poses),
-            GATES[0], NEAREST, LOG_DECADES,
-        )  # fmt: skip
-        return out
+        heading = poses[:, 2]
+        return log_ratios(
+            seen, Poses(poses[:, 0].copy(), poses[:, 1].copy(), np.cos(heading), np.sin(heading))
+        )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.landmark_tables import landmark_tables
-from hybridmap.recognising.kernels import kernels
+from hybridmap.recognising.matching import squared_distances
 from merge.graph.candidates import overlap
 
 Whole = NDArray[np.int64]
@@ -70,7 +70,8 @@ def overlaps(
 
 def pair_overlap(codes: NDArray[np.uint8], others: NDArray[np.uint8], alike: float) -> float:
     """The same of two nodes' (N, 32) and (M, 32) codes, all compared with all."""
-    squared = kernels().squared_steps(codes, others) * np.float32(landmark_tables().step ** 2)
+    squared = squared_distances(codes.astype(np.float32), others.astype(np.float32))
+    squared *= np.float32(landmark_tables().step ** 2)
     rows, columns = np.nonzero(squared < alike**2)
     return overlap(rows, columns, squared[rows, columns], alike)
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap import jit
 from hybridmap.camera import Camera
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import View
-from hybridmap.recognising.kernels import kernels
 from hybridmap.recognising.matching import MatchSettings, match
 from hybridmap.recognising.recognition import Recognition, RecognitionSettings, register
 from mapserver.relocalizing.seenplaces import Sighting
@@ -46,7 +46,7 @@ class Doubles:
     def __init__(self, settings: RecognitionSettings) -> None:
         """Take when a place counts as recognised; a likeness may leave open where exactly it is seen from."""
         self._settings = replace(settings, **VAGUE)
-        kernels()  # compiled when a server starts, if ever: nobody who asks waits for that
+        jit.load()  # when a server starts: a robot that asks must not wait for a compiler
         self._kept: OrderedDict[tuple[NodeId, NodeId], tuple[Node, Node, Recognition | None]] = OrderedDict()
 
     def compare(self, a: Node, b: Node) -> Recognition | None:

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from benchmarks.synthetic import CAMERA, random_vectors
 from hybridmap.camera import Camera
 from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.descriptor import quantise
@@ -15,6 +14,7 @@ from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.wake import Wake
+from synthetic.world import CAMERA, random_vectors
 from wire.codec import decode_body, encode_body
 
 EVIDENCE = ("inliers", "doubles", "matches", "share", "there", "back", "sigma_xy", "log_evidence")

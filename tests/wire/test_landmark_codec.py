@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,7 +28,7 @@ from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
 from hybridmap.recognising.recognition import Recognition, examine_nodes
 from hybridmap.recognising.selection import SelectionSettings, choose
-from wire import landmark_codec as codec
+from tests.hybridmap.kernel_forms import in_numpy
 from wire.codec import decode_body, encode_body, encode_change
 from wire.landmark_codec import (
     MAX_LANDMARKS,
@@ -246,11 +247,9 @@ def test_damage_is_noticed(some: SimpleNamespace, data: st.DataObject) -> None:
 
 def both_forms(packed: bytes) -> list[Landmarks | str]:
     """What comes of the compiled decoder, and of NumPy's; a reason if it is none."""
-    assert codec._compiled() is not None, "numba is installed for tests"
     found: list[Landmarks | str] = []
-    for form in (codec._compiled, lambda: None):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(codec, "_compiled", form)
+    for form in (nullcontext, in_numpy):
+        with form():
             try:
                 found.append(unpack_landmarks(packed, CAMERA))
             except InvalidMessage as error:

@@ -8,7 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridmap.errors import InvalidMessage
+from tests.hybridmap.kernel_forms import form
 from wire.lanes import TOTAL, BitReader, Column, Columns, LaneReader, LaneWriter, pack_bits
+
+__all__ = ["form"]
+
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def some_column(random: np.random.Generator, symbols: int) -> Column:
@@ -34,7 +39,7 @@ def test_what_is_pushed_comes_back(seed: int, lanes: int, steps: int, size: int)
     bits = BitReader(data)
     reader = LaneReader(bits, lanes, size)
     for column, row in zip(columns, symbols, strict=True):
-        assert np.array_equal(reader.pop(column), row)
+        assert np.array_equal(reader.pop(Columns.of([column]))[0], row)
     assert np.array_equal(reader.pop_plain(widths, some), plain)
     assert np.array_equal(reader.states - (1 << size), seeds)
     bits.end()
@@ -44,22 +49,22 @@ def test_what_is_pushed_comes_back(seed: int, lanes: int, steps: int, size: int)
 def test_many_columns_at_once_are_the_same_as_one_by_one(seed: int) -> None:
     random = np.random.default_rng(seed)
     lanes, size = int(random.integers(0, 200)), int(random.integers(12, 32))
-    columns = Columns(tuple(some_column(random, int(random.integers(1, 60))) for _ in range(9)))
-    symbols = [random.integers(0, len(c.frequencies), lanes) for c in columns.columns]
+    columns = [some_column(random, int(random.integers(1, 60))) for _ in range(9)]
+    symbols = [random.integers(0, len(c.frequencies), lanes) for c in columns]
     writer = LaneWriter(random.integers(0, 1 << size, lanes) + (1 << size), size)
-    for column, row in zip(columns.columns[::-1], symbols[::-1], strict=True):
+    for column, row in zip(columns[::-1], symbols[::-1], strict=True):
         writer.push(row, column)
     data = pack_bits(*writer.finish())
     bits, other = BitReader(data), BitReader(data)
     reader, plain = LaneReader(bits, lanes, size), LaneReader(other, lanes, size)
-    found = reader.pop_columns(columns)
-    assert np.array_equal(found, [plain.pop(column) for column in columns.columns])
+    found = reader.pop(Columns.of(columns))
+    assert np.array_equal(found, np.concatenate([plain.pop(Columns.of([column])) for column in columns]))
     assert np.array_equal(found, np.array(symbols).reshape(9, lanes))
     assert np.array_equal(reader.states, plain.states) and bits.at == other.at
     if lanes > 10:
         short = BitReader(data[: -(-lanes * size // 8) + 1])
         with pytest.raises(InvalidMessage, match="cut off"):
-            LaneReader(short, lanes, size).pop_columns(columns)
+            LaneReader(short, lanes, size).pop(Columns.of(columns))
 
 
 def test_a_symbol_costs_what_its_frequency_is_worth() -> None:

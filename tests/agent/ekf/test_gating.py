@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from agent.ekf.gating import believe, chi_squares, one_point_consensus, pixel_gate
-from agent.ekf.kernels import leave_one_out, whiten
+from agent.ekf.innovations import leave_one_out, whiten
 
 
 def joint(n: int, shared: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

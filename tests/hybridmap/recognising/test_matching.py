@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap.descriptor import decode
-from hybridmap.recognising.matching import MatchSettings, match, match_vectors
+from hybridmap.recognising.matching import MatchSettings, match, match_vectors, squared_distances, two_nearest
 
 
 def brute_force(a: np.ndarray, b: np.ndarray, s: MatchSettings, noise: float) -> set[tuple[int, int]]:
@@ -31,6 +31,22 @@ def test_against_brute_force(n: int, m: int, seed: int, noise: float) -> None:
     b = b.astype(np.float32)
     pairs = match_vectors(a, b, s, noise).pairs
     assert {(int(i), int(j)) for i, j in pairs} == brute_force(a, b, s, noise)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 20), st.integers(1, 20))
+def test_nearest_and_second_are_exact(seed: int, n: int, m: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = random_codes(n, rng), random_codes(m, rng)
+    exact = ((a[:, None].astype(int) - b[None].astype(int)) ** 2).sum(axis=2)
+    assert (squared_distances(a.astype(np.float32), b.astype(np.float32)) == exact).all()
+    table = rng.integers(0, 5, (n, m)).astype(np.float32)  # with equals
+    before = table.copy()
+    best, least, second = two_nearest(table)
+    ordered = np.sort(np.column_stack([table, np.full(n, np.inf)]), axis=1)
+    assert (best == table.argmin(axis=1)).all()
+    assert (least == ordered[:, 0]).all() and (second == ordered[:, 1]).all()
+    assert (table == before).all()
 
 
 def random_codes(n: int, rng: np.random.Generator) -> np.ndarray:

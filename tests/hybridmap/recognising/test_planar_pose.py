@@ -7,14 +7,17 @@ import pytest
 import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import multivariate_normal
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.recognising.minimal_poses import hypotheses
 from hybridmap.recognising.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
-from hybridmap.recognising.pose_refinement import Stack
 from hybridmap.recognising.sightings import Sightings
+from tests.hybridmap.kernel_forms import form
+
+__all__ = ["form"]
+
+pytestmark = pytest.mark.usefixtures("form")
 
 CAMERA = Camera(320, 240, 277.0, 270.0, 159.5, 121.0, mount_height=0.25, mount_forward=0.12)
 HONEST = PlanarPoseSettings(pixel_sigma=0.7, scale_sigma=0.0)
@@ -56,51 +59,6 @@ def test_minimal_solutions_are_exact(inverted: bool) -> None:
     errors = np.array([error(Pose2.from_vector(pose), true) for pose in poses])
     assert (errors[:50] < 1e-6).mean() > 0.8  # three bearings; a draw may repeat a point
     assert (errors[50:] < 1e-6).mean() > 0.8  # two depths
-
-
-def test_derivatives_against_finite_differences() -> None:
-    rng = np.random.default_rng(4)
-    true = random_pose(rng)
-    forward, inverted = seen_points(true, 6, rng), seen_points(true.inverse(), 5, rng)
-    stack = Stack.build(
-        [Sightings.build(*forward, CAMERA), Sightings.build(*inverted, CAMERA, inverted=True)]
-    )
-    predicted, by_pose, by_point = stack.predict(true, stack.points)
-    assert np.allclose(predicted[:, :2], np.concatenate([forward[1], inverted[1]]), atol=1e-9)
-    step = 1e-6
-    for k in range(3):
-        d = step * np.eye(3)[k]
-        up = stack.predict(true @ Pose2.from_vector(d), stack.points)[0]
-        down = stack.predict(true @ Pose2.from_vector(-d), stack.points)[0]
-        assert np.allclose((up - down) / (2 * step), by_pose[:, :, k], rtol=1e-4, atol=1e-3)
-        moved = (stack.predict(true, stack.points + d)[0] - stack.predict(true, stack.points - d)[0]) / (
-            2 * step
-        )
-        assert np.allclose(moved, by_point[:, :, k], rtol=1e-4, atol=1e-3)
-
-
-@pytest.mark.parametrize("inverted", [False, True])
-def test_likelihood_ratio_against_scipy(inverted: bool) -> None:
-    rng = np.random.default_rng(5)
-    pose = random_pose(rng)
-    points, pixels = seen_points(pose.inverse() if inverted else pose, 20, rng)
-    half = rng.normal(0, 0.03, (20, 3, 3))
-    covariances = half @ half.transpose(0, 2, 1)
-    pixels = pixels + rng.normal(0, 1.0, (20, 2))
-    sightings = Sightings.build(
-        points, pixels, CAMERA, covariances=covariances, pixel_sigma=0.9, inverted=inverted
-    )
-    predicted, _, by_point = Stack.build([sightings]).predict(pose, points)
-    expected = []
-    for k in range(20):
-        j = by_point[k, :2]
-        density = multivariate_normal(predicted[k, :2], j @ covariances[k] @ j.T + 0.81 * np.eye(2))
-        expected.append(density.logpdf(pixels[k]) + math.log(320 * 240))
-    found = sightings.log_ratios(np.stack([pose.vector, [50.0, 50.0, 0.0]]))
-    kept = found[0] > 0
-    assert kept.sum() > 10
-    assert np.allclose(found[0][kept], np.array(expected)[kept], atol=1e-6)
-    assert found[1].sum() < found[0].sum()
 
 
 def noisy_problem(

@@ -23,6 +23,11 @@ from synthetic.world import (
     take_node,
     take_view,
 )
+from tests.hybridmap.kernel_forms import form
+
+__all__ = ["form"]
+
+pytestmark = pytest.mark.usefixtures("form")
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 

@@ -15,7 +15,7 @@ SERVER = """
 import hashlib, json, sys, time
 from pathlib import Path
 import numpy as np
-from benchmarks.synthetic import room, take_map
+from synthetic.world import room, take_map
 from hybridmap.change import Change, EdgePut, NodePut
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from mapserver.merging.merger import Merger
 from merge.graph.merged import MergedMap
+from synthetic.world import room, take_map
 
 Log = list[tuple[MapId, ChangeBody]]
 LIAR = MapId("liar", 1)

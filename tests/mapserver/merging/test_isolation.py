@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 import merge.belief.memory
 import merge.merging
-from benchmarks.synthetic import room, take_map
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
@@ -26,6 +25,7 @@ from mapserver.merging.isolation import leave_out
 from mapserver.merging.merger import Merger
 from mapweave.offline import merge_parts
 from merge.graph.merged import MergedMap
+from synthetic.world import room, take_map
 
 Log = list[tuple[MapId, ChangeBody]]
 R0, R1, BAD, WORSE = (MapId(agent, 1) for agent in ("r0", "r1", "bad", "worse"))

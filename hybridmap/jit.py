@@ -1,0 +1,172 @@
+"""Kernels: NumPy code that numba compiles where it is installed, and that runs as it stands elsewhere.
+
+    @for_each
+    def square(n: Index, rows: Matrix, out: Vector) -> None:
+        out[n] = rows[n, 0] ** 2 + rows[n, 1] ** 2
+
+    @compiled
+    def lengths(rows: Matrix) -> Vector:
+        out = np.empty(len(rows))
+        square(len(rows), rows, out)
+        return np.sqrt(out)
+
+What is computed alike for each of many is written once, for number n, and called with how many there are.
+numba loops over n; without it n is a slice, all of them, and each operation is one on arrays. So such a
+function has masks in place of branches.
+
+A kernel is compiled by `load` or when it is first called, for the types that its annotations name, and kept
+on disk beside its module. To see whether what was kept still holds, numba looks at that one file: a kernel
+uses only constants, and calls only kernels, of its own module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, update_wrapper
+from inspect import signature
+from types import FunctionType
+from typing import Annotated, Any, Concatenate, Generic, ParamSpec, TypeVar, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+Vector = Annotated[NDArray[np.float64], 1]
+Matrix = Annotated[NDArray[np.float64], 2]
+Cube = Annotated[NDArray[np.float64], 3]
+Flags = Annotated[NDArray[np.bool_], 1]
+"""Arrays of so many dimensions, dense and in C's order."""
+
+Index = Any
+"""The number of one of many, or all of them."""
+
+ALL = slice(None)
+
+_OPTIONS = {"error_model": "numpy", "fastmath": {"contract"}}
+"""A product and its sum may be one instruction; sums keep their order."""
+
+KERNELS: list[Kernel[..., Any]] = []
+"""All kernels of the modules that are imported."""
+
+
+class Kernel(Generic[P, R]):
+    """A function that may be compiled.
+
+    Attributes:
+        python: the function without numba.
+    """
+
+    def __init__(self, function: Callable[..., Any], python: Callable[P, R], loop: str | None = None) -> None:
+        """Take a function; nothing is compiled yet.
+
+        Args:
+            function: as it is written.
+            python: what a call does without numba.
+            loop: source of what a call does with numba: calls of `one`, with ... for the arguments behind the
+                indices. None for the function itself.
+        """
+        self.python = python
+        self._function: Any = function
+        self._loop = loop
+        update_wrapper(self, function)
+        KERNELS.append(self)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call the compiled form where there is numba."""
+        return self.machine(*args, **kwargs)
+
+    @cached_property
+    def machine(self) -> Callable[P, R]:
+        """What a call runs."""
+        try:
+            import numba
+            import scipy.linalg  # noqa: F401, numba takes LAPACK from it
+        except ImportError:
+            return self.python
+        form: Callable[P, R] = self._looping(numba) if self._loop else self._kept(numba)
+        return form
+
+    def _kept(self, numba: Any) -> Any:
+        """Compiled for the annotated types."""
+        try:
+            machine = numba.njit(cache=True, **_OPTIONS)(self._linked())
+        except RuntimeError:
+            # Nowhere to keep it: an installation that may not be written to, and no home either.
+            machine = numba.njit(**_OPTIONS)(self._linked())
+        hints = get_type_hints(self._function, include_extras=True)
+        machine.compile(tuple(_type_of(hint) for name, hint in hints.items() if name != "return"))
+        return machine
+
+    def _looping(self, numba: Any) -> Any:
+        """To be compiled as part of the kernels that call it, for the types that they have."""
+        # If the call names each argument, numba makes one loop of both: three times as fast.
+        count = len(signature(self._function).parameters) - str(self._loop).count("range")
+        arguments = ", ".join(f"argument{k}" for k in range(count))
+        scope = {"one": numba.njit(inline="always", **_OPTIONS)(self._linked()), "empty": np.empty}
+        exec(str(self._loop).replace("...", arguments), scope)
+        return numba.njit(**_OPTIONS)(scope["loop"])
+
+    def _linked(self) -> FunctionType:
+        """The function, with the compiled forms of the kernels that it calls."""
+        source = self._function
+        called = {name: source.__globals__.get(name) for name in source.__code__.co_names}
+        machines = {name: kernel.machine for name, kernel in called.items() if isinstance(kernel, Kernel)}
+        linked = FunctionType(source.__code__, {**source.__globals__, **machines}, source.__name__)
+        linked.__qualname__ = source.__qualname__
+        return linked
+
+
+def compiled(function: Callable[P, R]) -> Kernel[P, R]:
+    """Compile a function whose annotations name its types: `Matrix` and the like, numbers, named tuples."""
+    return Kernel(function, function)
+
+
+def for_each(function: Callable[Concatenate[Index, P], None]) -> Kernel[Concatenate[int, P], None]:
+    """Call function(n, ...) for each n below a count, which is given in place of n."""
+
+    def python(count: int, *args: P.args, **kwargs: P.kwargs) -> None:
+        function(ALL, *args, **kwargs)
+
+    loop = """def loop(count, ...):
+    for n in range(count):
+        one(n, ...)"""
+    return Kernel(function, python, loop)
+
+
+def for_each_pair(
+    function: Callable[Concatenate[Index, Index, P], Any],
+) -> Kernel[Concatenate[int, int, P], Matrix]:
+    """(M, N) table of function(m, n, ...); M and N are given in place of m and n. Only vectors take m."""
+
+    def python(rows: int, columns: int, *args: P.args, **kwargs: P.kwargs) -> Matrix:
+        table: Matrix = function((ALL, None), ALL, *args, **kwargs)
+        return table
+
+    loop = """def loop(rows, columns, ...):
+    table = empty((rows, columns))
+    for m in range(rows):
+        for n in range(columns):
+            table[m, n] = one(m, n, ...)
+    return table"""
+    return Kernel(function, python, loop)
+
+
+def load() -> None:
+    """Compile, or read from disk, all kernels imported so far: a robot that drives must not wait for it."""
+    for kernel in KERNELS:
+        _ = kernel.machine
+
+
+def _type_of(hint: Any) -> Any:
+    """What numba calls an annotated type."""
+    import numba
+
+    if (dimensions := getattr(hint, "__metadata__", None)) is not None:
+        scalar = get_args(get_args(get_args(hint)[0])[1])[0]
+        return numba.types.Array(numba.from_dtype(np.dtype(scalar)), dimensions[0], "C")
+    if hasattr(hint, "_fields"):
+        fields = [_type_of(of) for of in get_type_hints(hint, include_extras=True).values()]
+        return numba.types.BaseTuple.from_types(fields, hint)
+    return numba.typeof(hint())

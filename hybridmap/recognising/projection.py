@@ -1,0 +1,336 @@
+"""Known points in the image of a planar robot: how likely they are there, and which posture they imply.
+
+With q the point in the axes of a robot at (x, y, heading), forward, left and up, and the camera
+`mount_forward` ahead of the axle, looking along the robot's x axis,
+    X = q_x - mount_forward,  a = q_y / X,  b = (q_z - mount_height) / X,  u = cx - fx a,  v = cy - fy b.
+By the point, in the robot's axes, du = (fx a, -fx, 0) / X and dv = (fy b, 0, -fy) / X.
+
+These are kernels (hybridmap.jit): what is written for sighting n runs for each in turn or for all at once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridmap.jit import Cube, Flags, Index, Matrix, Vector, compiled, for_each, for_each_pair
+
+NEAREST = 0.05
+"""Points less than this ahead of the optical centre count as not visible, m."""
+
+GATE = 9.21
+"""Chi-square 99 % point for 2 degrees of freedom."""
+
+DEPTH_DECADES = math.log(100.0)
+"""A wrong match's depth may be anything over two decades, evenly in its logarithm."""
+
+LOG_DEPTH_DENSITY = math.log(DEPTH_DECADES) - 0.5 * math.log(2.0 * math.pi)
+
+SMALL_STEP = 1e-4
+"""Gauss-Newton ends when no component moves more, m and rad: far below any posture's uncertainty."""
+
+
+class Optics(NamedTuple):
+    """A camera as the kernels take it: focal lengths px, mount m, image's area px^2."""
+
+    fx: float
+    fy: float
+    mount_height: float
+    mount_forward: float
+    area: float
+
+
+class Seen(NamedTuple):
+    """N sightings of one camera.
+
+    Attributes:
+        points: (N, 3) m.
+        covariances: (N, 3, 3) m^2.
+        slopes: (N, 2) a and b of each pixel.
+        depths: (N,) m; 1 where not measured.
+        depth_variances: (N,) m^2; 1 where not measured.
+        measured: (N,) where the image gives a depth too.
+        pixel_variance: px^2.
+        optics: of the camera.
+    """
+
+    points: Matrix
+    covariances: Cube
+    slopes: Matrix
+    depths: Vector
+    depth_variances: Vector
+    measured: Flags
+    pixel_variance: float
+    optics: Optics
+
+
+class Poses(NamedTuple):
+    """H postures of the robot in the points' frame: (H,) m, m and the heading's cosine and sine."""
+
+    x: Vector
+    y: Vector
+    cos: Vector
+    sin: Vector
+
+
+@for_each_pair
+def _log_ratio(h: Index, n: Index, seen: Seen, poses: Poses) -> Vector:
+    """How much likelier sighting n is under posture h than as a wrong match, nats; see `log_ratios`."""
+    optics, p = seen.optics, seen.covariances
+    c, s = poses.cos[h], poses.sin[h]
+    dx, dy = seen.points[n, 0] - poses.x[h], seen.points[n, 1] - poses.y[h]
+    depth = c * dx + s * dy - optics.mount_forward
+    ahead = np.maximum(depth, NEAREST)
+    a = (c * dy - s * dx) / ahead
+    b = (seen.points[n, 2] - optics.mount_height) / ahead
+    # The point's covariance in the robot's axes.
+    xx = c * c * p[n, 0, 0] + 2.0 * c * s * p[n, 0, 1] + s * s * p[n, 1, 1]
+    yy = p[n, 0, 0] + p[n, 1, 1] - xx
+    xy = c * s * (p[n, 1, 1] - p[n, 0, 0]) + (c * c - s * s) * p[n, 0, 1]
+    xz, yz = c * p[n, 0, 2] + s * p[n, 1, 2], c * p[n, 1, 2] - s * p[n, 0, 2]
+    # And in the image.
+    fu, fv = optics.fx / ahead, optics.fy / ahead
+    ru, rv = optics.fx * (a - seen.slopes[n, 0]), optics.fy * (b - seen.slopes[n, 1])
+    uu = fu * fu * (a * (a * xx - 2.0 * xy) + yy) + seen.pixel_variance
+    vv = fv * fv * (b * (b * xx - 2.0 * xz) + p[n, 2, 2]) + seen.pixel_variance
+    uv = fu * fv * (b * (a * xx - xy) - a * xz + yz)
+    determinant = uu * vv - uv * uv
+    distance2 = (ru * (vv * ru - 2.0 * uv * rv) + uu * rv * rv) / determinant
+    # The depth is treated as independent of the pixel here; the refinement does not.
+    variance = xx + seen.depth_variances[n]
+    off = depth - seen.depths[n]
+    depth2 = seen.measured[n] * off * off / variance
+    gain = seen.measured[n] * (np.log(seen.depths[n]) + LOG_DEPTH_DENSITY - 0.5 * np.log(variance))
+    ratio = math.log(optics.area / (2.0 * math.pi)) - 0.5 * (np.log(determinant) + distance2 + depth2) + gain
+    kept = (depth > NEAREST) & (distance2 < GATE) & (depth2 < GATE)
+    nats: Vector = kept * np.maximum(ratio, 0.0)
+    return nats
+
+
+@compiled
+def log_ratios(seen: Seen, poses: Poses) -> Matrix:
+    """(H, N) how much likelier sightings are under postures than as wrong matches, nats; 0 where the point is
+    behind the camera or outside the 99 % gate.
+    """
+    return _log_ratio(len(poses.x), len(seen.points), seen, poses)
+
+
+class Stack(NamedTuple):
+    """All sightings of one problem, in columns; each has its own camera and direction.
+
+    Attributes:
+        points: (N, 3) m.
+        covariances: (N, 3, 3) m^2.
+        observed: (N, 3) u px, v px, depth m; the depth is 0 where not measured.
+        noise: (N, 3) variances of these.
+        measured: (N,) where the depth is.
+        gates: (N,) largest squared normalised residual of an inlier.
+        log_wrong: (N,) what -log of a right match's density is compared with, nats.
+        inverted: (N,) the point is in the robot's frame, and the image was taken where the wanted posture's
+            frame has its origin.
+        optics: (N, 6) fx, fy, cx, cy px, mount_height, mount_forward m.
+    """
+
+    points: Matrix
+    covariances: Cube
+    observed: Matrix
+    noise: Matrix
+    measured: Flags
+    gates: Vector
+    log_wrong: Vector
+    inverted: Flags
+    optics: Matrix
+
+
+class Linear(NamedTuple):
+    """A stack linearised at a posture and at points.
+
+    Attributes:
+        reprojection_px: (N, 2) observed minus predicted, against the points where they are now.
+        white: (N, 3, 4) for u px, v px and depth m the residual against the point where it was given, and the
+            derivatives of the prediction by the posture's x, y and heading, perturbed on the right as in
+            PoseGaussian; whitened by the inverse of the residuals' Cholesky factor. 0 where not visible.
+        factor: (N, 6) Cholesky's, 00 10 11 20 21 22, of the covariance of the residuals.
+        by_point: (N, 4) du by forward and left, dv by forward and up, px/m, in the axes of the robot whose
+            camera it is. The depth's derivative is forward.
+        axes: (N, 2) cosine and sine of that robot's heading in the points' frame.
+        distance2: (N,) squared normalised residuals.
+        log_ratios: (N,) nats against a wrong match, not cut.
+        inliers: (N,).
+        weights: (N,) probability that a sighting is right, 0 of those that are no inliers.
+    """
+
+    reprojection_px: Matrix
+    white: Cube
+    factor: Matrix
+    by_point: Matrix
+    axes: Matrix
+    distance2: Vector
+    log_ratios: Vector
+    inliers: Flags
+    weights: Vector
+
+
+@for_each
+def _linearise(n: Index, stack: Stack, posture: Vector, points: Matrix, out: Linear) -> None:
+    """Fill in what `linearise` says of sighting n."""
+    fx, fy, cx, cy = stack.optics[n, 0], stack.optics[n, 1], stack.optics[n, 2], stack.optics[n, 3]
+    x, y, cos, sin = posture[0], posture[1], math.cos(posture[2]), math.sin(posture[2])
+    # Where the robot whose camera it is stands in the points' frame: at the posture, or at its inverse.
+    inverse = 1.0 * stack.inverted[n]
+    direct = 1.0 - inverse
+    c, s = cos, sin * (direct - inverse)
+    dx = points[n, 0] - direct * x + inverse * (cos * x + sin * y)
+    dy = points[n, 1] - direct * y - inverse * (sin * x - cos * y)
+    forward, left = c * dx + s * dy, c * dy - s * dx
+    depth = forward - stack.optics[n, 5]
+    ahead = np.maximum(depth, NEAREST)
+    a, b = left / ahead, (points[n, 2] - stack.optics[n, 4]) / ahead
+    u_x, u_y, v_x, v_z = fx * a / ahead, -fx / ahead, fy * b / ahead, -fy / ahead
+
+    # Observed minus predicted; and back from where the point is now to where it was given.
+    off_u, off_v = stack.observed[n, 0] - cx + fx * a, stack.observed[n, 1] - cy + fy * b
+    off_d = stack.observed[n, 2] - depth
+    bx, by = stack.points[n, 0] - points[n, 0], stack.points[n, 1] - points[n, 1]
+    back_x, back_y, back_z = c * bx + s * by, c * by - s * bx, stack.points[n, 2] - points[n, 2]
+
+    # Cholesky's factor of the residuals' covariance: the depth's variance may be a million times a pixel's.
+    p, noise = stack.covariances, stack.noise
+    xx = c * c * p[n, 0, 0] + 2.0 * c * s * p[n, 0, 1] + s * s * p[n, 1, 1]
+    yy, zz = p[n, 0, 0] + p[n, 1, 1] - xx, p[n, 2, 2]
+    xy = c * s * (p[n, 1, 1] - p[n, 0, 0]) + (c * c - s * s) * p[n, 0, 1]
+    xz, yz = c * p[n, 0, 2] + s * p[n, 1, 2], c * p[n, 1, 2] - s * p[n, 0, 2]
+    f00 = np.sqrt(u_x * (u_x * xx + 2.0 * u_y * xy) + u_y * u_y * yy + noise[n, 0])
+    f10 = (v_x * (u_x * xx + u_y * xy) + v_z * (u_x * xz + u_y * yz)) / f00
+    f20 = (u_x * xx + u_y * xy) / f00
+    f11 = np.sqrt(v_x * (v_x * xx + 2.0 * v_z * xz) + v_z * v_z * zz + noise[n, 1] - f10 * f10)
+    f21 = (v_x * xx + v_z * xz - f20 * f10) / f11
+    f22 = np.sqrt(xx + noise[n, 2] - f20 * f20 - f21 * f21)
+
+    # A step of the posture moves the point in the robot's axes by -(1, 0, -left) and -(0, 1, forward); where
+    # inverted, inverse(posture @ d) = inverse(posture) @ (-Ad(posture) d) to first order.
+    visible = depth > NEAREST
+    white = out.white
+    for k in range(4):
+        if k == 0:
+            u = off_u - u_x * back_x - u_y * back_y
+            v = off_v - v_x * back_x - v_z * back_z
+            d = stack.measured[n] * (off_d - back_x)
+        else:
+            if k == 1:
+                along, aside = inverse * cos - direct, inverse * sin
+            elif k == 2:
+                along, aside = -inverse * sin, inverse * cos - direct
+            else:
+                along, aside = (
+                    inverse * y + (direct - inverse) * left,
+                    -inverse * x + (inverse - direct) * forward,
+                )
+            u, v, d = u_x * along + u_y * aside, v_x * along, along
+        white[n, 0, k] = visible * u / f00
+        white[n, 1, k] = (visible * v - f10 * white[n, 0, k]) / f11
+        white[n, 2, k] = (visible * d - f20 * white[n, 0, k] - f21 * white[n, 1, k]) / f22
+
+    distance2 = white[n, 0, 0] ** 2 + white[n, 1, 0] ** 2 + white[n, 2, 0] ** 2
+    ratio = stack.log_wrong[n] - np.log(f00 * f11 * f22) - 0.5 * distance2
+    inlier = visible & (distance2 < stack.gates[n]) & (ratio > 0.0)
+    out.reprojection_px[n, 0], out.reprojection_px[n, 1] = off_u, off_v
+    out.factor[n, 0], out.factor[n, 1], out.factor[n, 2] = f00, f10, f11
+    out.factor[n, 3], out.factor[n, 4], out.factor[n, 5] = f20, f21, f22
+    out.by_point[n, 0], out.by_point[n, 1], out.by_point[n, 2], out.by_point[n, 3] = u_x, u_y, v_x, v_z
+    out.axes[n, 0], out.axes[n, 1] = c, s
+    out.distance2[n], out.log_ratios[n], out.inliers[n] = distance2, ratio, inlier
+    out.weights[n] = inlier / (1.0 + np.exp(-np.minimum(np.maximum(ratio, 0.0), 30.0)))
+
+
+@compiled
+def linearise(stack: Stack, posture: Vector, points: Matrix) -> Linear:
+    """Linearise sightings at a posture (3,) and at points (N, 3) m near those of the stack."""
+    count = len(stack.points)
+    out = Linear(
+        np.empty((count, 2)), np.empty((count, 3, 4)), np.empty((count, 6)), np.empty((count, 4)),
+        np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count, np.bool_), np.empty(count),
+    )  # fmt: skip
+    _linearise(count, stack, posture, points, out)
+    return out
+
+
+@compiled
+def normal_equations(linear: Linear) -> Matrix:
+    """(4, 4) products of the columns of all white rows, each counted by its weight.
+
+    Of the posture, [1:, 1:] is the information and [1:, 0] the gradient.
+    """
+    rows = (linear.white * np.sqrt(linear.weights)[:, None, None]).reshape(-1, 4)
+    return rows.T @ rows
+
+
+@compiled
+def determined(information: Matrix) -> bool:
+    """Whether a posture's (3, 3) information is far from singular; lengths and angles count alike at 1 m."""
+    if not np.isfinite(information).all():
+        return False
+    values = np.linalg.eigvalsh(information)
+    return bool(values[0] > 1e-9 * max(values[2], 1e-300))
+
+
+@for_each
+def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matrix) -> None:
+    """Put point n where it fits best after a step of the posture, within its uncertainty; outliers back."""
+    white, factor, p = linear.white, linear.factor, stack.covariances
+    # The residual that is left, times the inverse of its covariance.
+    left0 = white[n, 0, 0] - white[n, 0, 1] * step[0] - white[n, 0, 2] * step[1] - white[n, 0, 3] * step[2]
+    left1 = white[n, 1, 0] - white[n, 1, 1] * step[0] - white[n, 1, 2] * step[1] - white[n, 1, 3] * step[2]
+    left2 = white[n, 2, 0] - white[n, 2, 1] * step[0] - white[n, 2, 2] * step[1] - white[n, 2, 3] * step[2]
+    d = left2 / factor[n, 5]
+    v = (left1 - factor[n, 4] * d) / factor[n, 2]
+    u = (left0 - factor[n, 1] * v - factor[n, 3] * d) / factor[n, 0]
+    # By the point: in the robot's axes, then in the points' frame.
+    forward = linear.by_point[n, 0] * u + linear.by_point[n, 2] * v + d
+    left, z = linear.by_point[n, 1] * u, linear.by_point[n, 3] * v
+    x = linear.axes[n, 0] * forward - linear.axes[n, 1] * left
+    y = linear.axes[n, 1] * forward + linear.axes[n, 0] * left
+    inlier = linear.inliers[n]
+    for k in range(3):
+        out[n, k] = stack.points[n, k] + inlier * (p[n, k, 0] * x + p[n, k, 1] * y + p[n, k, 2] * z)
+
+
+@compiled
+def improve(
+    stack: Stack, start: Vector, prior: Vector, prior_information: Matrix, rounds: int
+) -> tuple[bool, Vector, Matrix]:
+    """Bring a posture to its best near a first one by Gauss-Newton.
+
+    Args:
+        stack: the sightings.
+        start: (3,) m, m, rad.
+        prior: (3,) mean of what else is known of the posture.
+        prior_information: (3, 3) of that, zero if nothing is.
+        rounds: at most.
+
+    Returns:
+        Whether the inliers determine a posture; the posture (3,); and the points (N, 3) m that fit it best.
+    """
+    posture, points = start.copy(), stack.points.copy()
+    away = np.empty(3)
+    for _ in range(rounds):
+        linear = linearise(stack, posture, points)
+        products = normal_equations(linear)
+        information = products[1:, 1:] + prior_information
+        c, s = math.cos(posture[2]), math.sin(posture[2])
+        dx, dy = prior[0] - posture[0], prior[1] - posture[1]
+        away[0], away[1] = c * dx + s * dy, c * dy - s * dx
+        away[2] = (prior[2] - posture[2] + math.pi) % (2.0 * math.pi) - math.pi
+        if not determined(information):
+            return False, posture, points
+        gradient = products[1:, 0] + prior_information @ away
+        step = np.linalg.solve(information, gradient).astype(np.float64)
+        posture[0] += c * step[0] - s * step[1]
+        posture[1] += s * step[0] + c * step[1]
+        posture[2] = (posture[2] + step[2] + math.pi) % (2.0 * math.pi) - math.pi
+        _move_point(len(points), stack, linear, step, points)
+        if np.abs(step).max() < SMALL_STEP:
+            break
+    return True, posture, points

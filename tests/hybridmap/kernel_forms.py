@@ -1,0 +1,30 @@
+"""Tests of kernels run twice: as numba compiles them, and in NumPy as on a robot without it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from hybridmap.jit import KERNELS
+
+
+@contextmanager
+def in_numpy() -> Iterator[None]:
+    """Run kernels as they are written."""
+    with pytest.MonkeyPatch.context() as patch:
+        for kernel in KERNELS:
+            patch.setitem(kernel.__dict__, "machine", kernel.python)
+        yield
+
+
+@pytest.fixture(params=["numba", "numpy"], scope="module")
+def form(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Either form, for all tests of a module that uses it."""
+    if request.param == "numba":
+        pytest.importorskip("numba")
+        yield "numba"
+    else:
+        with in_numpy():
+            yield "numpy"
