@@ -12,9 +12,9 @@ from hybridmap.node import Edge, MapId
 from hybridmap.ruling import Rulings
 from merge.belief.credence import credences
 from merge.belief.cutting import fragments_of
-from merge.belief.joining import Solver
 from merge.graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
 from merge.graph.merged import MergedMap, Placement
+from merge.graph.solver import Solver
 from merge.merging import MergeSettings
 from merge.undoing import undo
 from wire.codec import element_of
@@ -73,7 +73,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     s = settings or MergeSettings()
     maps, rulings = maps_of(content), Rulings(content.rulings)
     links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
-    solved = Solver(fragments_of(undo(maps, (), rulings).maps, s.consistency, s.strain), s.huber).solve(links)
+    solved = Solver(fragments_of(undo(maps, (), rulings).maps, s.consistency, s.strain)).solve(links)
     postures = {
         node: Placement(number, posture)
         for number, graph in enumerate(solved)

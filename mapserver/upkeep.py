@@ -16,7 +16,6 @@ from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
 from mapserver.chronicle import Chronicle
-from mapserver.merging.deciding import Deciding
 from mapserver.merging.findingskeeper import FindingsKeeper
 from mapserver.merging.merger import Merger, MergerSettings
 from mapserver.places.placeindex import PlaceIndex
@@ -40,13 +39,6 @@ class _Read:
     """All of the store has been handed over; `taken` is set when it is taken in."""
 
     taken: threading.Event = field(default_factory=threading.Event)
-
-
-@dataclass(frozen=True)
-class _Decided:
-    """What was to be decided again as a whole is decided, or could not be."""
-
-    well: bool
 
 
 News = Change | list[Change] | Rulings
@@ -79,10 +71,7 @@ class Upkeep:
         self._share = share
         self._by_itself = by_itself
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
-        self._deciding = Deciding(self._merger, lambda well: self._changes.put(_Decided(well)))
-        self._changes: queue.SimpleQueue[News | threading.Event | _Read | _Decided | None] = (
-            queue.SimpleQueue()
-        )
+        self._changes: queue.SimpleQueue[News | threading.Event | _Read | None] = queue.SimpleQueue()
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
@@ -193,7 +182,6 @@ class Upkeep:
                 spent = time.monotonic() - began
                 rest_until = time.monotonic() + spent * (1.0 / self._share - 1.0)
                 self._save()
-                self._deciding.begin()
                 continue
             if change is None:
                 return
@@ -201,11 +189,6 @@ class Upkeep:
                 if self._by_itself and self._merger.uncompared:
                     self._tell_apart()
                 change.taken.set()
-                continue
-            if isinstance(change, _Decided):
-                self._dirty |= change.well
-                if not change.well:
-                    self._merger.give_up()
                 continue
             if isinstance(change, threading.Event):
                 if self._dirty:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -20,10 +20,10 @@ from mapserver.relocalizing.lookalikes import LookAlikes
 from merge.graph.candidates import CandidateSettings, Pair
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
+from merge.graph.pairs import PairTable
+from merge.graph.verdicts import Verdict, Verdicts
 from merge.graph.verification import VerificationSettings, verify
-from merge.incremental.islands import Islands
-from merge.incremental.pairs import PairTable
-from merge.incremental.verdicts import Verdict, Verdicts
+from merge.islands import Islands
 from merge.life.fading import Fader, FadingSettings
 from merge.life.renewal import RenewalSettings, Renewer
 from merge.merging import MergeSettings
@@ -117,7 +117,7 @@ class Merger:
             self._prints[node_id] = known if known and same else (node, print_of(node))
         prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
-        return Findings(prints, self._pairs.overlaps(), verdicts, self._islands.decisions())
+        return Findings(prints, self._pairs.overlaps(), verdicts)
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -177,7 +177,7 @@ class Merger:
 
     def merged(self) -> MergedMap:
         """The merged map of all that has come; made anew only if something has changed, and where it has."""
-        if self._dirty or self._islands.decided:
+        if self._dirty:
             self.look_around()
             self._take_over()
             changed = self._pairs.changed()
@@ -192,9 +192,7 @@ class Merger:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
-            merged = self._islands.merge(
-                self._kept, self._verdicts, self._touched, self._rulings, self._succession.past
-            )
+            merged = self._islands.merge(self._kept, self._verdicts, self._touched, self._rulings)
             renewed = self._renewer.renewed(merged)
             self._succession.follow(renewed.superseded)
             self._merged = self._fader.fade(renewed)
@@ -202,15 +200,6 @@ class Merger:
             self._touched, self._changed = set(), set()
             self._dirty = False
         return self._merged
-
-    def again(self) -> Callable[[], None] | None:
-        """What should be decided again as a whole, by any thread; the next merge takes it up."""
-        task = self._islands.again(self._kept, self._verdicts)
-        return None if task is None else task.run
-
-    def give_up(self) -> None:
-        """What was to be decided again could not be."""
-        self._islands.give_up()
 
     def look_around(self, most: int | None = None) -> None:
         """Look for what is like the nodes that were read, or like so many of them."""
@@ -228,7 +217,6 @@ class Merger:
             for pair, verdict in self._before.verdicts(self.node):
                 if pair[1] not in self._known.get(pair[0], {}):
                     self._judge(pair, verdict)
-            self._islands.resume(self._before.decided)
             self._before = None
 
     def apart(self) -> MergedMap:

@@ -21,8 +21,9 @@ from mapserver.relocalizing.regions import RegionSettings
 from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
 from mapserver.relocalizing.seenplaces import Sighting
 from mapserver.upkeep import PREPARED_AT_ONCE, Upkeep
+from merge.graph.component import solve_graph
+from merge.graph.factors import Measurement
 from merge.graph.merged import MergedMap, Placement
-from merge.graph.posegraph import Measurement, solve_graph
 from tests.waiting import eventually
 
 ROOM = room(0, 0, 5, 4, 700, np.random.default_rng(1))
