@@ -15,9 +15,9 @@ from hybridmap.node import Edge, MapId
 from hybridmap.ruling import Rulings
 from merge.belief.credence import credences
 from merge.belief.cutting import fragments_of
-from merge.belief.joining import Solver
 from merge.graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
 from merge.graph.merged import MergedMap, Placement
+from merge.graph.solver import Solver
 from merge.merging import MergeSettings
 from merge.undoing import undo
 from wire.codec import element_of
@@ -81,7 +81,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
     try:
         parts = fragments_of(undo(maps, (), rulings).maps, s.consistency, s.strain)
-        solved = Solver(parts, s.huber).solve(links)
+        solved = Solver(parts).solve(links)
     except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
         # The solver's RuntimeError says that a system is singular.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

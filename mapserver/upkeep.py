@@ -14,7 +14,6 @@ from hybridmap.node import Node, NodeId
 from hybridmap.ruling import Rulings
 from mapserver.answers import Answers
 from mapserver.chronicle import Chronicle
-from mapserver.merging.deciding import Deciding
 from mapserver.merging.findingskeeper import FindingsKeeper
 from mapserver.merging.merger import Merger, MergerSettings
 from mapserver.places.placeindex import PlaceIndex
@@ -61,7 +60,6 @@ class Upkeep:
         self._chronicle = chronicle or Chronicle()
         self._share = share
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
-        self._deciding = Deciding(self._merger, schedule, self._decided)
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
@@ -189,10 +187,6 @@ class Upkeep:
             self._prepare(PREPARED_AT_ONCE)
         spent = self._schedule.monotonic() - began
         self._save()
-        try:
-            self._deciding.begin()
-        except Exception:  # steps go on from what stands
-            log.exception("nothing can be decided again")
         return spent * (1.0 / self._share - 1.0)
 
     def _settle(self, merged: threading.Event) -> None:
@@ -206,16 +200,6 @@ class Upkeep:
         if self._merger.uncompared:
             self._tell_apart()
         taken.set()
-
-    def _decided(self, well: bool) -> None:
-        """What was to be decided again as a whole is decided, or could not be; called from any thread."""
-
-        def take_up() -> None:
-            self._dirty |= well
-            if not well:
-                self._merger.give_up()
-
-        self._schedule.post(take_up)
 
     def _take(self, change: Change) -> None:
         if isinstance(change.body, NodePut):

@@ -9,7 +9,8 @@ from hybridmap.errors import InvalidValue
 from hybridmap.node import NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.g2o import G2oGraph
-from merge.graph.posegraph import LEAST_SIGMAS, Measurement, solve_graph
+from merge.graph.component import solve_graph
+from merge.graph.factors import LEAST_SIGMAS, Measurement
 
 OTHERS = "g2o"
 """Stands for the agent in the ids of others' vertices."""

@@ -11,8 +11,8 @@ from hybridmap.node import EdgeId, Node, NodeId
 from hybridmap.pose import Pose2
 from merge.belief.credence import credences
 from merge.belief.cutting import fragments_of
+from merge.graph.factors import Measurement
 from merge.graph.merged import MergedMap
-from merge.graph.posegraph import Measurement
 from merge.undoing import undo
 
 

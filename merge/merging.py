@@ -13,24 +13,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
+from hybridmap.node import MapId, NodeId
 from merge.belief.agglomeration import agglomerate
 from merge.belief.consistency import ConsistencySettings, group_links
 from merge.belief.distinctness import weigh
 from merge.belief.drives import refuse_drives
-from merge.belief.joining import Outliers, Solver, optimise
+from merge.belief.joining import optimise
 from merge.belief.memory import Memory
 from merge.belief.readmission import readmitted
 from merge.bodies.refutation import Refutation
 from merge.bodies.settings import ExclusionSettings
+from merge.graph.candidates import Pair
+from merge.graph.fragments import Fragment
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap, Postures
-from merge.graph.posegraph import HUBER
+from merge.graph.solver import Solver
+from merge.standing import Standing
 
 
 @dataclass(frozen=True)
@@ -40,22 +42,12 @@ class MergeSettings:
     Attributes:
         consistency: when links are believed.
         exclusion: when two robots would have been in one place.
-        outliers: how links are found that the joined map does not bear out.
         strain: chi-square with 3 degrees of freedom above which an optimised link is refused.
     """
 
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     exclusion: ExclusionSettings = field(default_factory=ExclusionSettings)
-    outliers: Outliers = Outliers.WORST_FIRST
     strain: float = 25.0
-
-    @property
-    def huber(self) -> float:
-        """Normalised residual from which a link pulls no harder.
-
-        Where the wrong ones are found out before the solution counts, none has to be held back.
-        """
-        return HUBER if self.outliers is Outliers.WORST_FIRST else math.inf
 
 
 def merge_maps(
@@ -63,7 +55,6 @@ def merge_maps(
     links: Iterable[Link],
     refused: Iterable[RefusedLink] = (),
     settings: MergeSettings | None = None,
-    memory: Memory | None = None,
 ) -> MergedMap:
     """Merge.
 
@@ -72,56 +63,99 @@ def merge_maps(
         links: verified, at most one a pair of nodes; those at nodes that are not there are left out.
         refused: pairs that were refused before, to be kept with their reasons.
         settings: how.
-        memory: of merges before with the same settings; what they have found out is not found out again.
 
     Returns:
         The merged map. It does not depend on the order of maps, links or nodes.
     """
-    s = settings or MergeSettings()
-    memory = memory or Memory()
+    return decide(maps, links, refused, settings or MergeSettings(), Memory())[0]
+
+
+def decide(
+    maps: Mapping[MapId, HybridMap],
+    links: Iterable[Link],
+    refused: Iterable[RefusedLink],
+    settings: MergeSettings,
+    memory: Memory,
+    before: Standing | None = None,
+) -> tuple[MergedMap, Standing]:
+    """Merge, and tell what was decided, so that the next merge can begin from it.
+
+    Args:
+        maps: by id; they are not changed.
+        links: verified, see `merge_maps`.
+        refused: pairs that were refused before, to be kept with their reasons.
+        settings: how.
+        memory: of merges with the same settings; what they have found out is not found out again.
+        before: what stands of the same maps, as far as it is still true. A link keeps its decision until
+            links between the same two maps come or go; None: all are decided.
+
+    Returns:
+        The merged map, and what stands now.
+    """
+    s = settings
     fragments = memory.fragments(maps, s.consistency, s.strain)
-    solver = Solver(fragments, s.huber)
+    solver = Solver(fragments)
     by_node = solver.by_node
-    refutation = Refutation(maps, solver, s.consistency, s.exclusion)
-    present = [link for link in links if link.a in by_node and link.b in by_node]
-    present = memory.weighed(present, weigh(present, by_node, maps, s.consistency))
-    refusals = [r for r in refused if r.a in by_node and r.b in by_node]
-    refusals += [r for fragment in fragments for r in fragment.refused]
-    given = {link.canonical().pair: link for link in present}
+    given = {link.pair: link for link in links if link.a in by_node and link.b in by_node}
+    standing = before or Standing()
+    known = {pair for pair, link in given.items() if standing.given.get(pair) is link}
+    news = (given.keys() - known) | (standing.given.keys() - known)
+    fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
+    weighed = _weighed(given, standing, known, fresh, by_node, maps, memory, s)
+    held = [link for pair, link in weighed.items() if pair in standing.believed and pair in known]
+    out = standing.refuted & known
+    part = {node: k for k, graph in enumerate(standing.graphs) for node in graph.nodes}
+    closed = {
+        pair
+        for pair in standing.refused.keys() & known
+        if weighed[pair].maps not in fresh and part.get(pair[0]) == part.get(pair[1])
+    }
+    if before is not None:
+        gone = [standing.weighed[pair] for pair in standing.believed - known]
+        solver.resume(standing.graphs, standing.fragments, held, gone)
+    refutation = Refutation(maps, fragments, s.exclusion, memory)
     groups = {
         (first, second): memory.group(
             group,
-            [given[link.canonical().pair] for link in group],
+            [weighed[link.key] for link in group],
             by_node[first],
             by_node[second],
             s.consistency,
             refutation.verdict,
+            exact=before is None,
         )
-        for (first, second), group in group_links(present, by_node).items()
+        for (first, second), group in group_links(
+            [link for pair, link in weighed.items() if pair not in out], by_node
+        ).items()
     }
+    earlier = {refutation.key_of(weighed[pair]) for pair in out}
     # Each round refutes a link at least, so there is a last one.
     while True:
-        kept, unjoined = agglomerate(solver, groups, s.consistency)
-        solved, kept, strained = optimise(solver, kept, s.strain, s.outliers)
-        if s.outliers is Outliers.WORST_FIRST:
-            tried = [r.link for r in (*unjoined, *strained) if r.link is not None]
-            if back := readmitted(solver, kept, tried, s.consistency):
-                kept = [*kept, *back]
-                solved = solver.solve(kept, believed=True)
-                told = {link.canonical().pair for link in back}
-                unjoined, strained = (
-                    [r for r in some if r.pair not in told] for some in (unjoined, strained)
-                )
-        refuted = {key for key, group in groups.items() if group.refuted}
-        impossible = refutation.impossible(solved, kept, refuted)
+        kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
+        solved, kept, strained = optimise(solver, kept, s.strain, whole=before is None)
+        tried = [r.link for r in (*unjoined, *strained) if r.link is not None]
+        if back := readmitted(solver, kept, tried, s.consistency):
+            kept = [*kept, *back]
+        solved = solver.solve(kept, believed=True)
+        told = {link.key for link in kept}
+        unjoined, strained = ([r for r in some if r.pair not in told] for some in (unjoined, strained))
+        refuted = earlier | {key for key, group in groups.items() if group.refuted}
+        changed = None if before is None else solver.changed
+        impossible = refutation.impossible(solved, kept, refuted, changed)
         if not impossible:
             break
         for key, reason in impossible.items():
             story = [link for link in kept if refutation.key_of(link) == key]
             groups[key] = groups[key].without(story, reason, s.consistency, refutation.verdict)
-    refusals += [r for group in groups.values() for r in group.refuted] + unjoined + strained
+        impossible_pairs = {r.pair for group in groups.values() for r in group.refuted}
+        held = [link for link in held if link.pair not in impossible_pairs]
+    fallen = {r.pair: r for group in groups.values() for r in group.refuted}
+    because = {pair: standing.refused[pair] for pair in closed | out}
+    because |= {r.pair: r for r in (*unjoined, *strained)} | fallen
+    refusals = [r for r in refused if r.a in by_node and r.b in by_node] + list(because.values())
+    refusals += [r for fragment in fragments for r in fragment.refused]
     refusals += refuse_drives(maps, solved, s.consistency)
-    return MergedMap(
+    merged = MergedMap(
         dict(sorted(maps.items())),
         tuple(sorted((link.canonical() for link in kept), key=lambda link: link.pair)),
         tuple(sorted(refusals, key=lambda r: r.pair)),
@@ -129,3 +163,37 @@ def merge_maps(
         Postures(solved),
         tuple(solved),
     )
+    return merged, Standing(
+        given,
+        weighed,
+        frozenset(link.pair for link in merged.links),
+        because,
+        frozenset(out | fallen.keys()),
+        merged.graphs,
+        tuple(fragments),
+        len(given) if before is None else standing.size,
+        0 if before is None else standing.changed + len(news),
+    )
+
+
+def _weighed(
+    given: Mapping[Pair, Link],
+    standing: Standing,
+    known: Set[Pair],
+    fresh: Set[tuple[MapId, MapId]],
+    by_node: Mapping[NodeId, Fragment],
+    maps: Mapping[MapId, HybridMap],
+    memory: Memory,
+    s: MergeSettings,
+) -> dict[Pair, Link]:
+    """Links with their doubles, which are looked for among those between maps of which links are new."""
+    out = {pair: standing.weighed[pair] for pair in given if pair in known}
+    some = [link for link in given.values() if link.maps in fresh]
+    involved = {one: maps[one] for pair in fresh for one in pair if one in maps}
+    for link, found in zip(
+        some, memory.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
+    ):
+        # What is known to be elsewhere too stays so, whoever is looked at.
+        if link.key not in out or out[link.key].doubles < found.doubles:
+            out[link.key] = found
+    return out

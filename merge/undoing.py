@@ -52,6 +52,8 @@ def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Ruling
         links: verified.
         rulings: of people.
     """
+    if not rulings.in_force:
+        return Undone(maps, tuple(links), (), maps, rulings)
     kept: list[Link] = []
     refused: list[RefusedLink] = []
     for link in links:
@@ -60,8 +62,6 @@ def undo(maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: Ruling
             kept.append(link)
         else:
             refused.append(refuse(link, reason_of(ruling)))
-    if not rulings.in_force:
-        return Undone(maps, tuple(kept), (), maps, rulings)
     retired = rulings.retired
     left = {map_id: one for map_id, one in maps.items() if map_id not in retired}
     kept = [link for link in kept if link.a.map not in retired and link.b.map not in retired]

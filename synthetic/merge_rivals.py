@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import networkx as nx
 import numpy as np
@@ -15,12 +14,13 @@ from mapweave.scoring import align
 from merge.belief.cliques import best_clique
 from merge.belief.consistency import ConsistencySettings, group_links, loop_distances2
 from merge.belief.cutting import fragments_of
-from merge.belief.joining import Outliers
 from merge.graph.fragments import fragment_by_node
 from merge.graph.links import Link
-from merge.graph.merged import MergedMap
+from merge.graph.merged import MergedMap, Postures
+from merge.graph.solver import Solver
 from merge.merging import MergeSettings, merge_maps
 from synthetic.fleet import SyntheticFleet
+from synthetic.gnc import inliers
 
 MAPWEAVE = "mapweave"
 """The settings that are the default."""
@@ -28,21 +28,25 @@ Maps = Mapping[MapId, HybridMap]
 Rival = Callable[[Maps, Sequence[Link]], MergedMap]
 
 
-def believing(outliers: Outliers) -> MergeSettings:
-    """No link is asked whether others agree with it."""
-    default = MergeSettings()
-    consistency = replace(default.consistency, cliques=False)
-    return replace(default, consistency=consistency, outliers=outliers)
-
-
 def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
     """All links are believed."""
-    return merge_maps(maps, links, settings=believing(Outliers.NONE))
+    fragments = fragments_of(maps)
+    by_node = fragment_by_node(fragments)
+    believed = [link for link in links if link.a in by_node and link.b in by_node]
+    graphs = Solver(fragments).solve(believed, believed=True)
+    return MergedMap(
+        maps,
+        tuple(sorted(believed, key=lambda link: link.pair)),
+        (),
+        tuple(frozenset(graph.nodes) for graph in graphs),
+        Postures(graphs),
+        tuple(graphs),
+    )
 
 
 def gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
     """Graduated non-convexity over all links at once (Yang et al., RA-L 2020)."""
-    return merge_maps(maps, links, settings=believing(Outliers.GRADUATED))
+    return least_squares(maps, inliers(fragments_of(maps), links, MergeSettings().strain))
 
 
 def pcm(maps: Maps, links: Sequence[Link]) -> MergedMap:
@@ -66,17 +70,11 @@ def largest_sets(maps: Maps, links: Sequence[Link]) -> list[Link]:
     return out
 
 
-def mapweave_gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
-    """Mapweave with graduated non-convexity at the end."""
-    return merge_maps(maps, links, settings=replace(MergeSettings(), outliers=Outliers.GRADUATED))
-
-
 RIVALS: dict[str, Rival] = {
     "least_squares": least_squares,
     "gnc": gnc,
     "pcm": pcm,
     "pcm_gnc": pcm_gnc,
-    "mapweave_gnc": mapweave_gnc,
     MAPWEAVE: merge_maps,
 }
 """By name."""

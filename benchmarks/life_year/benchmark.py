@@ -3,10 +3,9 @@
     python -m benchmarks.life_year [--drives N] [--seed N] [--false SHARE] [--nodes N] [--alone] [--json]
 
 Only postures are drawn and links, true and false (`synthetic.drives`); a merge follows every drive.
-Side by side: what was decided of nodes of another day for which others stand is left standing, as the map
-server does, and everything is decided again whenever a tenth has changed. Told are seconds of the processor a
-merge, links that the two do not have in common, false links that are believed, and how far living nodes are
-from the truth. With `--alone` only the first is run.
+Side by side: what was decided stands, as on the map server, and everything is decided with every drive. Told
+are seconds of the processor a merge, links that the two do not have in common, false links that are believed,
+and how far living nodes are from the truth. With `--alone` only the first is run.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from hybridmap.pose import Pose2
 from hybridmap.ruling import Rulings
 from mapweave.scoring import align
 from merge.graph.merged import MergedMap
-from merge.incremental.islands import Islands
-from merge.incremental.verdicts import Verdicts
+from merge.graph.verdicts import Verdicts
+from merge.islands import Islands
 from synthetic.drives import Drive, DriveSettings, drives
 from synthetic.fleet import FleetSettings
 
@@ -43,20 +42,20 @@ class Merging:
     """One way of merging day after day.
 
     Attributes:
-        stands: whether what was decided of nodes of another day stands.
+        stands: whether what was decided stands.
         seconds: of the processor, of each merge.
-        beside: the same, of what the map server decides again beside its merges.
         merged: the newest map.
     """
 
     stands: bool
     seconds: list[float] = field(default_factory=list)
-    beside: float = 0.0
     merged: MergedMap = field(default_factory=MergedMap.empty)
-    _islands: Islands = field(default_factory=Islands)
     _verdicts: Verdicts = field(default_factory=Verdicts)
     _maps: dict[MapId, HybridMap] = field(default_factory=dict)
-    _past: frozenset[NodeId] = frozenset()
+
+    def __post_init__(self) -> None:
+        """Nothing is merged yet."""
+        self._islands = Islands() if self.stands else Islands(exact=10**9)
 
     def take(self, today: Drive) -> None:
         """One more drive."""
@@ -66,13 +65,8 @@ class Merging:
             self._verdicts.put(link.pair, link)
             touched |= {link.a.map, link.b.map}
         began = time.process_time()
-        self.merged = self._islands.merge(self._maps, self._verdicts, touched, Rulings(), self._past)
+        self.merged = self._islands.merge(self._maps, self._verdicts, touched, Rulings())
         self.seconds.append(time.process_time() - began)
-        self._past = today.past if self.stands else frozenset()
-        if again := self._islands.again(self._maps, self._verdicts):
-            began = time.process_time()
-            again.run()
-            self.beside += time.process_time() - began
 
 
 def main() -> None:
@@ -84,7 +78,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of ways, noise and links (default 0)")
     parser.add_argument("--false", type=float, default=0.3, help="share of false links (default 0.3)")
     parser.add_argument("--nodes", type=int, default=48, help="of a drive (default 48)")
-    parser.add_argument("--alone", action="store_true", help="without deciding everything again beside it")
+    parser.add_argument(
+        "--alone", action="store_true", help="without deciding everything with every drive beside it"
+    )
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     a = parser.parse_args()
     if a.drives < 1 or a.nodes < 20 or a.seed < 0 or not 0.0 <= a.false < 0.95:
@@ -125,7 +121,6 @@ def run(
             f"{name}merge_s": round(statistics.median(way.seconds[-LAST:]), 3),
             f"{name}merge_s_most": round(max(way.seconds), 3),
             f"{name}merge_s_all": round(sum(way.seconds), 3),
-            f"{name}beside_s_all": round(way.beside, 3),
             f"{name}components": len(way.merged.components),
             f"{name}links": len(links),
             f"{name}links_false": len(links - true),

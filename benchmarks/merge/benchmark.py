@@ -12,18 +12,13 @@ that one fleet of twenty that stays in two pieces decides the mean (`ate_ratio_m
 that became one map, whose ratio is at most 1.1, and in which robots are joined by no true link. False links
 come in sets of up to four that agree with each other; under `independent` are the same figures where each is
 false for itself, as is usual in the literature. Side by side: plain least squares, graduated non-convexity
-alone (GNC), pairwise consistency alone (PCM), the two together, Mapweave with GNC at the end, and Mapweave as
-it is by default.
+alone (GNC), pairwise consistency alone (PCM), the two together, and Mapweave.
 
 Drives through a city of square blocks (see `synthetic.city`), and with `--g2o FILE` the graphs in
 files, are split among `--split` robots and merged: `cost_ratio` is the chi-square of all edges, refused ones
 too, over that of GTSAM's batch optimum; null where the graph ended in pieces. With `--robots FOLDER`, which
 holds one g2o file of a graph in space for each robot: how many links between robots there are, and which of
 them pairwise consistency keeps, as pairs of keys.
-
-Without false links and step by step (see `benchmarks.merge.steps`), `steps` tells what it costs to optimise
-as a map of 1000 nodes grows, beside GTSAM's iSAM2 with its usual settings and with exact ones: ms of the
-processor for a step, and `cost_ratio` to the batch optimum at the end.
 
 With `--scale` only that is measured: fleets of maps of 100 nodes (see `benchmarks.merge.scale`), and by the
 number of nodes what a new node costs, verification included, and a merge: median and 95th percentile in ms by
@@ -51,7 +46,6 @@ from rich.table import Table
 
 from benchmarks.merge.robots import kept_links
 from benchmarks.merge.scale import scale
-from benchmarks.merge.steps import stepping
 from hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.g2o import G2oGraph, read_g2o
 from synthetic.city import HEADING_SIGMAS, draw_grid
@@ -75,8 +69,6 @@ SHARES = (0, 50, 80, 90)
 """Of false links, per cent."""
 SIZES = (300, 1000)
 """Nodes of fleets at scale, unless others are asked for."""
-STEP_NODES = 1000
-"""Of the map that grows step by step."""
 GRID_NODES = 400
 """Of the drives through a city."""
 GOOD = 1.1
@@ -104,7 +96,6 @@ def main() -> None:
             found = with_false_links(arguments.seed, arguments.runs, FleetSettings(), progress)
             alone = FleetSettings(most_alike=1)
             independent = with_false_links(arguments.seed, arguments.runs, alone, progress)
-            steps = stepping(STEP_NODES, arguments.seed, progress)
             for k, (title, sigma) in enumerate(HEADING_SIGMAS.items()):
                 city = draw_grid(GRID_NODES, sigma, np.random.default_rng([arguments.seed, k]))
                 graphs.setdefault(title, city)
@@ -119,7 +110,6 @@ def main() -> None:
         console.print(_table(figure, found))
     for figure in independent[MAPWEAVE]:
         console.print(_table(figure, independent, ", each false link for itself"))
-    console.print(_steps_table(steps))
     for folder, (links, kept) in folders.items():
         console.print(f"{folder}: {len(kept)} of {len(links)} links between robots are kept")
     if arguments.json:
@@ -134,7 +124,6 @@ def main() -> None:
             "runs": arguments.runs,
             **_with_rivals(found),
             "independent": _with_rivals(independent),
-            "steps": steps,
             **spatial,
         }
         print(json.dumps(out))
@@ -220,14 +209,6 @@ def _table(figure: str, found: dict[str, Figures], of_what: str = "") -> Table:
     for name, figures in found.items():
         values = [figures[figure][column] for column in columns]
         table.add_row(name, *("in pieces" if value is None else f"{value:.4g}" for value in values))
-    return table
-
-
-def _steps_table(steps: dict[str, dict[str, float]]) -> Table:
-    columns = list(next(iter(steps.values())))
-    table = Table("", *columns, title=f"optimising step by step, {STEP_NODES} nodes")
-    for name, figures in steps.items():
-        table.add_row(name, *(f"{figures[column]:.7g}" for column in columns))
     return table
 
 

@@ -19,8 +19,9 @@ from benchmarks.relocalize.pictures import (
 from hybridmap.grid import settle
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from merge.graph.component import solve_graph
+from merge.graph.factors import Measurement
 from merge.graph.merged import MergedMap, Placement
-from merge.graph.posegraph import Measurement, solve_graph
 from sim.world import World
 from sim.worlds.catalog import make_world
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 
 from hybridmap.node import Node, NodeId
 from merge.graph.candidates import Pair
-from merge.incremental.decided import Decided
-from merge.incremental.verdicts import Verdict
+from merge.graph.verdicts import Verdict
 
 PRINT_BYTES = 16
 
@@ -26,13 +25,11 @@ class Findings:
         prints: of the nodes that were compared with all others that there were.
         overlaps: between them; pairs that are left out share too little.
         verdicts: on pairs of them.
-        decided: what the merge has made of them where maps are large.
     """
 
     prints: Mapping[NodeId, bytes] = field(default_factory=dict)
     overlaps: Mapping[Pair, float] = field(default_factory=dict)
     verdicts: Mapping[Pair, Verdict] = field(default_factory=dict)
-    decided: Decided = field(default_factory=Decided)
 
     def __len__(self) -> int:
         """How many pairs were compared."""
@@ -67,11 +64,6 @@ class Recollection:
             if other is not None and self.knows(other):
                 out[other_id] = value
         return out
-
-    @property
-    def decided(self) -> Decided:
-        """What the merge had made of them: a start, whatever has changed since."""
-        return self._findings.decided
 
     def verdicts(self, node_of: Callable[[NodeId], Node | None]) -> Iterable[tuple[Pair, Verdict]]:
         """On pairs of nodes that it knows."""

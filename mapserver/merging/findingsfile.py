@@ -1,7 +1,6 @@
 """The findings as a file (see mapserver.sealed), so that a server that starts again need not compare again.
 
-header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON), links ...,
-    which of them are believed, places
+header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON), links ...
 """
 
 from __future__ import annotations
@@ -23,11 +22,10 @@ from mapserver.merging.findings import PRINT_BYTES, Findings
 from mapserver.sealed import seal, unseal
 from merge.graph.candidates import Pair
 from merge.graph.links import Link, RefusedLink
-from merge.incremental.decided import Decided
-from merge.incremental.verdicts import Verdict
+from merge.graph.verdicts import Verdict
 
 MAGIC = b"mapweave verdicts\n"
-FORMAT = 2
+FORMAT = 3
 
 
 def save(path: Path, findings: Findings, made_by: str) -> None:
@@ -96,10 +94,6 @@ def _parts(findings: Findings, made_by: str) -> Iterator[NDArray[Any]]:
     yield np.array([kinds[tuple(link.evidence)] for _, link in links], np.int64)
     yield np.cumsum([0, *(len(link.evidence) for _, link in links)])
     yield np.array([value for _, link in links for value in link.evidence.values()], np.float64)
-    yield np.array([pair in findings.decided.believed for pair, _ in links], np.bool_)
-    placed = [(row[node], pose.vector) for node, pose in findings.decided.places.items() if node in row]
-    yield np.array([k for k, _ in placed], np.int64)
-    yield np.array([vector for _, vector in placed], np.float64).reshape(-1, 3)
 
 
 def _read(parts: Iterator[NDArray[Any]]) -> Findings:
@@ -121,10 +115,7 @@ def _read(parts: Iterator[NDArray[Any]]) -> Findings:
         told = dict(zip(kinds[kind[k]], evidence[m:n], strict=True))
         posture = PoseGaussian(Pose2(*means[k]), covariances[k])
         verdicts[pair] = Link(*pair, posture, shared[i:j], told)
-    believed = frozenset(pair for pair, yes in zip(pairs, next(parts).tolist(), strict=True) if yes)
-    placed = zip(next(parts).tolist(), next(parts).tolist(), strict=True)
-    places = {nodes[k]: Pose2(*vector) for k, vector in placed}
-    return Findings(prints, overlaps, verdicts, Decided(believed, places))
+    return Findings(prints, overlaps, verdicts)
 
 
 def _known(found: Iterable[tuple[Pair, Any]], row: dict[NodeId, int]) -> list[tuple[Pair, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping, Set
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -25,10 +25,10 @@ from mapserver.relocalizing.lookalikes import LookAlikes
 from merge.graph.candidates import CandidateSettings, Pair
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
+from merge.graph.pairs import PairTable
+from merge.graph.verdicts import Verdict, Verdicts
 from merge.graph.verification import VerificationSettings, verify
-from merge.incremental.islands import Islands
-from merge.incremental.pairs import PairTable
-from merge.incremental.verdicts import Verdict, Verdicts
+from merge.islands import Islands
 from merge.life.fading import Fader, FadingSettings
 from merge.life.renewal import RenewalSettings, Renewer
 from merge.merging import MergeSettings
@@ -71,14 +71,13 @@ class Pipeline:
         verdicts: Verdicts,
         touched: set[MapId],
         rulings: Rulings,
-        past: Set[NodeId],
     ) -> MergedMap:
         """See `Islands.merge`.
 
         Raises:
             InvalidValue: a node lies where nobody could be told of it.
         """
-        merged = self.islands.merge(maps, verdicts, touched, rulings, past)
+        merged = self.islands.merge(maps, verdicts, touched, rulings)
         for graph in merged.graphs:
             # Written so that NaN fails.
             if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():
@@ -155,7 +154,7 @@ class Merger:
             self._prints[node_id] = known if known and same else (node, print_of(node))
         prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
-        return Findings(prints, self._pairs.overlaps(), verdicts, self._pipeline.islands.decisions())
+        return Findings(prints, self._pairs.overlaps(), verdicts)
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -228,7 +227,7 @@ class Merger:
         Args:
             use: what is made of a merged map that is new; a map with which that fails is set apart as well.
         """
-        if self._dirty or self._pipeline.islands.decided:
+        if self._dirty:
             self.look_around()
             self._take_over()
             changed = self._pairs.changed()
@@ -266,7 +265,7 @@ class Merger:
         use: Callable[[MergedMap], object] | None,
     ) -> MergedMap:
         kept = {one: self._kept[one] for one in maps}
-        merged = pipeline.merged(kept, verdicts, touched, self._rulings, self._succession.past)
+        merged = pipeline.merged(kept, verdicts, touched, self._rulings)
         merged = replace(merged, set_apart=self._isolation.reasons)
         if use is not None:
             use(merged)
@@ -279,7 +278,7 @@ class Merger:
 
         def attempt(some: Collection[MapId]) -> Pipeline:
             pipeline = Pipeline(self.settings, self.reaches)
-            self._made(pipeline, self._verdicts.copy(), some, set(some), use)
+            self._made(pipeline, self._verdicts, some, set(some), use)
             return pipeline
 
         # Those that are suspected before and the small ones last: they are rather set apart than others.
@@ -290,20 +289,10 @@ class Merger:
         if not bad:
             log.warning("the merge fails with what it knew (%s) and not without it: begun anew", first)
         self._pipeline = pipeline
-        self._verdicts.news()
         return self._made(pipeline, self._verdicts, [one for one in maps if one not in bad], set(), use)
 
     def _suspicion(self, one: MapId) -> int:
         return self._isolation.suspicion(one) + (one in self._suspects)
-
-    def again(self) -> Callable[[], None] | None:
-        """What should be decided again as a whole, by any thread; the next merge takes it up."""
-        task = self._pipeline.islands.again(self._kept, self._verdicts)
-        return None if task is None else task.run
-
-    def give_up(self) -> None:
-        """What was to be decided again could not be."""
-        self._pipeline.islands.give_up()
 
     def look_around(self, most: int | None = None) -> None:
         """Look for what is like the nodes that were read, or like so many of them."""
@@ -324,7 +313,6 @@ class Merger:
             for pair, verdict in self._before.verdicts(self.node):
                 if pair[1] not in self._known.get(pair[0], {}):
                     self._judge(pair, verdict)
-            self._pipeline.islands.resume(self._before.decided)
             self._before = None
 
     def apart(self) -> MergedMap:

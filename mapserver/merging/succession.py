@@ -12,7 +12,7 @@ from hybridmap.node import Node, NodeId
 from mapserver.places import tally
 from mapserver.places.placeindex import PlaceIndex
 from merge.graph.candidates import Pair
-from merge.incremental.pairs import PairTable
+from merge.graph.pairs import PairTable
 
 SETTLED = 3600.0
 """s on the robot's own clock after which what it saw is no longer of today."""

@@ -9,8 +9,7 @@ piece are tested against it.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Container, Mapping, Sequence, Set
 
 import networkx as nx
 
@@ -18,22 +17,28 @@ from hybridmap.node import MapId, NodeId
 from merge.belief.consistency import ConsistencySettings, Sorted, group_links, sort_links
 from merge.belief.credence import standpoints
 from merge.belief.groups import LinkGroup
-from merge.belief.joining import Solver, misfits
+from merge.belief.joining import misfits
 from merge.belief.witnesses import FalseWitnesses
 from merge.graph.fragments import Fragment, fragment_by_node
 from merge.graph.links import Link, RefusedLink, refuse
 from merge.graph.posegraph import PoseGraph
+from merge.graph.solver import Solver
 
 Key = tuple[NodeId, NodeId]
 """Names of two pieces of map, smaller first."""
 
-P = TypeVar("P", NodeId, int)
-"""A piece of map, by whatever it is called."""
+MOST_POOLED = 200
+"""Links between two components that are sorted together, the best supported ones; the others are tested
+against what these join. All pairs of them are compared."""
 CONTRADICTION = "contradicts better supported links by way of other maps"
 
 
 def agglomerate(
-    solver: Solver, groups: Mapping[Key, LinkGroup], s: ConsistencySettings
+    solver: Solver,
+    groups: Mapping[Key, LinkGroup],
+    s: ConsistencySettings,
+    standing: Sequence[Link] = (),
+    closed: Set[Key] = frozenset(),
 ) -> tuple[list[Link], list[RefusedLink]]:
     """Join fragments by their groups of links.
 
@@ -41,22 +46,30 @@ def agglomerate(
         solver: of the fragments.
         groups: by the names of the fragments.
         s: when links are believed.
+        standing: links that are believed already; the others are tested against what they join.
+        closed: pairs of links that are not asked: they were refused, and nothing near them has changed.
 
     Returns:
-        The links that join, and those that do not; what a group has refuted is in neither.
+        The links that join, and those that do not; what a group has refuted or what is closed is in neither.
     """
-    kept = [link for group in groups.values() for link in group.sorted.kept if group.first is group.second]
-    if not s.cliques:
-        return [link for group in groups.values() for link in group.sorted.kept], []
-    refused = {r.pair: r for group in groups.values() for r in group.sorted.refused}
-    waiting = [link for group in groups.values() for link in group.links if group.first is not group.second]
+    kept = list(standing)
+    told = {link.key for link in kept} | closed
+    asked = {key: [k for k in group.links if k.key not in told] for key, group in groups.items()}
+    asked = {key: links for key, links in asked.items() if links}
+    for key in asked:
+        if groups[key].first is groups[key].second:
+            kept += [link for link in groups[key].sorted.kept if link.key not in told]
+    refused = {r.pair: r for key in asked for r in groups[key].sorted.refused if r.pair not in told}
+    waiting = [link for key, links in asked.items() if key[0] != key[1] for link in links]
     between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
     heard = _heard(groups)
     agreed = {
-        link.canonical().pair
-        for key, found in between.items()
-        for link in _beyond_chance(found, [found], heard[key[0].map], s).kept
+        link.key
+        for key in asked
+        if key in between
+        for link in _beyond_chance(between[key], [between[key]], heard[key[0].map], s).kept
     }
+    sorted_before: dict[Key, tuple[PoseGraph, PoseGraph, int, Sorted]] = {}
     while True:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in waiting if by_node[link.a] is by_node[link.b]]
@@ -66,27 +79,36 @@ def agglomerate(
         fits = {link.pair for link in borne_out}
         for link in inside:
             if link.pair not in fits:
-                refused.setdefault(link.canonical().pair, refuse(link, CONTRADICTION))
+                refused.setdefault(link.key, refuse(link, CONTRADICTION))
+        pools = group_links(waiting, by_node)
+        if not pools:
+            break
         own: dict[Key, list[Sorted]] = {}
         for (a, b), found in between.items():
             first, second = sorted((by_node[a].name, by_node[b].name))
             own.setdefault((first, second), []).append(found)
-        pooled = {
-            key: _beyond_chance(_sorted(links, key, groups, by_node, s), own[key], heard[key[0].map], s)
-            for key, links in group_links(waiting, by_node).items()
-        }
+        pooled = {}
+        for key, links in pools.items():
+            first_graph, second_graph = (by_node[name].graph for name in key)
+            known = sorted_before.get(key)
+            if known is None or known[:3] != (first_graph, second_graph, len(links)):
+                found = _sorted(links, key, groups, by_node, s)
+                known = sorted_before[key] = first_graph, second_graph, len(links), found
+            pooled[key] = _beyond_chance(known[3], own[key], heard[key[0].map], s)
         chosen = joined({key: found.weight for key, found in pooled.items() if found.kept}, pooled)
         if not chosen:
+            for key, found in pooled.items():
+                refused = {**{r.pair: r for r in found.refused}, **refused}
+                for link in pools[key]:
+                    refused.setdefault(link.key, refuse(link, found.refused[0].reason))
             break
         kept += [link for key in chosen for link in pooled[key].kept]
-        through = {link.canonical().pair for key in chosen for link in pooled[key].kept}
-        waiting = [link for link in waiting if link.canonical().pair not in through]
-    for found in pooled.values():
-        refused |= {r.pair: r for r in found.refused if r.pair not in refused}
-    told = {link.canonical().pair for link in kept}
-    every = [link for group in groups.values() for link in group.links]
-    kept = _heard_again(solver, kept, [k for k in every if k.canonical().pair not in told], agreed, heard, s)
-    told = {link.canonical().pair for link in kept}
+        through = {link.key for key in chosen for link in pooled[key].kept}
+        waiting = [link for link in waiting if link.key not in through]
+    told = {link.key for link in kept}
+    left = [link for links in asked.values() for link in links if link.key not in told]
+    kept = _heard_again(solver, kept, left, agreed, heard, s)
+    told = {link.key for link in kept}
     return kept, [r for pair, r in refused.items() if pair not in told]
 
 
@@ -104,15 +126,16 @@ def _heard_again(
     one of them. What all others make of the map is a better judge than any one of them.
     """
     kept, refused = list(kept), list(refused)
-    while True:
+    while refused:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
         back = _borne_out(inside, by_node, agreed, heard, s)
         if not back:
             return kept
         kept += back
-        pairs = {link.pair for link in back}
-        refused = [link for link in refused if link.pair not in pairs]
+        pairs = {link.key for link in back}
+        refused = [link for link in refused if link.key not in pairs]
+    return kept
 
 
 def _sorted(
@@ -127,7 +150,8 @@ def _sorted(
     first, second = by_node[key[0]], by_node[key[1]]
     if group is not None and len(group.first) == len(first) and len(group.second) == len(second):
         return group.sorted
-    return sort_links(links, first, second, s)
+    best = sorted(links, key=lambda link: (-link.weight, link.pair))[:MOST_POOLED]
+    return sort_links(best, first, second, s)
 
 
 def _heard(groups: Mapping[Key, LinkGroup]) -> dict[MapId, FalseWitnesses]:
@@ -152,16 +176,16 @@ def _beyond_chance(
     return found.beyond_chance(heard.without(FalseWitnesses.of(one.supports[0] for one in own)), s)
 
 
-def best_supported(weights: Mapping[tuple[P, P], float]) -> dict[P, tuple[P, P]]:
+def best_supported(weights: Mapping[Key, float]) -> dict[NodeId, Key]:
     """Of each piece the two that are joined by the greatest weight: it and another one."""
-    best: dict[P, tuple[P, P]] = {}
+    best: dict[NodeId, Key] = {}
     for key in _ranked(weights):
         for piece in key:
             best.setdefault(piece, key)
     return best
 
 
-def joined(weights: Mapping[tuple[P, P], float], tied: Container[tuple[P, P]]) -> list[tuple[P, P]]:
+def joined(weights: Mapping[Key, float], tied: Container[Key]) -> list[Key]:
     """Which pieces are joined in this round: those of which each is the other's best supported one.
 
     A piece of which the other one has a better supported one is joined to it too, if no links at all tie it
@@ -175,7 +199,7 @@ def joined(weights: Mapping[tuple[P, P], float], tied: Container[tuple[P, P]]) -
         Best supported first.
     """
     best = best_supported(weights)
-    better: dict[P, list[P]] = {}
+    better: dict[NodeId, list[NodeId]] = {}
     out = []
     for key in _ranked(weights):
         for one, other in (key, key[::-1]):
@@ -189,7 +213,7 @@ def joined(weights: Mapping[tuple[P, P], float], tied: Container[tuple[P, P]]) -
     return out
 
 
-def _ranked(weights: Mapping[tuple[P, P], float]) -> list[tuple[P, P]]:
+def _ranked(weights: Mapping[Key, float]) -> list[Key]:
     return sorted(weights, key=lambda key: (-weights[key], key))
 
 
@@ -231,10 +255,10 @@ def borne_out(
         least: natural logarithm of Bayes' factor from which any other one is likely enough.
         s: when links are believed.
     """
-    if not s.cliques or not links:
-        return [True for _ in links]
+    if not links:
+        return []
     fits = misfits(links, graph, s) < s.gate
-    out = [bool(good) and link.canonical().pair in agreed for link, good in zip(links, fits, strict=True)]
+    out = [bool(good) and link.key in agreed for link, good in zip(links, fits, strict=True)]
     asked = [k for k, good in enumerate(out) if not good]
     for k, found in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
         out[k] = bool(found.log_factor > least)

@@ -49,7 +49,6 @@ class ConsistencySettings:
         least_evidence: natural logarithm of the odds from which a link that is too little alone, or was
             contradicted, is believed where others join its two ends: how many witnesses are true for one that
             is false, times Bayes' factor (see merge.belief.credence), which must speak for it.
-        cliques: whether links must agree with each other at all; without, all are believed for now.
     """
 
     gate: float = 16.27
@@ -63,7 +62,6 @@ class ConsistencySettings:
     dominance: float = 1.5
     exact: int = 40
     least_evidence: float = 4.6
-    cliques: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +104,9 @@ class Sorted:
             if story
             else f"as many agree by chance where {100.0 * false.share:.0f} % of the links are false"
         )
-        told = {link.canonical().pair for link in story}
+        told = {link.key for link in story}
         every = [*self.kept, *(r.link for r in self.refused if r.link is not None)]
-        refused = [refuse(link, reason) for link in every if link.canonical().pair not in told]
+        refused = [refuse(link, reason) for link in every if link.key not in told]
         refused.sort(key=lambda refusal: refusal.pair)
         return replace(self, kept=story, refused=tuple(refused), rivals=())
 
@@ -167,8 +165,6 @@ def sort_links(
     """
     s = settings or ConsistencySettings()
     links = sorted(links, key=lambda link: link.pair)
-    if not s.cliques:
-        return Sorted(tuple(links), (), weight=float(sum(link.weight for link in links)))
     refused: list[RefusedLink] = []
     if first is second:
         links, refused = _against_odometry(links, first, s)

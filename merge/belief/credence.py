@@ -26,9 +26,10 @@ import numpy as np
 from hybridmap.node import NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from merge.belief.consistency import ConsistencySettings
+from merge.graph.factors import believable
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
-from merge.graph.posegraph import PoseGraph, believable
+from merge.graph.posegraph import PoseGraph
 
 AT_ONCE = 64
 """Links whose covariances are solved for together: all at once would take memory by the square."""

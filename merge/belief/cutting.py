@@ -19,10 +19,12 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from merge.belief.claims import CLAIMS, sort_claims
 from merge.belief.consistency import ConsistencySettings, group_links, sort_links
-from merge.belief.joining import Solver, join, optimise
+from merge.belief.joining import join, optimise
+from merge.graph.component import solve_graph
+from merge.graph.factors import Measurement
 from merge.graph.fragments import Fragment
 from merge.graph.links import RefusedLink, link_of
-from merge.graph.posegraph import Measurement, solve_graph
+from merge.graph.solver import Solver
 
 WORDS = {EdgeKind.LOOP: "loop", EdgeKind.MERGED: "link", EdgeKind.DRIVEN: "drive"}
 

@@ -60,8 +60,8 @@ class LinkGroup:
         return self._without(story, reason, s)._settled(s, verdict)
 
     def _without(self, story: Sequence[Link], reason: str, s: ConsistencySettings) -> LinkGroup:
-        told = {link.canonical().pair for link in story}
-        in_story = np.array([link.canonical().pair in told for link in self.links])
+        told = {link.key for link in story}
+        in_story = np.array([link.key in told for link in self.links])
         agree = loop_distances2(self.links, self.first, self.second, s) < s.gate
         falls = in_story | (agree[:, in_story].mean(axis=1) > 0.5)
         left = tuple(link for link, gone in zip(self.links, falls, strict=True) if not gone)

@@ -14,6 +14,7 @@ from hybridmap.node import MapId, NodeId
 from merge.belief.consistency import ConsistencySettings
 from merge.belief.cutting import fragments_of
 from merge.belief.groups import LinkGroup, Verdict
+from merge.bodies.trails import Trail, trails_of
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link
 
@@ -30,6 +31,7 @@ class Memory:
         self._maps: dict[MapId, tuple[HybridMap, list[Fragment]]] = {}
         self._groups: dict[Key, tuple[Fragment, Fragment, tuple[Link, ...], LinkGroup]] = {}
         self._weighed: dict[Key, tuple[Link, Link]] = {}
+        self._trails: dict[NodeId, tuple[Fragment, tuple[Trail, ...]]] = {}
 
     def fragments(
         self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings, strain: float
@@ -68,6 +70,7 @@ class Memory:
         second: Fragment,
         s: ConsistencySettings,
         verdict: Verdict,
+        exact: bool = True,
     ) -> LinkGroup:
         """See `LinkGroup.of`; links between two fragments are sorted anew only if any of them is new.
 
@@ -78,14 +81,24 @@ class Memory:
             second: piece of map; may be the same.
             s: when links are believed.
             verdict: on sets that are supported alike; it depends on the two fragments alone.
+            exact: also if either fragment has changed elsewhere.
         """
         key = first.name, second.name
         known = self._groups.get(key)
-        if known is not None and known[0] is first and known[1] is second and _same(known[2], given):
+        same = known is not None and known[0] is first and known[1] is second
+        if known is not None and (same or not exact) and _same(known[2], given):
             return known[3]
         group = LinkGroup.of(links, first, second, s, verdict)
         self._groups[key] = first, second, tuple(given), group
         return group
+
+    def trails(self, fragment: Fragment, one: HybridMap) -> tuple[Trail, ...]:
+        """See `trails_of`; those of a fragment are read once."""
+        known = self._trails.get(fragment.name)
+        if known is None or known[0] is not fragment:
+            found = trails_of([one.nodes[node] for node in fragment.nodes])
+            known = self._trails[fragment.name] = fragment, found
+        return known[1]
 
     def forget(self, maps: set[MapId]) -> None:
         """Drop what is known of maps that are gone."""

@@ -12,14 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
-from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
 from merge.belief.consistency import ConsistencySettings
 from merge.belief.credence import standpoints
-from merge.belief.joining import Solver, misfits
+from merge.belief.joining import misfits
+from merge.graph.component import Component
 from merge.graph.links import Link
-from merge.graph.posegraph import Measurement, PoseGraph
+from merge.graph.solver import Solver
 
 FEW = 0.05
 """Share of a component's links up to which those that are refused are tried."""
@@ -39,16 +37,18 @@ def readmitted(
         s: when links are believed.
     """
     out: list[Link] = []
-    for graph in solver.solve(kept):
-        here = [link for link in kept if link.a in graph.rows]
+    if not refused:
+        return out
+    for graph in solver.solve(kept, believed=True):
         inside = [link for link in refused if link.a in graph.rows and link.b in graph.rows]
+        here = [link for link in kept if link.a in graph.rows] if inside else []
         if not inside or len(inside) > FEW * (len(here) + len(inside)):
             continue
         log_odds = math.log((len(here) + 0.5) / (len(inside) + 0.5))
         known = zip(inside, misfits(inside, graph, s), standpoints(inside, graph, kept=False), strict=True)
         tried = sorted(
             ((link, far, found) for link, far, found in known if far < NEAR * s.gate and not found.alone),
-            key=lambda item: item[0].canonical().pair,
+            key=lambda item: item[0].key,
         )
         cost = _cost(solver, here) if tried else 0.0
         for link, far, found in tried:
@@ -61,17 +61,7 @@ def readmitted(
 
 def _cost(solver: Solver, links: Sequence[Link]) -> float:
     """Chi-square of all measurements of the one component that links make."""
-    graph = next(g for g in solver.solve(links, believed=True) if links[0].a in g.rows)
-    return chi2(graph, solver.measurements(links, graph))
-
-
-def chi2(graph: PoseGraph, measurements: Sequence[Measurement]) -> float:
-    """Sum of the squared normalised residuals of a solved graph."""
-    if not measurements:
-        return 0.0
-    a = graph.means[graph.index([m.a for m in measurements])]
-    b = graph.means[graph.index([m.b for m in measurements])]
-    measured = np.stack([m.a_from_b.mean.vector for m in measurements])
-    off = compose_poses(inverse_poses(measured), compose_poses(inverse_poses(a), b))
-    covariances = np.stack([m.covariance for m in measurements])
-    return float((off * np.linalg.solve(covariances, off[:, :, None])[:, :, 0]).sum())
+    solver.solve(links, believed=True)
+    graph = solver.graph_of(links[0].a)
+    assert isinstance(graph, Component)
+    return graph.chi2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import networkx as nx
@@ -10,15 +10,16 @@ import numpy as np
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
-from merge.belief.consistency import ConsistencySettings
-from merge.belief.joining import Solver
+from merge.belief.memory import Memory
 from merge.bodies.clash import Clash
 from merge.bodies.exclusion import clash_of
 from merge.bodies.settings import ExclusionSettings
 from merge.bodies.suspicion import suspicion
-from merge.bodies.trails import Trail, trails_of
+from merge.bodies.trails import Trail
+from merge.graph.fragments import Fragment, fragment_by_node
 from merge.graph.links import Link
 from merge.graph.posegraph import PoseGraph
+from merge.graph.solver import Solver
 
 Key = tuple[NodeId, NodeId]
 """Names of two fragments, smaller first."""
@@ -32,48 +33,43 @@ class Refutation:
     def __init__(
         self,
         maps: Mapping[MapId, HybridMap],
-        solver: Solver,
-        consistency: ConsistencySettings,
+        fragments: Sequence[Fragment],
         exclusion: ExclusionSettings,
+        memory: Memory | None = None,
     ) -> None:
         """Read the trails.
 
         Args:
             maps: with the nodes of all fragments.
-            solver: of the fragments.
-            consistency: when links are believed.
+            fragments: pieces of map.
             exclusion: when two robots clash.
+            memory: of merges before.
         """
-        self._solver = solver
-        self._consistency = consistency
+        self._by_node = fragment_by_node(fragments)
         self._exclusion = exclusion
-        self._trails: dict[NodeId, tuple[Trail, ...]] = {}
-        for fragment in solver.fragments:
-            nodes = maps[fragment.name.map].nodes
-            trails = trails_of([nodes[node] for node in fragment.nodes])
-            if trails:
-                self._trails[fragment.name] = trails
+        memory = memory or Memory()
+        trails = ((f.name, memory.trails(f, maps[f.name.map])) for f in fragments)
+        self._trails: dict[NodeId, tuple[Trail, ...]] = {name: some for name, some in trails if some}
 
     def verdict(self, story: Sequence[Link]) -> str:
         """Why links that agree with each other cannot be true; empty if they can, as far as anybody knows."""
-        ends = {self._solver.by_node[node].name for link in story for node in link.pair}
-        if len(ends & self._trails.keys()) < 2:
+        ends = {self._by_node[node].name: self._by_node[node] for link in story for node in link.pair}
+        if len(ends.keys() & self._trails.keys()) < 2:
             return ""
-        graph = next(g for g in self._solver.solve(story) if story[0].a in g.rows)
+        graph = Solver(list(ends.values())).solve(story)[0]
         return next((clash.reason for _, clash in self._clashes([graph])), "")
 
     def key_of(self, link: Link) -> Key:
         """Between which fragments a link is."""
-        first, second = sorted(self._solver.by_node[node].name for node in link.pair)
+        first, second = sorted(self._by_node[node].name for node in link.pair)
         return first, second
 
-    def keys_of(self, links: Iterable[Link]) -> set[Key]:
-        """Between which fragments links are; those at other nodes are left out."""
-        known = self._solver.by_node
-        return {self.key_of(link) for link in links if link.a in known and link.b in known}
-
     def impossible(
-        self, solved: Sequence[PoseGraph], kept: Sequence[Link], refuted: Collection[Key]
+        self,
+        solved: Sequence[PoseGraph],
+        kept: Sequence[Link],
+        refuted: Collection[Key] = (),
+        changed: Collection[NodeId] | None = None,
     ) -> dict[Key, str]:
         """Groups that must fall, with reasons.
 
@@ -85,8 +81,9 @@ class Refutation:
             solved: the components.
             kept: the links that made them.
             refuted: between which fragments other links have been refuted.
+            changed: fragments whose robots may clash with others since it was looked at last; None: all.
         """
-        clashes = dict(self._clashes(solved, refuted))
+        clashes = dict(self._clashes(solved, refuted, changed))
         if not clashes:
             return {}
         weights: dict[Key, int] = {}
@@ -101,7 +98,10 @@ class Refutation:
         return {weakest: f"{clash.reason}, and these are the weakest links that join the two"}
 
     def _clashes(
-        self, solved: Sequence[PoseGraph], refuted: Collection[Key] = ()
+        self,
+        solved: Sequence[PoseGraph],
+        refuted: Collection[Key] = (),
+        changed: Collection[NodeId] | None = None,
     ) -> Iterator[tuple[Key, Clash]]:
         """Pairs of fragments in one component that clash, by whichever clock says so most clearly."""
         for graph in solved:
@@ -111,7 +111,7 @@ class Refutation:
             found: dict[Key, list[Clash]] = {}
             for k, other in _near(graph, [trail for _, trail in trails]):
                 (first, one), (second, two) = trails[k], trails[other]
-                if first == second:
+                if first == second or (changed is not None and not {first, second} & set(changed)):
                     continue
                 clash = clash_of(graph, one, two, self._exclusion)
                 if clash is None and (min(first, second), max(first, second)) in refuted:

@@ -205,13 +205,13 @@ def _witnesses(merged: MergedMap, link: Link, consistency: ConsistencySettings |
     ]
     ((names, group),) = group_links([link, *near], pieces).items()
     distances2 = loop_distances2(group, pieces[names[0]], pieces[names[1]], s)
-    own = next(k for k, other in enumerate(group) if other.canonical().pair == link.canonical().pair)
+    own = next(k for k, other in enumerate(group) if other.key == link.key)
     return tuple(
         Witness(
             *other.pair,
             float(distances2[own, k]),
             bool(distances2[own, k] < s.gate),
-            other.canonical().pair in kept,
+            other.key in kept,
         )
         for k, other in enumerate(group)
         if k != own

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 from hybridmap.node import NodeId
+from merge.graph.factors import Factors, Measurement
 from merge.graph.links import RefusedLink
-from merge.graph.posegraph import Measurement, PoseGraph
+from merge.graph.posegraph import PoseGraph
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,13 @@ class Fragment:
     def nodes(self) -> tuple[NodeId, ...]:
         """In the order of ids."""
         return self.graph.nodes
+
+    @cached_property
+    def factors(self) -> Factors:
+        """Its measurements between the rows of its nodes."""
+        row = self.graph.rows
+        a, b = [row[m.a] for m in self.measurements], [row[m.b] for m in self.measurements]
+        return Factors.of(self.measurements, a, b)
 
     def __len__(self) -> int:
         """How many nodes."""

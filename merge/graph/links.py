@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from hybridmap.pose import PoseGaussian
+from merge.graph.factors import Measurement
 
 MERGE_AUTHOR = "merge"
 """Stands for the agent in the ids of edges that the merge makes."""
@@ -46,8 +47,18 @@ class Link:
 
     @cached_property
     def pair(self) -> tuple[NodeId, NodeId]:
-        """(a, b): there is at most one link between two nodes."""
+        """(a, b)."""
         return self.a, self.b
+
+    @cached_property
+    def key(self) -> tuple[NodeId, NodeId]:
+        """The two nodes, smaller id first: there is at most one link between two nodes."""
+        return (self.a, self.b) if self.a <= self.b else (self.b, self.a)
+
+    @cached_property
+    def maps(self) -> tuple[MapId, MapId]:
+        """The maps of the two nodes, smaller first; twice the same for a loop."""
+        return self.key[0].map, self.key[1].map
 
     @property
     def within(self) -> bool:
@@ -70,8 +81,19 @@ class Link:
         return self.doubles == 0 or self.weight >= LEAST_DISTINCT
 
     def turned(self) -> Link:
-        """The same link seen from its other end."""
-        return Link(self.b, self.a, self.a_from_b.inverse(), self.shared[:, ::-1], self.evidence)
+        """The same link seen from its other end; turned twice it is itself."""
+        return self._turned
+
+    @cached_property
+    def _turned(self) -> Link:
+        other = Link(self.b, self.a, self.a_from_b.inverse(), self.shared[:, ::-1], self.evidence)
+        other.__dict__["_turned"] = self
+        return other
+
+    @cached_property
+    def measurement(self) -> Measurement:
+        """What it says of the two nodes; it may be wrong."""
+        return Measurement(self.a, self.b, self.a_from_b, robust=True)
 
     def canonical(self) -> Link:
         """The same link with the smaller id first."""

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from hybridmap.errors import SettingsError
 from mapweave.settings import Settings, load_settings, merge_settings
-from merge.belief.joining import Outliers
 from merge.merging import MergeSettings
 from wire.tables import build
 
@@ -137,19 +136,18 @@ def test_the_merge_too_can_be_written_down_and_chosen(tmp_path):
     default = MergeSettings()
     assert merging(tmp_path, "") == default
     assert merging(tmp_path, as_toml({"merge": dataclasses.asdict(default)})) == default
-    chosen = merging(tmp_path, "[merge]\noutliers = 'graduated'\n[merge.consistency]\ncliques = false")
-    consistency = dataclasses.replace(default.consistency, cliques=False)
-    assert chosen == dataclasses.replace(default, outliers=Outliers.GRADUATED, consistency=consistency)
+    chosen = merging(tmp_path, "[merge]\nstrain = 16.0\n[merge.consistency]\nleast_links = 3")
+    consistency = dataclasses.replace(default.consistency, least_links=3)
+    assert chosen == dataclasses.replace(default, strain=16.0, consistency=consistency)
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("merge = 3", "merge: must be a table"),
-        ("[merge]\noutlier = 'none'", "merge: no setting 'outlier'; did you mean 'outliers'?"),
-        ("[merge]\noutliers = 'pcm'", "merge: outliers: 'pcm' is none of none, worst_first, graduated"),
-        ("[merge]\noutliers = 3", "merge: outliers: 3 is none of none, worst_first, graduated"),
-        ("[merge.consistency]\ncliques = 1", "merge: consistency: cliques: 1 is no bool"),
+        ("[merge]\nstrains = 9.0", "merge: no setting 'strains'; did you mean 'strain'?"),
+        ("[merge]\nstrain = 'much'", "merge: strain: 'much' is no float"),
+        ("[merge.consistency]\nleast_links = 1.5", "merge: consistency: least_links: 1.5 is no int"),
     ],
 )
 def test_what_is_wrong_with_the_merge_is_said_in_one_line(tmp_path, text, said):

@@ -1,4 +1,4 @@
-"""Random lives of fleets, whose merges in steps are held against merges made anew."""
+"""Random lives of fleets, whose merges from what stood are held against merges made anew."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ import numpy as np
 
 from hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
 from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from hybridmap.node import Edge, EdgeId, EdgeKind, MapId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ruling import Ruling, Rulings
 from merge.graph.candidates import Pair
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
-from merge.incremental.graph import WideGraph
-from merge.incremental.relaxing import RelaxSettings, relax
-from merge.incremental.verdicts import Verdict, Verdicts
+from merge.graph.verdicts import Verdict, Verdicts
 from merge.merging import merge_maps
 from merge.undoing import undo
 from synthetic.fleet import FleetSettings, draw_fleet
@@ -115,16 +113,3 @@ class Life:
         refused = [v for v in self.known.values() if isinstance(v, RefusedLink)]
         undone = undo(self.maps, links, self.rulings)
         return undone.completed(merge_maps(undone.maps, undone.links, [*refused, *undone.refused]))
-
-
-def polished(merged: MergedMap, anew: MergedMap) -> dict[NodeId, Pose2]:
-    """Where the merge made anew has the nodes, optimised further: GTSAM stops a little before."""
-    found: dict[NodeId, Pose2] = {}
-    for graph in merged.graphs:
-        assert isinstance(graph, WideGraph)
-        means = np.array([anew.pose(node).vector for node in graph.nodes])
-        anchor = np.array([graph.rows[graph.anchor]])
-        everything = np.arange(len(means))
-        means, _ = relax(graph.factors, means, anchor, everything, graph.huber, RelaxSettings())
-        found |= {node: Pose2.from_vector(mean) for node, mean in zip(graph.nodes, means, strict=True)}
-    return found

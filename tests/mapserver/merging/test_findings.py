@@ -20,11 +20,8 @@ from mapserver.merging.findingskeeper import SUFFIX, FindingsKeeper
 from mapserver.merging.merger import Merger, MergerSettings
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
+from merge.graph.verdicts import Verdict
 from merge.graph.verification import VerificationSettings
-from merge.incremental.decided import Decided
-from merge.incremental.settings import StepSettings
-from merge.incremental.steps import Steps
-from merge.incremental.verdicts import Verdict
 from merge.merging import MergeSettings
 from synthetic.world import room, take_map
 
@@ -89,9 +86,7 @@ def random_findings(rng: np.random.Generator) -> Findings:
         evidence = {key: float(rng.normal()) for key in keys}
         verdicts[pair] = Link(*pair, posture, rng.integers(0, 150, (int(rng.integers(0, 9)), 2)), evidence)
     overlaps = {pair: float(rng.uniform(3, 30)) for pair in pairs}
-    links = [pair for pair, verdict in verdicts.items() if isinstance(verdict, Link)]
-    decided = Decided(frozenset(links[::2]), {node: Pose2(*rng.normal(0.0, 9.0, 3)) for node in nodes[::3]})
-    return Findings({node: rng.bytes(PRINT_BYTES) for node in nodes}, overlaps, verdicts, decided)
+    return Findings({node: rng.bytes(PRINT_BYTES) for node in nodes}, overlaps, verdicts)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -110,7 +105,6 @@ def test_what_is_read_is_what_was_saved(seed: int, tmp_path: Path) -> None:
         assert np.array_equal(again.a_from_b.covariance, verdict.a_from_b.covariance)
         assert np.array_equal(again.shared, verdict.shared) and again.shared.dtype == np.int64
         assert list(again.evidence.items()) == list(verdict.evidence.items())
-    assert (two.decided.believed, two.decided.places) == (one.decided.believed, one.decided.places)
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
     with pytest.raises(InvalidFile, match="other settings"):
         load(tmp_path / "x", "somebody else")
@@ -127,24 +121,6 @@ def test_who_starts_again_compares_nothing_and_merges_the_same(logged: Log, tmp_
     # It goes on as if nothing had been.
     saved(second, tmp_path / "store")
     assert same(merged, read(logged, tmp_path / "store").merged())
-
-
-def test_large_maps_begin_from_what_was_decided(
-    logged: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    always = StepSettings(anew_up_to=0, whole_up_to=0)
-    monkeypatch.setattr("merge.incremental.islands.StepSettings", lambda: always)
-    first = read(logged)
-    merged = first.merged()
-    saved(first, tmp_path / "store")
-    again: list[int] = []
-    real = Steps.resume
-    monkeypatch.setattr(Steps, "resume", lambda *a: (again.append(1), real(*a))[1])
-    after = read(logged, tmp_path / "store").merged()
-    assert again and len(after.components) == len(merged.components)
-    assert [link.pair for link in after.links] == [link.pair for link in merged.links]
-    for node in merged.postures:
-        assert after.pose(node).distance(merged.pose(node)) < 1e-5
 
 
 def test_what_came_later_is_compared_with_all(logged: Log, tmp_path: Path) -> None:

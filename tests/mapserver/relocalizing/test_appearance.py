@@ -19,14 +19,9 @@ from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.appearance import Appearance, rivals
 from mapserver.relocalizing.relocalization import Relocalizer
 from merge.graph.merged import MergedMap
-from merge.incremental.islands import Islands
-from merge.incremental.verdicts import Verdicts
-from synthetic.world import (
-    World,
-    room,
-    take_node,
-    take_view,
-)
+from merge.graph.verdicts import Verdicts
+from merge.islands import Islands
+from synthetic.world import World, room, take_node, take_view
 from wire.messages import decode_relocalize_answer, encode_relocalize_answer
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)

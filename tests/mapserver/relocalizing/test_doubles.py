@@ -16,8 +16,8 @@ from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.doubles import Doubles, carried, unexplained
 from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.relocalizing.seenplaces import Sighting, hidden, is_lonely
+from merge.graph.component import solve_graph
 from merge.graph.merged import MergedMap, Placement
-from merge.graph.posegraph import solve_graph
 from synthetic.world import (
     CAMERA,
     Sensing,

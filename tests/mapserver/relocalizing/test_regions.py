@@ -21,8 +21,9 @@ from mapserver.relocalizing.relocalization import RelocalizationSettings, Reloca
 from mapserver.relocalizing.seenplaces import Sighting
 from mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapserver.upkeep import PREPARED_AT_ONCE, Upkeep
+from merge.graph.component import solve_graph
+from merge.graph.factors import Measurement
 from merge.graph.merged import MergedMap, Placement
-from merge.graph.posegraph import Measurement, solve_graph
 from synthetic.world import room, take_node, take_view
 from tests.waiting import eventually
 

@@ -11,9 +11,10 @@ from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.belief.cliques import best_clique, independent_links
 from merge.belief.consistency import ConsistencySettings, loop_distances2, sort_links
+from merge.graph.component import solve_graph
+from merge.graph.factors import Measurement
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link
-from merge.graph.posegraph import Measurement, solve_graph
 
 
 def fragment(agent: str, tour: list[Pose2], rng: np.random.Generator, sigma: float = 0.02) -> Fragment:

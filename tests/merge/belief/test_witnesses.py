@@ -8,9 +8,10 @@ import pytest
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.belief.witnesses import FalseWitnesses, Support, chances, crowds, neighbours, support_of
+from merge.graph.component import solve_graph
+from merge.graph.factors import Measurement
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link
-from merge.graph.posegraph import Measurement, solve_graph
 from merge.merging import merge_maps
 from synthetic.fleet import FleetSettings, draw_fleet
 from synthetic.merge_rivals import error, joined_falsely, oracle

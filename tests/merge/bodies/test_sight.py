@@ -18,7 +18,9 @@ from merge.bodies.exclusion import clash_of
 from merge.bodies.looking import Looking
 from merge.bodies.sight import SightSettings, errors_in_common, none_wrong, odds_against
 from merge.bodies.trails import trails_of
-from merge.graph.posegraph import Measurement, PoseGraph, solve_graph
+from merge.graph.component import solve_graph
+from merge.graph.factors import Measurement
+from merge.graph.posegraph import PoseGraph
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 RADIUS = 0.16

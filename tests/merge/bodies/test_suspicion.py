@@ -9,14 +9,13 @@ from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from merge.belief.consistency import ConsistencySettings
 from merge.belief.cutting import fragments_of
-from merge.belief.joining import Solver
 from merge.bodies.exclusion import clash_of, evidence_in_all
 from merge.bodies.refutation import Refutation
 from merge.bodies.settings import ExclusionSettings
 from merge.bodies.suspicion import suspicion
 from merge.graph.links import Link
+from merge.graph.solver import Solver
 from tests.merge.bodies.rooms import Room, meeting
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -68,10 +67,10 @@ def test_only_where_another_story_was_refuted() -> None:
             maps[one].apply(EdgePut(edge))
     ends = first.views[0].id, second.views[0].id
     link = Link(*ends, PoseGaussian(Pose2(0.5, 0.0, 0.0), SURE), np.zeros((9, 2), np.int64), {})
-    solver = Solver(fragments_of(maps))
-    solved = solver.solve([link])
-    refutation = Refutation(maps, solver, ConsistencySettings(), ExclusionSettings())
+    fragments = fragments_of(maps)
+    solved = Solver(fragments).solve([link])
+    refutation = Refutation(maps, fragments, ExclusionSettings())
     assert refutation.impossible(solved, [link], ()) == {}
-    (key,) = refutation.keys_of([link])
+    key = refutation.key_of(link)
     found = refutation.impossible(solved, [link], {key})
     assert set(found) == {key} and "other links between their maps were refuted" in found[key]

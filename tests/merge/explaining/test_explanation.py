@@ -24,9 +24,10 @@ from merge.explaining.explanation import explain_nodes
 from merge.explaining.maps import explain_fleet, explain_maps
 from merge.explaining.own import reach_words
 from merge.explaining.parting import joined_maps, joinings, partings
+from merge.graph.component import solve_graph
+from merge.graph.factors import LEAST_SIGMAS, Measurement
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
-from merge.graph.posegraph import LEAST_SIGMAS, Measurement, solve_graph
 from merge.graph.verification import VerificationSettings
 from synthetic.world import room, take_map
 

@@ -7,7 +7,9 @@ import scipy.optimize
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.graph import posegraph
-from merge.graph.posegraph import LEAST_SIGMAS, Measurement, PoseGraph, solve_graph
+from merge.graph.component import solve_graph
+from merge.graph.factors import LEAST_SIGMAS, Measurement
+from merge.graph.posegraph import PoseGraph
 
 IDS = [NodeId("a", 1, k) for k in range(8)]
 

@@ -6,7 +6,7 @@ import pytest
 from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from merge.graph.candidates import CandidateSettings, Pair, choose_pairs
-from merge.incremental.pairs import PairTable
+from merge.graph.pairs import PairTable
 
 STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 

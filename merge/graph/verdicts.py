@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping
 
 from hybridmap.node import MapId
 from hybridmap.ruling import Rulings
 from merge.graph.candidates import Pair
 from merge.graph.links import Link, RefusedLink
-from merge.incremental.sheets import MapPair
 
+MapPair = tuple[MapId, MapId]
+"""Smaller first; twice the same for links within a map."""
 Verdict = Link | RefusedLink
 
 
@@ -20,44 +21,21 @@ class Verdicts:
         """None yet."""
         self._between: dict[MapPair, dict[Pair, Verdict]] = {}
         self._partners: dict[MapId, set[MapId]] = {}
-        self._news: set[MapPair] = set()
-
-    def copy(self) -> Verdicts:
-        """The same as it is now; there is no news in it."""
-        other = Verdicts()
-        other._between = {maps: dict(known) for maps, known in self._between.items()}
-        other._partners = {one: set(others) for one, others in self._partners.items()}
-        return other
 
     def put(self, pair: Pair, verdict: Verdict) -> None:
         """Take note of what was found of a pair."""
         maps = pair[0].map, pair[1].map
         self._between.setdefault(maps, {})[pair] = verdict
         self._partners.setdefault(maps[0], set()).add(maps[1])
-        self._news.add(maps)
 
     def drop(self, pair: Pair) -> None:
         """A pair is chosen no longer. One that never was is no error."""
         maps = pair[0].map, pair[1].map
         known = self._between.get(maps, {})
-        if known.pop(pair, None) is not None:
-            self._news.add(maps)
+        known.pop(pair, None)
         if not known and maps in self._between:
             del self._between[maps]
             self._partners[maps[0]].discard(maps[1])
-
-    def news(self) -> set[MapPair]:
-        """Between which maps something has changed since this was asked last."""
-        news, self._news = self._news, set()
-        return news
-
-    def between(self, maps: MapPair) -> Mapping[Pair, Verdict]:
-        """Of the pairs between two maps."""
-        return self._between.get(maps, {})
-
-    def at(self, maps: Set[MapId]) -> set[MapPair]:
-        """Between which maps there is anything, if one of them is among these."""
-        return {pair for pair in self._between if pair[0] in maps or pair[1] in maps} if maps else set()
 
     def ties(self, rulings: Rulings) -> Iterable[MapPair]:
         """Maps between which there are links, those that people have ruled out left out."""

@@ -1,0 +1,155 @@
+"""The merge as maps grow: only what a change can bear on is merged anew.
+
+Maps that links tie together, directly or by way of others, are an island. Nothing in one island bears on
+another, so an island that nothing has touched is kept as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import networkx as nx
+
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
+from hybridmap.ruling import Rulings
+from merge.belief.memory import Memory
+from merge.graph.links import Link, RefusedLink
+from merge.graph.merged import MergedMap, Postures
+from merge.graph.verdicts import Verdict, Verdicts
+from merge.merging import MergeSettings, decide
+from merge.standing import Standing
+from merge.undoing import undo
+
+EXACT = 600
+"""Islands of as many nodes are decided as a whole whenever they change: that is soon done, and the outcome
+depends on what there is alone, not on the order in which it came."""
+CHANGED = 0.25
+"""Larger ones when links have come or gone that are this share of those that were decided together."""
+
+
+class Islands:
+    """Merges island by island, and keeps what it has merged."""
+
+    def __init__(self, settings: MergeSettings | None = None, exact: int = EXACT) -> None:
+        """Nothing is merged yet.
+
+        Args:
+            settings: how.
+            exact: nodes up to which an island is decided as a whole whenever it changes.
+        """
+        self._settings = settings or MergeSettings()
+        self._exact = exact
+        self._memory = Memory()
+        self._merged: dict[frozenset[MapId], MergedMap] = {}
+        self._standing: dict[frozenset[MapId], Standing] = {}
+        self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
+        self._rulings = Rulings()
+
+    def merge(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+        touched: set[MapId],
+        rulings: Rulings,
+    ) -> MergedMap:
+        """Merge.
+
+        Args:
+            maps: by id. They are never changed, only replaced.
+            verdicts: on pairs of their nodes.
+            touched: maps that were replaced, or with a node of which the verdicts have changed, since this
+                was called last.
+            rulings: of people.
+
+        Returns:
+            What `merge_maps` makes of all maps; of large islands nearly so.
+        """
+        for ruling in {*rulings.in_force} ^ {*self._rulings.in_force}:
+            touched = touched | {end.map if isinstance(end, NodeId) else end for end in ruling.ends}
+        self._rulings = rulings
+        islands = self._ties(maps, verdicts)
+        before, self._merged = self._merged, {}
+        standing, self._standing = self._standing, {}
+        for island in islands:
+            merged = before.get(island)
+            if merged is None or island & touched:
+                inside = {one: maps[one] for one in sorted(island)}
+                earlier = [standing[one] for one in sorted(standing, key=min) if one & island]
+                merged, stands = self._decided(inside, verdicts.among(island), rulings, earlier)
+            else:
+                stands = standing[island]
+            self._merged[island], self._standing[island] = merged, stands
+        island_of = {one: island for island in islands for one in island}
+        return _together(list(self._merged.values()), maps, verdicts.across(island_of), rulings)
+
+    def _decided(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Iterable[Verdict],
+        rulings: Rulings,
+        earlier: Sequence[Standing],
+    ) -> tuple[MergedMap, Standing]:
+        links, refused = _sorted_out(verdicts)
+        undone = undo(maps, links, rulings)
+        everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._memory
+        small = sum(len(one.nodes) for one in maps.values()) <= self._exact
+        before = None if small or not earlier else Standing.together(earlier)
+        merged, stands = decide(*everything, before)
+        if stands.changed > CHANGED * stands.size:
+            merged, stands = decide(*everything)
+        return undone.completed(merged), stands
+
+    def _ties(self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts) -> list[frozenset[MapId]]:
+        """Islands: maps that links or drives tie together."""
+        ties: nx.Graph = nx.Graph()
+        ties.add_nodes_from(maps)
+        ties.add_edges_from(verdicts.ties(self._rulings))
+        for map_id, one in maps.items():
+            known = self._abroad.get(map_id)
+            if known is None or known[0] is not one:
+                ends = {node[:2] for edge in one.edges.values() for node in (edge.a, edge.b)}
+                known = self._abroad[map_id] = one, frozenset(MapId(*end) for end in ends) - {map_id}
+            ties.add_edges_from((map_id, other) for other in known[1])
+        found = (frozenset(part & maps.keys()) for part in nx.connected_components(ties))
+        return sorted((island for island in found if island), key=min)
+
+
+def _sorted_out(verdicts: Iterable[Verdict]) -> tuple[list[Link], list[RefusedLink]]:
+    links: list[Link] = []
+    refused: list[RefusedLink] = []
+    for verdict in verdicts:
+        if isinstance(verdict, Link):
+            links.append(verdict)
+        else:
+            refused.append(verdict)
+    return links, refused
+
+
+def _together(
+    islands: list[MergedMap],
+    maps: Mapping[MapId, HybridMap],
+    across: Iterable[Verdict],
+    rulings: Rulings,
+) -> MergedMap:
+    """One merged map of islands that have nothing to do with each other."""
+    graphs = sorted(
+        (
+            (graph, component)
+            for one in islands
+            for graph, component in zip(one.graphs, one.components, strict=True)
+        ),
+        key=lambda item: (-len(item[0].nodes), item[0].anchor),
+    )
+    solved = tuple(graph for graph, _ in graphs)
+    postures = Postures(solved)
+    links = sorted((link for one in islands for link in one.links), key=lambda link: link.pair)
+    refused = [refusal for one in islands for refusal in one.refused]
+    apart, between = _sorted_out(across)
+    undone = undo({}, apart, rulings)
+    refused += [r for r in (*between, *undone.refused) if r.a in postures and r.b in postures]
+    refused.sort(key=lambda refusal: refusal.pair)
+    components = tuple(component for _, component in graphs)
+    whole = MergedMap(dict(sorted(maps.items())), tuple(links), tuple(refused), components, postures, solved)
+    return replace(whole, rulings=rulings)

@@ -1,0 +1,158 @@
+"""Merging from what stood against merging anew, over random lives of fleets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridmap.change import NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import MapId, NodeId
+from hybridmap.ruling import Ruling, Rulings
+from merge import islands as islands_module
+from merge.graph import solver
+from merge.graph.merged import MergedMap
+from merge.islands import Islands
+from merge.merging import MergeSettings
+from tests.merge.lives import DENSE, Life
+
+
+def told(merged: MergedMap) -> tuple[object, ...]:
+    """Everything but numbers."""
+    return (
+        [link.pair for link in merged.links],
+        sorted((r.pair, r.reason, str(r.edge)) for r in merged.refused),
+        set(merged.components),
+        merged.rulings.in_force,
+        set(merged.maps),
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "false_share"), [(0, 0.0), (1, 0.3), (2, 0.3), (3, 0.5), (4, 0.0), (5, 0.6)]
+)
+def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> None:
+    """Whatever happens in whatever order: the outcome is that of a merge made anew, to the last bit."""
+    life, islands = Life(seed, false_share), Islands()
+    for _ in range(45):
+        life.step()
+        if life.rng.random() < 0.4:
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+            life.touched = set()
+            anew = life.anew()
+            assert told(merged) == told(anew)
+            assert [graph.anchor for graph in merged.graphs] == [graph.anchor for graph in anew.graphs]
+            assert list(merged.postures) == list(anew.postures)
+            for node, place in merged.postures.items():
+                other = anew.postures[node]
+                assert place.component == other.component
+                assert place.merged_from_robot.mean == other.merged_from_robot.mean
+                assert np.array_equal(place.merged_from_robot.covariance, other.merged_from_robot.covariance)
+    assert len(islands.merge(life.maps, life.verdicts, set(), life.rulings).postures) > 20
+
+
+@pytest.mark.parametrize(("seed", "false_share"), [(40, 0.0), (41, 0.3), (42, 0.5)])
+def test_what_is_decided_together_is_the_merge_made_anew(
+    seed: int, false_share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However it began: once too much has changed, nothing of what stood has a say."""
+    monkeypatch.setattr(islands_module, "CHANGED", -1.0)
+    life, islands = Life(seed, false_share), Islands(exact=0)
+    for _ in range(50):
+        life.step()
+        if life.rng.random() < 0.3:
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+            life.touched = set()
+            assert told(merged) == told(life.anew())
+
+
+@pytest.mark.parametrize("seed", [43, 44, 45])
+def test_decisions_that_stand_are_those_of_the_merge_made_anew(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is ever decided again here, and few nodes are moved at a time."""
+    monkeypatch.setattr(islands_module, "CHANGED", math.inf)
+    monkeypatch.setattr(solver, "WHOLE", 0)
+    monkeypatch.setattr(solver, "LEAST", 12)
+    life, islands = Life(seed, 0.0, DENSE), Islands(exact=0)
+    for _ in range(60):
+        life.step(quiet=True)
+        merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+        life.touched = set()
+    anew = life.anew()
+    assert set(merged.components) == set(anew.components)
+    one, two = ({link.pair for link in links} for links in (merged.links, anew.links))
+    assert len(two) > 150 and len(one ^ two) <= 0.03 * len(two)
+    if one == two:
+        assert max(merged.pose(node).distance(anew.pose(node)) for node in anew.postures) < 0.02
+
+
+@pytest.mark.parametrize(("seed", "false_share"), [(46, 0.0), (47, 0.3), (48, 0.3)])
+def test_whatever_happens_decisions_stand_or_fall_as_in_a_merge_made_anew(
+    seed: int, false_share: float
+) -> None:
+    """Nodes, links, rulings and retired maps come and go."""
+    life, islands = Life(seed, false_share), Islands(exact=0)
+    apart = links = 0
+    for _ in range(60):
+        life.step()
+        if life.maps and life.rng.random() < 0.05:
+            which = sorted(life.maps)[int(life.rng.integers(len(life.maps)))]
+            life.number += 1
+            ruling = Ruling((which, which), bool(life.rng.random() < 0.6), "anna", life.number)
+            life.rulings = life.rulings + Rulings([ruling])
+        if life.rng.random() < 0.4:
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+            life.touched, anew = set(), life.anew()
+            one, two = ({link.pair for link in some.links} for some in (merged, anew))
+            apart, links = apart + len(one ^ two), links + len(two)
+            assert set(merged.postures) == set(anew.postures)
+            assert {r.pair for r in merged.refused} | one == {r.pair for r in anew.refused} | two
+    assert links > 15 and apart <= 0.1 * links
+
+
+def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    times: list[bool] = []
+    real = islands_module.decide
+    monkeypatch.setattr(
+        islands_module, "decide", lambda *a: (times.append(len(a) == 5 or a[5] is None), real(*a))[1]
+    )
+    life, islands = Life(4, 0.0, DENSE), Islands(exact=0)
+    for _ in range(60):
+        life.step(quiet=True)
+        islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+        life.touched = set()
+    assert 3 < sum(times) < 30 and not all(times[-8:])
+    times.clear()
+    islands.merge(life.maps, life.verdicts, set(life.maps), life.rulings)
+    assert times == [False]
+
+
+def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solver, "WHOLE", 0)
+    monkeypatch.setattr(solver, "LEAST", 12)
+    found = []
+    for _ in range(2):
+        life, islands = Life(49, 0.3, DENSE), Islands(exact=0)
+        for _ in range(40):
+            life.step()
+            merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+            life.touched = set()
+        found.append((told(merged), [merged.pose(node).vector.tobytes() for node in merged.postures]))
+    assert found[0] == found[1]
+
+
+def test_what_nothing_touches_is_kept() -> None:
+    life, islands = Life(7, 0.0), Islands(MergeSettings())
+    for _ in range(60):
+        life.step()
+    first = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
+    alone = MapId("z", 1)
+    node = next(iter(life.maps[min(life.maps)].nodes.values()))
+    life.maps[alone] = HybridMap([NodePut(replace(node, id=NodeId("z", 1, 1)))])
+    second = islands.merge(life.maps, life.verdicts, {alone}, life.rulings)
+    assert {id(g) for g in first.graphs} <= {id(g) for g in second.graphs}
+    assert len(second.graphs) > len(first.graphs)
