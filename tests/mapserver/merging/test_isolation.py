@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Iterable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -278,7 +279,7 @@ def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(told: dict[Ma
     log: Log = [(BAD, NodePut(replace(node.node, id=one))) for one in ids]
     log += [
         (BAD, EdgePut(replace(edge.edge, id=NodeId(*BAD, 200 + k), a=a, b=b, a_from_b=far)))
-        for k, (a, b) in enumerate(zip(ids, ids[1:], strict=False))
+        for k, (a, b) in enumerate(pairwise(ids))
     ]
     merged = merger_of({**told, BAD: log}, R0, R1, BAD).merged()
     assert "lie beyond 1e+06 m" in merged.set_apart[BAD]
