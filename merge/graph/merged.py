@@ -13,7 +13,7 @@ from hybridmap.change import EdgePut
 from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
 from hybridmap.ruling import Rulings
 from hybridmap.superseded import Superseded
 from merge.graph.links import Link, RefusedLink
@@ -143,7 +143,7 @@ class MergedMap:
         if component is None or component != self.component_of(b):
             return None
         found = self.graphs[component].relative([a], [b])
-        return PoseGaussian(Pose2.from_vector(found.means[0]), found.covariances[0])
+        return PoseGaussian(Pose2.from_vector(found.means[0]), nearest_covariance(found.covariances[0]))
 
     def check(self, end: NodeId | MapId) -> None:
         """Refuse a node or a map that is not there.
