@@ -6,7 +6,7 @@ between all of them tell true merges from false ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Set
+from collections.abc import Callable, Collection, Iterable
 
 from hybridmap.node import Node, NodeId
 from mapserver.places import tally
@@ -33,11 +33,6 @@ class Succession:
         self._index, self._pairs, self._node_of = index, pairs, node_of
         self._left_out: set[NodeId] = set()
         self._newest: dict[str, tuple[int, int]] = {}
-
-    @property
-    def past(self) -> Set[NodeId]:
-        """Nodes of another day that are superseded."""
-        return self._left_out
 
     def overlaps(self, node: Node, before: Iterable[Pair]) -> dict[NodeId, float]:
         """Which nodes a node is compared with: those in the index, and those left out that it was before.

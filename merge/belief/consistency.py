@@ -10,7 +10,7 @@ Links between the same two places are no independent witnesses and count for les
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -262,7 +262,7 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
 
 
 def group_links(
-    links: Sequence[Link], by_node: dict[NodeId, Fragment]
+    links: Sequence[Link], by_node: Mapping[NodeId, Fragment]
 ) -> dict[tuple[NodeId, NodeId], list[Link]]:
     """Links by the names of the two pieces of map, smaller first; each link turned to that direction."""
     groups: dict[tuple[NodeId, NodeId], list[Link]] = {}
