@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from agent.vision.sift import Sift
     from hybridmap.errors import DeviceError
     from hybridmap.query import Certainty
-    from mapserver.people.answer_json import answer_record
+    from mapserver.http.answer_json import answer_record
     from mapweave.match_picture import draw_matches
     from wire.messages import decode_relocalize_answer, encode_view
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hybridmap.errors import Busy, InvalidValue
-from mapserver.people.web import Web
+from mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.desks import PLACE, Desk, picture
 from tests.waiting import eventually

@@ -9,8 +9,39 @@ from __future__ import annotations
 
 import ipaddress
 import socket
+from http import HTTPStatus
+
+from starlette.datastructures import Headers
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from hybridmap.errors import InvalidValue
+from mapserver.http.serving import json_bytes
+
+
+class SameSite:
+    """An application that refuses what pages of other sites ask."""
+
+    def __init__(self, app: ASGIApp, listens_at: str) -> None:
+        """Stand before an application.
+
+        Args:
+            app: answers everything else.
+            listens_at: host at which the server listens.
+        """
+        self._app = app
+        self._names = own_names(listens_at)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer, or refuse."""
+        headers = Headers(scope=scope)
+        answer = self._app
+        try:
+            check_site(headers.get("Host"), headers.get("Origin"), self._names)
+        except InvalidValue as error:
+            content = json_bytes({"error": str(error)})
+            answer = Response(content, HTTPStatus.FORBIDDEN, media_type="application/json")
+        await answer(scope, receive, send)
 
 
 def own_names(listens_at: str) -> frozenset[str]:

@@ -5,20 +5,26 @@ from __future__ import annotations
 import http.client
 import json
 import math
+import re
+import resource
 import socket
 import struct
 import time
 import tracemalloc
 import zlib
 from collections.abc import Iterator
+from email.message import Message
 
 import numpy as np
 import pytest
 
 from hybridmap.errors import Busy, NotConnected, SettingsError
-from mapserver.people import web
-from mapserver.people.web import MOST_BYTES, Web, parse_address
+from hybridmap.history import Happening, Kind
+from mapserver.http import serving, web
+from mapserver.http.serving import Limits
+from mapserver.http.web import MOST_BYTES, Web, parse_address
 from tests.mapserver.desks import ANSWER, Desk, picture
+from tests.waiting import eventually
 
 
 @pytest.fixture
@@ -34,13 +40,13 @@ def served(desk: Desk) -> Iterator[Web]:
 
 def ask(
     served: Web, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
-) -> tuple[int, dict[str, str], bytes]:
+) -> tuple[int, Message, bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
     connection.request(method, path, body, headers or {})
     reply = connection.getresponse()
     content = reply.read()
     connection.close()
-    return reply.status, dict(reply.getheaders()), content
+    return reply.status, reply.headers, content
 
 
 def post(served: Web, query: str = "", body: bytes | None = None, **headers: str) -> tuple[int, dict]:
@@ -174,7 +180,7 @@ def test_images_that_are_none(served: Web, body: bytes, words: str) -> None:
     ("body", "content_type", "words"),
     [
         (b"", "multipart/form-data", "the form has no boundary"),
-        (b"xx", "multipart/form-data; boundary=b", "the form is cut off"),
+        (b"xx", "multipart/form-data; boundary=b", "the form is damaged: "),
         (form(("picture", b"x"))[0], form()[1]["Content-Type"], "no part named image"),
         (form(("image", b"x"))[0][:-4], form()[1]["Content-Type"], "the form is cut off"),
         (form(*[(f"p{k}", b"") for k in range(40)])[0], form()[1]["Content-Type"], "more than 32 parts"),
@@ -307,8 +313,20 @@ def test_the_page_and_the_status(served: Web) -> None:
         ("POST", "/", 405),
         ("GET", "/../etc/passwd", 404),
         ("POST", "/nothing", 404),
-        ("DELETE", "/", 501),
-        ("GET", "/" + "x" * 70_000, 414),
+        ("DELETE", "/", 405),
+        ("BREW", "/", 405),
+        ("GET", "/" + "x" * 70_000, 404),
+        ("GET", "/" + "x" * 900_000, 400),
+        ("GET", "/static", 404),
+        ("GET", "/static/", 404),
+        ("GET", "/static/nothing.js", 404),
+        ("GET", "/static/../web.py", 404),
+        ("GET", "/static/..%2fweb.py", 404),
+        ("GET", "/static/%2e%2e/web.py", 404),
+        ("GET", "/static//etc/passwd", 404),
+        ("GET", "/static/%2fetc/passwd", 404),
+        ("GET", "/static/why.js%00", 404),
+        ("POST", "/static/why.js", 405),
     ],
 )
 def test_what_is_not_there(served: Web, method: str, path: str, status: int) -> None:
@@ -334,7 +352,7 @@ def raw(served: Web, data: bytes, close: bool = False) -> bytes:
     [
         (b"Content-Length: 99999999999\r\n", b"413"),
         (b"Content-Length: %d\r\nExpect: 100-continue\r\n" % (MOST_BYTES + 1), b"413"),
-        (b"Content-Length: -1\r\n", b"411"),
+        (b"Content-Length: -1\r\n", b"400"),
         (b"Transfer-Encoding: chunked\r\n", b"411"),
         (b"", b"411"),
         (b"Content-Length: 0\r\n", b"400"),
@@ -352,40 +370,142 @@ def test_a_body_that_is_too_long_gets_its_answer_all_the_same(served: Web) -> No
     assert (status, answer) == (413, {"error": "at most 16 MiB are taken"})
 
 
-def test_who_hangs_up_or_dawdles_holds_up_nobody(served: Web, monkeypatch: pytest.MonkeyPatch) -> None:
-    half = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
-    assert b"only 3 of 1000 bytes came" in raw(served, half, close=True)
-    monkeypatch.setattr(web._Handler, "timeout", 0.2)
-    slow = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(web.MOST_AT_ONCE)]
-    for connection in slow:
-        connection.sendall(half)
-    begin = time.monotonic()
-    # All places are taken for a moment; the page is there all the same.
-    assert ask(served, "GET", "/status")[0] == 200
-    while post(served)[0] != 200:
-        assert time.monotonic() < begin + 15.0
-        time.sleep(0.05)
-    assert slow[0].recv(65536).startswith(b"HTTP/1.1 408")
-    for connection in slow:
-        connection.close()
+HALF = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
 
 
-def test_a_byte_now_and_then_takes_no_longer_than_anything_else(
-    served: Web, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(web._Handler, "timeout", 0.5)
-    with socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow:
-        slow.sendall(b"POST /relocalize HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1000\r\n\r\n")
+def test_who_hangs_up_or_dawdles_holds_up_nobody(desk: Desk) -> None:
+    with Web(("127.0.0.1", 0), desk, patience=0.5) as served:
+        # Nobody is left who would read an answer.
+        assert raw(served, HALF, close=True) == b""
+        slow = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(web.MOST_AT_ONCE)]
+        for connection in slow:
+            connection.sendall(HALF)
         begin = time.monotonic()
-        slow.settimeout(0.1)
-        while time.monotonic() < begin + 10.0:
-            try:
-                slow.sendall(b"x")
-                if slow.recv(100).startswith(b"HTTP/1.1 408"):
-                    break
-            except TimeoutError:
-                continue
+        # All places are taken for a moment; the page is there all the same.
+        assert ask(served, "GET", "/")[0] == 200
+        while post(served)[0] != 200:
+            assert time.monotonic() < begin + 15.0
+            time.sleep(0.05)
+        assert slow[0].recv(65536).startswith(b"HTTP/1.1 408")
+        for connection in slow:
+            connection.close()
+
+
+def test_a_byte_now_and_then_takes_no_longer_than_anything_else(desk: Desk) -> None:
+    with (
+        Web(("127.0.0.1", 0), desk, patience=0.5) as served,
+        socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
+    ):
+        slow.sendall(HALF)
+        assert drip(slow, b"x").startswith(b"HTTP/1.1 408")
+
+
+def test_a_head_that_never_ends_is_dropped(desk: Desk) -> None:
+    with (
+        Web(("127.0.0.1", 0), desk, limits=Limits(head=0.5)) as served,
+        socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
+    ):
+        slow.sendall(b"GET /status HTTP/1.1\r\nHost: localhost\r\nX: ")
+        assert drip(slow, b"x") == b""
+
+
+def test_who_takes_nothing_of_an_answer_is_dropped(desk: Desk) -> None:
+    desk.happenings = (Happening(10**18, Kind.RULED, "no" * 2000),) * 3000
+    with (
+        Web(("127.0.0.1", 0), desk, limits=Limits(stall=0.5)) as served,
+        socket.socket() as slow,
+    ):
+        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        slow.connect(("127.0.0.1", served.port))
+        slow.sendall(b"GET /history HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        eventually(lambda: served.connections == 1)
+        eventually(lambda: served.connections == 0)
+        assert len(ask(served, "GET", "/history")[2]) > 10_000_000
+
+
+def drip(connection: socket.socket, piece: bytes) -> bytes:
+    """Send a little now and then until there is an answer, or the end of the connection."""
+    begin = time.monotonic()
+    connection.settimeout(0.1)
+    while time.monotonic() < begin + 5.0:
+        try:
+            connection.sendall(piece)
+            return connection.recv(65536)
+        except TimeoutError:
+            continue
+        except ConnectionError:
+            return b""
+    raise AssertionError("it may go on for ever")
+
+
+def test_thousands_of_half_open_connections_keep_nobody_out(served: Web) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    half = []
+    try:
+        for k in range(2000):
+            half.append(socket.create_connection(("127.0.0.1", served.port), timeout=20))
+            half[-1].sendall(
+                (b"", b"G", b"GET / HTTP/1.1\r\n", b"POST /relocalize HTTP/1.1\r\nHost: x")[k % 4]
+            )
+        begin = time.monotonic()
+        assert post(served)[0] == 200
+        assert ask(served, "GET", "/status")[0] == 200
         assert time.monotonic() < begin + 5.0
+        assert served.connections <= serving.MAX_WAITING + 2
+    finally:
+        for connection in half:
+            connection.close()
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    ("head", "status"),
+    [
+        (b"Content-Length: 3\r\nTransfer-Encoding: chunked\r\n", b"400"),
+        (b"Content-Length: 3\r\nContent-Length: 4\r\n", b"400"),
+        (b"Transfer-Encoding: chunked\r\nTransfer-Encoding: identity\r\n", b"400"),
+        (b"Content-Length : 3\r\n", b"400"),
+        (b"Content-Length: +3\r\n", b"400"),
+        (b"Content-Length: 3\r\n X: y\r\n", b"400"),
+        (b"X: a\x00b\r\nContent-Length: 3\r\n", b"400"),
+    ],
+)
+def test_requests_that_say_two_things_are_answered_once(served: Web, head: bytes, status: bytes) -> None:
+    """What stands behind the first request is never taken for a second one."""
+    got = raw(
+        served,
+        b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\nabc"
+        b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    )
+    assert got.startswith(b"HTTP/1.1 " + status) and got.count(b"HTTP/1.1 ") == 1
+    assert b'{"error": ' in got
+
+
+def test_one_request_a_connection(served: Web) -> None:
+    got = raw(served, b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
+    assert got.count(b"HTTP/1.1 200") == 1 and b"\r\nconnection: close\r\n" in got.lower()
+
+
+def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
+    for path in ("/", "/why", "/static/why.js", "/static/photo.css", "/status", "/nothing"):
+        _, headers, content = ask(served, "GET", path)
+        assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'; ")
+        assert (headers["X-Content-Type-Options"], headers["Cache-Control"]) == ("nosniff", "no-store")
+        assert headers["Server"] == "Mapweave"
+        assert not re.search(rb"<script(?! src=)|<style| on[a-z]+=|javascript:", content)
+
+
+def test_a_server_that_is_closed_leaves_nothing_behind(desk: Desk) -> None:
+    with Web(("127.0.0.1", 0), desk) as served, socket.create_connection(("127.0.0.1", served.port)) as half:
+        half.sendall(HALF)
+        eventually(lambda: served.connections == 1)
+        begin = time.monotonic()
+        served.close()
+        assert time.monotonic() < begin + 5.0
+        served.close()
+        with Web(("127.0.0.1", served.port), desk) as again:
+            assert ask(again, "GET", "/status")[0] == 200
 
 
 def test_noise_instead_of_http(served: Web) -> None:

@@ -1,36 +1,4 @@
-"""The page on which people ask why maps are one, or are not, and why routes lead as they do.
-
-What it tells is in its address: ?a=MAP&b=MAP, ?a=NODE&b=NODE, or with &route=1 the way from node to node.
-"""
-
-WHY_PAGE = """<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Mapweave: why is that one map?</title>
-<style>
-  body { font: 1.05rem/1.5 system-ui, sans-serif; max-width: 60rem; margin: 0 auto; padding: 1rem;
-         color: #1b2733; background: #f7f8fa }
-  h1 { font-size: 1.4rem }
-  input { width: 7rem; font: inherit } button { font: inherit }
-  section { margin-top: 1rem; padding: .6rem 1rem; border-radius: .5rem; background: #fff;
-            border-left: .4rem solid #d29a1c }
-  section.good { border-color: #2a8f5b } section.failed { border-color: #c0392b }
-  a { color: #1f5fa8 } ul { margin: .3rem 0; padding-left: 1.2rem } p { margin: .3rem 0 }
-  svg { width: 100%; height: auto; margin-top: .6rem }
-  small { color: #5b6875 } details { margin-top: 1rem } summary { cursor: pointer }
-</style>
-<h1>Why is that one map, or why not?</h1>
-<form id="form">
-  <input id="a" name="a" placeholder="r0.1.17" aria-label="node or map" autocapitalize="off">
-  and <input id="b" name="b" placeholder="r1.1.5" aria-label="another one" autocapitalize="off">
-  <button>Explain</button> <button name="route" value="1">The way</button> <a href="why" id="all">all maps</a>
-</form>
-<div id="told" role="status">Asking ...</div>
-<details id="past" hidden><summary>What has happened</summary><ul></ul></details>
-<p><small>To part two maps for good, or two nodes: <code>mapweave map unmerge A B --because TEXT</code>.
-  <a href="./">Where was a picture taken?</a></small></p>
-<script>
+"use strict";
 const byId = id => document.getElementById(id), told = byId("told");
 const SVG = "http://www.w3.org/2000/svg", BAD_PX = 10;
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
@@ -74,11 +42,11 @@ function picture(parent, pair) {
     `${BAD_PX} px off. ${alike} look alike and do not agree: grey.`);
 }
 const metres = ([x, y, turn]) =>
-  `${x.toFixed(3)} m ahead, ${y.toFixed(3)} m left, ${(turn * 180 / Math.PI).toFixed(1)}\\u00b0`;
+  `${x.toFixed(3)} m ahead, ${y.toFixed(3)} m left, ${(turn * 180 / Math.PI).toFixed(1)}\u00b0`;
 function posture(gaussian) {
   const sigma = [0, 1, 2].map(k => Math.sqrt(gaussian.covariance[k][k]));
   return `${metres(gaussian.mean)} (sigma ${sigma[0].toFixed(3)} m, ${sigma[1].toFixed(3)} m, ` +
-    `${(sigma[2] * 180 / Math.PI).toFixed(1)}\\u00b0)`;
+    `${(sigma[2] * 180 / Math.PI).toFixed(1)}\u00b0)`;
 }
 function to(parent, a, b, words) {
   const link = add(parent, "a", words);
@@ -120,7 +88,7 @@ function ruled(r) {
   const what = r.ends[0] === r.ends[1] ? (r.apart ? "is retired" : "is in use again")
     : r.apart ? "shall not be linked" : "may be linked again";
   return `${when} UTC ${r.who || "somebody"} ruled: ${[...new Set(r.ends)].join(" and ")} ${what}` +
-    (r.because ? `: \\u201c${r.because}\\u201d` : "");
+    (r.because ? `: \u201c${r.because}\u201d` : "");
 }
 function showMaps(maps) {
   if (!maps.length) add(told, "section", "There are no two maps.");
@@ -146,7 +114,7 @@ function showHops(box, hops) {
   for (const hop of hops) {
     const item = add(list, "li");
     to(item, hop.a, hop.b, `${hop.a} - ${hop.b}`);
-    item.append(`: ${hop.distance.toFixed(2)} m, ${(hop.turn * 180 / Math.PI).toFixed(0)}\u00b0, ` +
+    item.append(`: ${hop.distance.toFixed(2)} m, ${(hop.turn * 180 / Math.PI).toFixed(0)}°, ` +
       `cost ${hop.cost.toFixed(2)}; ${hop.kind}: ${hop.words}`);
   }
 }
@@ -198,6 +166,3 @@ async function explain() {
 }
 explain();
 past();
-</script>
-</html>
-"""

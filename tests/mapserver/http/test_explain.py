@@ -13,8 +13,8 @@ import pytest
 from hybridmap.errors import Busy
 from hybridmap.history import Happening, Kind
 from hybridmap.node import NodeId
-from mapserver.people.explanation_json import route_values
-from mapserver.people.web import Web
+from mapserver.http.explanation_json import route_values
+from mapserver.http.web import Web
 from mapserver.route_explaining import explain_route
 from mapserver.routes import Router
 from merge.explaining.explanation import explain_nodes
