@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import merge.belief.memory
-from benchmarks.synthetic import World, room, take_map, take_view
+from synthetic.world import World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
