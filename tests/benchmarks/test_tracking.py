@@ -11,7 +11,7 @@ import pytest
 
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
-from benchmarks.tracking.benchmark import follow
+from benchmarks.tracking.benchmark import follow, main
 from benchmarks.tracking.scenes import (
     TEXEL_PX,
     Drive,
@@ -85,7 +85,12 @@ def test_the_last_line_is_for_scripts():
 
 
 @pytest.mark.parametrize("bad", [("--drives", "0"), ("--frames", "3"), ("--seed", "-1")])
-def test_bad_input_gets_one_line(bad: tuple[str, str]):
-    done = run(*bad)
-    assert done.returncode == 1
-    assert done.stderr.splitlines() == ["tracking: at least 1 drive, 12 frames and seed 0 are needed"]
+def test_bad_input_gets_one_line(
+    bad: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["tracking", *bad])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    words = "tracking: at least 1 drive, 12 frames and seed 0 are needed"
+    assert ended.value.code == 1
+    assert capsys.readouterr().err.splitlines() == [words]
