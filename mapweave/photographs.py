@@ -1,0 +1,137 @@
+"""A map from photographs alone: of a stretch, in order, by a calibrated camera that somebody carries.
+
+Each photograph becomes a node, with an edge to the next. Structure from motion gives the depths of their landmarks
+in proportion to each other. How large all of it is follows from the spacing that the photographer states, so
+every depth, and every way between nodes, carries the uncertainty of that statement. A robot that drives along
+finds the scale by its wheels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from agent.drivers.image_file import read_grey
+from agent.observation import RobotDescription
+from agent.vision.lens import Lens
+from agent.vision.sift import Sift
+from hybridmap.camera import Camera
+from hybridmap.change import ChangeBody, EdgePut, NodePut
+from hybridmap.errors import DeviceError, InvalidValue
+from hybridmap.grid import settle
+from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.recognising.selection import choose, worth
+from mapweave.structure_from_motion import PIXEL_SIGMA, Structure, reconstruct
+
+SCALE_SHARE = 0.3
+"""By which the stated spacing may be off, as a share of it."""
+
+LEAST_LANDMARKS = 12
+"""A photograph that shows fewer points is no place that a robot could recognise."""
+
+FLOOR = (0.01, 0.01)
+"""What a posture is never better than, m and rad: the camera is not quite level."""
+
+
+def map_of_photographs(
+    images: Sequence[Path],
+    camera: Camera,
+    distortion: tuple[float, ...],
+    spacing: float,
+    map_id: MapId,
+) -> list[ChangeBody]:
+    """Make a map.
+
+    Args:
+        images: in the order in which they were taken, by one camera that was held about level.
+        camera: that took them; `mount_height` is how high it was held.
+        distortion: of its lens, OpenCV's five coefficients.
+        spacing: how far apart they were taken, on average, m; 30 % more or less does not matter.
+        map_id: whose nodes they become; the k-th photograph is node k.
+
+    Raises:
+        DeviceError: an image cannot be read.
+        InvalidValue: they are not one stretch, or show too little.
+    """
+    if not (math.isfinite(spacing) and spacing > 0.0):
+        raise InvalidValue(f"spacing {spacing:g}: give the metres between photographs")
+    sift = Sift(Lens(RobotDescription(camera, distortion)))  # type: ignore[arg-type]
+    features = [sift.extract(read_grey(image, camera)) for image in images]
+    views = [one.view(camera) for one in features]
+    structure = reconstruct(views, spacing)
+    levels = [_level(structure, k) for k in range(len(views))]
+    changes: list[ChangeBody] = []
+    seats = []
+    for k, image in enumerate(images):
+        landmarks, points = _landmarks(structure, k, levels[k], camera, views[k].codes)
+        if len(landmarks) < LEAST_LANDMARKS:
+            raise InvalidValue(f"{image}: only {len(landmarks)} points of it are in its neighbours too")
+        seats.append(points)
+        way = levels[0].inverse() @ levels[k]
+        node_id = NodeId(map_id.agent, map_id.epoch, k + 1)
+        changes.append(NodePut(Node(node_id, k, _spread(way), camera, landmarks)))
+    for k in range(len(images) - 1):
+        _, a, b = np.intersect1d(seats[k], seats[k + 1], return_indices=True)
+        nodes = [NodeId(map_id.agent, map_id.epoch, k + 1 + end) for end in (0, 1)]
+        edge_id = NodeId(map_id.agent, map_id.epoch, len(images) + k + 1)
+        way = _spread(levels[k].inverse() @ levels[k + 1])
+        shared = np.stack([a, b], axis=1).astype(np.int64)
+        evidence = {"shared": float(len(shared))}
+        changes.append(EdgePut(Edge(edge_id, *nodes, way, EdgeKind.MAPPED, shared, evidence)))
+    return changes
+
+
+def _level(structure: Structure, k: int) -> Pose2:
+    """Where the k-th camera stood over the floor, and where it looked."""
+    axis = structure.rotations[k][:, 2]
+    x, y, _ = structure.centres[k]
+    return Pose2(float(x), float(y), math.atan2(axis[1], axis[0]))
+
+
+def _landmarks(
+    structure: Structure, k: int, level: Pose2, camera: Camera, codes: Array
+) -> tuple[Landmarks, Array]:
+    """What the k-th photograph shows, as a level camera at the stated height sees it; and which points."""
+    points = np.flatnonzero(structure.features[k] >= 0)
+    here = structure.points[points].copy()
+    here[:, :2] = level.inverse().apply(here[:, :2])
+    here[:, 0] += camera.mount_forward
+    depths = here[:, 0] - camera.mount_forward
+    pixels = camera.project(here)
+    sigmas = np.hypot(_depth_sigmas(structure, k, points, camera), SCALE_SHARE * depths)
+    good = camera.contains(pixels, -min(camera.width, camera.height) / 4) & (sigmas < 2 * SCALE_SHARE * depths)
+    points, pixels, depths, sigmas = points[good], pixels[good], depths[good], sigmas[good]
+    features = structure.features[k, points]
+    landmarks = Landmarks(
+        pixels.astype(np.float32), codes[features], depths.astype(np.float32), sigmas.astype(np.float32)
+    )
+    seen = (structure.features[:, points] >= 0).mean(axis=0)
+    kept = choose(landmarks, worth(seen, features / len(codes)), camera)
+    landmarks, order = settle(landmarks.take(kept), camera)
+    return landmarks, points[kept[order]]
+
+
+def _depth_sigmas(structure: Structure, k: int, points: Array, camera: Camera) -> Array:
+    """(M,) m, standard deviations of points along the k-th axis, the cameras taken as true."""
+    toward = structure.points[points] - structure.centres[:, None]
+    seen = structure.features[:, points] >= 0
+    distance = np.linalg.norm(toward, axis=2)
+    rays = toward / distance[..., None]
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    weight = np.where(seen, (camera.fx / PIXEL_SIGMA / distance) ** 2, 0.0)
+    covariances = np.linalg.inv(np.einsum("kn,knij->nij", weight, across))
+    axis = structure.rotations[k][:, 2]
+    return np.asarray(np.sqrt(np.einsum("i,nij,j->n", axis, covariances, axis)), np.float64)
+
+
+def _spread(way: Pose2) -> PoseGaussian:
+    """A way with what nobody knows of its scale."""
+    return PoseGaussian(
+        way, np.diag([
+            (SCALE_SHARE * way.x) ** 2 + FLOOR[0] ** 2, (SCALE_SHARE * way.y) ** 2 + FLOOR[0] ** 2, FLOOR[1] ** 2,
+        ])  # fmt: skip
+    )
