@@ -24,6 +24,9 @@ UNMEASURED_SCALE = 0.2
 """Where no depth is known better than by this share, the scale is what is not known. Mapping keeps no depth that is
 known worse than to 0.25, and some of a drive's are always known much better."""
 
+HELD_TILT = 0.02
+"""rad; a camera whose scale nobody measured was held by hand, and neither level nor at its height."""
+
 LEAST_DEPTH_SHARE = 0.03
 """What a depth is off by alone, as a share of it, where what it shares with the others is taken apart: the
 uncertainty of both together is rounded to steps of 13 %."""
@@ -159,6 +162,8 @@ class Landmarks:
         covariances: Array = np.einsum("ni,nj,n->nij", ray, ray, variances)
         covariances[:, 1, 1] += (pixel_sigma * depth / camera.fx) ** 2
         covariances[:, 2, 2] += (pixel_sigma * depth / camera.fy) ** 2
+        if self.scale_share:
+            covariances[:, 2, 2] += (HELD_TILT * depth) ** 2
         return covariances
 
     def take(self, index: NDArray[Any]) -> Landmarks:

@@ -9,6 +9,7 @@ finds the scale by its wheels.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,8 @@ import numpy as np
 
 from agent.drivers.image_file import read_grey
 from agent.observation import RobotDescription
+from agent.sharing.journal import Journal
+from agent.sharing.replication import Replicator
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.camera import Camera
@@ -26,6 +29,8 @@ from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.recognising.selection import choose, worth
 from mapweave.structure_from_motion import PIXEL_SIGMA, Structure, reconstruct
+from wire.bus import Bus
+from wire.keys import Keys
 
 SCALE_SHARE = 0.3
 """By which the stated spacing may be off, as a share of it."""
@@ -83,6 +88,46 @@ def map_of_photographs(
         evidence = {"shared": float(len(shared))}
         changes.append(EdgePut(Edge(edge_id, *nodes, way, EdgeKind.MAPPED, shared, evidence)))
     return changes
+
+
+def send_map(
+    changes: Sequence[ChangeBody],
+    map_id: MapId,
+    journal: Path,
+    bus: Bus,
+    keys: Keys,
+    server: str,
+    patience: float,
+) -> bool:
+    """Give a map to a server as a robot does: from a journal that keeps what has not been taken.
+
+    Args:
+        changes: of the map, each once.
+        map_id: no map of this number may be in the journal.
+        journal: its file; made if there is none.
+        bus: to the fleet.
+        keys: of the fleet.
+        server: that shall have it.
+        patience: how long to wait for it, s.
+
+    Returns:
+        Whether the server has it all.
+
+    Raises:
+        MapweaveError: the journal cannot be used.
+    """
+    journal.parent.mkdir(parents=True, exist_ok=True)
+    disk = Journal(journal, map_id.agent)
+    try:
+        disk.open_map(map_id.epoch)
+        replicator = Replicator(bus, keys, disk, map_id, servers=(server,))
+        try:
+            replicator.submit(changes, time.time_ns())
+            return replicator.wait_acknowledged(patience)
+        finally:
+            replicator.close()
+    finally:
+        disk.close()
 
 
 def _level(structure: Structure, k: int) -> Pose2:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import gtsam
@@ -44,6 +44,12 @@ OVERLAP = 3
 LEAST_MATCHES = 15
 """That agree on one essential matrix; with fewer two photographs count as showing nothing in common."""
 
+BEGINNINGS = 5
+"""Pairs of photographs from which it is tried to begin."""
+
+LEAST_POINTS = 12
+"""Known points by which a camera is placed."""
+
 LEAST_PARALLAX = math.radians(1.0)
 """Angle between the rays to a point, rad; with less its depth is not known to a quarter."""
 
@@ -59,9 +65,9 @@ class Structure:
     """N points seen in K photographs, in a level frame with z up; its unit is the metre as far as known.
 
     Attributes:
-        rotations: (K, 3, 3) world_from_camera.
+        rotations: (K, 3, 3) world_from_camera; NaN where a camera has not been placed yet.
         centres: (K, 3) m, of the cameras.
-        points: (N, 3) m.
+        points: (N, 3) m; NaN where no two rays determine one.
         features: (K, N) int64, the feature of each photograph that shows the point, -1 where none does.
     """
 
@@ -70,13 +76,21 @@ class Structure:
     points: Array
     features: NDArray[np.int64]
 
+    @property
+    def placed(self) -> NDArray[np.bool_]:
+        """(K,) which cameras are placed."""
+        return np.isfinite(self.centres[:, 0])
+
 
 def reconstruct(views: Sequence[View], spacing: float) -> Structure:
-    """Find where photographs were taken.
+    """Find where photographs were taken: from the pair that fixes most points on, one photograph at a time.
 
     Args:
         views: of one camera, in the order in which they were taken.
         spacing: how far apart, on average, m: the scale, of which photographs tell nothing.
+
+    Returns:
+        All cameras, and the points that are determined.
 
     Raises:
         InvalidValue: fewer than two photographs, or two that follow each other and have nothing in common.
@@ -85,21 +99,89 @@ def reconstruct(views: Sequence[View], spacing: float) -> Structure:
         raise InvalidValue("two photographs are needed at least")
     relations = {}
     for i, j in itertools.combinations(range(len(views)), 2):
-        if j - i <= OVERLAP:
-            related = _relate(views[i], views[j])
-            if related is not None:
-                relations[i, j] = related
-            elif j == i + 1:
-                raise InvalidValue(
-                    f"photographs {i + 1} and {j + 1} do not show the same things: take one in between"
-                )
-    tracks = _tracks(views, {pair: related.pairs for pair, related in relations.items()})
-    rotations, centres = [CAMERA_FROM_LEVEL.T], [np.array([0.0, 0.0, views[0].camera.mount_height])]
-    for i in range(len(views) - 1):
-        step = relations[i, i + 1]
-        centres.append(centres[i] + spacing * rotations[i] @ step.direction)
-        rotations.append(rotations[i] @ step.rotation)
-    return _adjust(views, Structure(np.array(rotations), np.array(centres), np.zeros((0, 3)), tracks), spacing)
+        if j - i <= OVERLAP and (related := _relate(views[i], views[j])) is not None:
+            relations[i, j] = related
+    apart = next((i for i in range(len(views) - 1) if (i, i + 1) not in relations), None)
+    if apart is not None:
+        raise InvalidValue(
+            f"photographs {apart + 1} and {apart + 2} do not show the same things: take one in between"
+        )
+    features = _tracks(views, {pair: related.pairs for pair, related in relations.items()})
+    starts = [_start(views, features, pair, related, spacing) for pair, related in relations.items()]
+    starts.sort(key=lambda start: -int(np.isfinite(start.points[:, 0]).sum()))
+    # What two photographs show of one wall has two explanations (Longuet-Higgins 1986); only the right one
+    # goes with the others.
+    whole = [_grown(views, start, relations, spacing) for start in starts[:BEGINNINGS]]
+    best = max(whole, key=lambda one: int((_misses(views, one) < GATE_PX).sum()))
+    found = np.isfinite(best.points[:, 0])
+    return replace(best, points=best.points[found], features=best.features[:, found])
+
+
+def _grown(
+    views: Sequence[View], start: Structure, relations: dict[tuple[int, int], _Relation], spacing: float
+) -> Structure:
+    """All cameras, one after the other, from two on."""
+    structure = start
+    while not structure.placed.all():
+        structure = _triangulated(views, _extended(views, structure, relations))
+        structure = _triangulated(views, _bundled(views, structure, spacing, True))
+    refuted = ~(_misses(views, structure) < GATE_PX)
+    structure = replace(structure, features=np.where(refuted, -1, structure.features))
+    return _triangulated(views, _bundled(views, _triangulated(views, structure), spacing, False))
+
+
+def _start(
+    views: Sequence[View], features: NDArray[np.int64], pair: tuple[int, int], related: _Relation, spacing: float
+) -> Structure:
+    """Two cameras, level but for what they are tilted against each other, and the points that both show."""
+    (i, j), count = pair, len(views)
+    rotations, centres = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
+    rotations[i], centres[i] = CAMERA_FROM_LEVEL.T, (0.0, 0.0, views[0].camera.mount_height)
+    rotations[j] = rotations[i] @ related.rotation
+    centres[j] = centres[i] + (j - i) * spacing * rotations[i] @ related.direction
+    points = np.full((features.shape[1], 3), np.nan)
+    structure = _triangulated(views, Structure(rotations, centres, points, features))
+    bad = ~(np.nanmax(_misses(views, structure)[[i, j]], axis=0, initial=0.0) < GATE_PX)
+    return replace(structure, points=np.where(bad[:, None], np.nan, structure.points))
+
+
+def _extended(
+    views: Sequence[View], structure: Structure, relations: dict[tuple[int, int], _Relation]
+) -> Structure:
+    """One camera more beside those that are placed: by the points that it shows, or as far on as the last."""
+    placed = np.flatnonzero(structure.placed)
+    low, high = int(placed[0]), int(placed[-1])
+    known = (structure.features >= 0) & np.isfinite(structure.points[:, 0])
+    inner = [k for k in range(low, high) if k not in placed]
+    k = max(inner or [k for k in (low - 1, high + 1) if 0 <= k < len(views)], key=lambda one: int(known[one].sum()))
+    rotations, centres = structure.rotations.copy(), structure.centres.copy()
+    seen, camera = np.flatnonzero(known[k]), views[k].camera
+    pixels = views[k].pixels[structure.features[k, seen]].astype(np.float64)
+    cv2.setRNGSeed(0)
+    fits, inside = False, None
+    if len(seen) >= LEAST_POINTS:
+        fits, turn, shift, inside = cv2.solvePnPRansac(
+            structure.points[seen], pixels, _matrix(camera), None, reprojectionError=GATE_PX, flags=cv2.SOLVEPNP_SQPNP
+        )
+    if fits and inside is not None and len(inside) >= LEAST_POINTS:
+        rotations[k] = cv2.Rodrigues(turn)[0].T
+        centres[k] = -rotations[k] @ shift[:, 0]
+    else:
+        near = high if k > high else (low if k < low else k - 1)
+        step = relations[min(k, near), max(k, near)]
+        length = float(np.linalg.norm(centres[high] - centres[low])) / (high - low)
+        if k > near:
+            centres[k] = centres[near] + length * rotations[near] @ step.direction
+            rotations[k] = rotations[near] @ step.rotation
+        else:
+            rotations[k] = rotations[near] @ step.rotation.T
+            centres[k] = centres[near] - length * rotations[k] @ step.direction
+    return replace(structure, rotations=rotations, centres=centres)
+
+
+def _matrix(camera: Camera) -> Array:
+    """(3, 3) px, of a pinhole."""
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +197,7 @@ def _relate(first: View, second: View) -> _Relation | None:
     pairs = match(first.codes, second.codes)
     if len(pairs) < LEAST_MATCHES:
         return None
-    camera = first.camera
-    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    matrix = _matrix(first.camera)
     a = first.pixels[pairs[:, 0]].astype(np.float64)
     b = second.pixels[pairs[:, 1]].astype(np.float64)
     cv2.setRNGSeed(0)
@@ -157,21 +238,8 @@ def _tracks(
     return np.array(columns, np.int64).reshape(-1, len(views)).T
 
 
-def _adjust(views: Sequence[View], start: Structure, spacing: float) -> Structure:
-    """Bundle adjustment, twice: the second time without sightings that the first has refuted."""
-    structure = start
-    for robust in (True, False):
-        structure = _triangulated(views, structure)
-        structure = _bundled(views, structure, spacing, robust)
-        misses = _misses(views, structure)
-        with np.errstate(invalid="ignore"):
-            features = np.where(misses < GATE_PX, structure.features, -1)
-        structure = Structure(structure.rotations, structure.centres, structure.points, features)
-    return _triangulated(views, structure)
-
-
 def _rays(views: Sequence[View], structure: Structure) -> Array:
-    """(K, N, 3) unit vectors in world to where the photographs show the points; NaN where they do not."""
+    """(K, N, 3) unit vectors in world to where placed photographs show the points; NaN where they do not."""
     camera = views[0].camera
     rays = np.full((*structure.features.shape, 3), np.nan)
     for k, view in enumerate(views):
@@ -184,25 +252,26 @@ def _rays(views: Sequence[View], structure: Structure) -> Array:
 
 
 def _triangulated(views: Sequence[View], structure: Structure) -> Structure:
-    """With points where the rays meet best; those without parallax, or behind a camera, are left out."""
+    """With points where the rays meet best; NaN for those without parallax, or behind a camera."""
     rays = _rays(views, structure)
     seen = np.isfinite(rays[..., 0])
     filled = np.nan_to_num(rays)
     # Each ray r through c holds the point p to (1 - r r^T)(p - c) = 0.
     across = (np.eye(3) - filled[..., :, None] * filled[..., None, :]) * seen[..., None, None]
     normal = across.sum(axis=0) + 1e-9 * np.eye(3)
-    points = np.linalg.solve(normal, np.einsum("knij,kj->ni", across, structure.centres)[..., None])[..., 0]
-    toward = points - structure.centres[:, None]
+    centres = np.nan_to_num(structure.centres)
+    points = np.linalg.solve(normal, np.einsum("knij,kj->ni", across, centres)[..., None])[..., 0]
+    toward = points - centres[:, None]
     ahead = (np.einsum("kni,kni->kn", toward, filled) > 0.0) | ~seen
     cosine = np.einsum("kni,lni->nkl", filled, filled)
     both = seen.T[:, :, None] & seen.T[:, None, :]
     parallax = np.arccos(np.clip(np.where(both, cosine, 1.0).min(axis=(1, 2)), -1.0, 1.0))
     good = (seen.sum(axis=0) >= 2) & ahead.all(axis=0) & (parallax > LEAST_PARALLAX)
-    return Structure(structure.rotations, structure.centres, points[good], structure.features[:, good])
+    return replace(structure, points=np.where(good[:, None], points, np.nan))
 
 
 def _misses(views: Sequence[View], structure: Structure) -> Array:
-    """(K, N) px by which sightings miss their points; NaN where there are none."""
+    """(K, N) px by which sightings miss their points; NaN where there are none, or nothing is known."""
     camera = views[0].camera
     misses = np.full(structure.features.shape, np.nan)
     for k, view in enumerate(views):
@@ -226,25 +295,28 @@ def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust
     tilt, rise = TILT_SIGMA, HEIGHT_SHARE * camera.mount_height
     held = gtsam.noiseModel.Diagonal.Sigmas(np.array([tilt, FREE, tilt, FREE, rise, FREE]))
     first = gtsam.noiseModel.Diagonal.Sigmas(np.array([tilt, FIXED, tilt, FIXED, rise, FIXED]))
-    step = gtsam.noiseModel.Isotropic.Sigma(1, STEP_SHARE * spacing)
-    for k, (rotation, centre) in enumerate(zip(structure.rotations, structure.centres, strict=True)):
+    placed = np.flatnonzero(structure.placed).tolist()
+    for before, k in zip([None, *placed], placed, strict=False):
+        rotation, centre = structure.rotations[k], structure.centres[k]
         values.insert(pose(k), gtsam.Pose3(gtsam.Rot3(rotation), centre))
         yaw = math.atan2(rotation[1, 2], rotation[0, 2])
         level = gtsam.Rot3.Yaw(yaw).matrix() @ CAMERA_FROM_LEVEL.T
         place = np.array([centre[0], centre[1], camera.mount_height])
-        graph.add(gtsam.PriorFactorPose3(pose(k), gtsam.Pose3(gtsam.Rot3(level), place), held if k else first))
-        if k:
-            graph.add(gtsam.RangeFactorPose3(pose(k - 1), pose(k), spacing, step))
-    for n, place in enumerate(structure.points):
-        values.insert(point(n), place)
-        for k in np.flatnonzero(structure.features[:, n] >= 0).tolist():
+        graph.add(gtsam.PriorFactorPose3(pose(k), gtsam.Pose3(gtsam.Rot3(level), place), first if before is None else held))
+        if before is not None:
+            way = (k - before) * spacing
+            step = gtsam.noiseModel.Isotropic.Sigma(1, STEP_SHARE * way)
+            graph.add(gtsam.RangeFactorPose3(pose(before), pose(k), way, step))
+    known = np.flatnonzero(np.isfinite(structure.points[:, 0])).tolist()
+    for n in known:
+        values.insert(point(n), structure.points[n])
+        for k in np.flatnonzero(structure.placed & (structure.features[:, n] >= 0)).tolist():
             pixels = views[k].pixels[structure.features[k, n]].astype(np.float64)
             graph.add(gtsam.GenericProjectionFactorCal3_S2(pixels, pixel, pose(k), point(n), lens, False, False))
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    poses = [solved.atPose3(pose(k)) for k in range(len(views))]
-    return Structure(
-        np.array([one.rotation().matrix() for one in poses]),
-        np.array([one.translation() for one in poses]),
-        np.array([solved.atPoint3(point(n)) for n in range(len(structure.points))]).reshape(-1, 3),
-        structure.features,
-    )
+    rotations, centres, points = structure.rotations.copy(), structure.centres.copy(), structure.points.copy()
+    for k in placed:
+        rotations[k], centres[k] = solved.atPose3(pose(k)).rotation().matrix(), solved.atPose3(pose(k)).translation()
+    for n in known:
+        points[n] = solved.atPoint3(point(n))
+    return replace(structure, rotations=rotations, centres=centres, points=points)

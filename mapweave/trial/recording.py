@@ -119,6 +119,7 @@ class Recording:
         plan: of the world as it was in the end.
         merged: the server's merged map in the end.
         lost: in order.
+        photographed: where photographs that are nodes were really taken: `world_from_robot`.
         moments: what the scenario did, and what was noticed, in order.
         recoveries_s: wall seconds from the return of a network, server or agent until all was well again.
         sim_s: simulated time.
@@ -132,6 +133,7 @@ class Recording:
     plan: FloorPlan
     merged: MapFile
     lost: tuple[Lost, ...] = ()
+    photographed: Mapping[NodeId, Pose2] = field(default_factory=dict)
     moments: tuple[Moment, ...] = ()
     recoveries_s: tuple[float, ...] = ()
     sim_s: float = 0.0
