@@ -101,6 +101,7 @@ class Follower:
         self._hidden = 0.0
         self._confirmed = False
         self._looks: list[PoseGaussian] = []
+        self._rounds = 0
 
     @property
     def blocked(self) -> tuple[NodeId, NodeId]:
@@ -188,7 +189,8 @@ class Follower:
         """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
 
         A view from where the node's was taken shows its features at their own scale, so nothing tells better
-        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there.
+        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there,
+        or if it has been driven by such looks before and they cannot tell it from the goal.
         """
         if state != "arrived":
             self._confirmed, self._hidden, self._looks = False, 0.0, []
@@ -196,11 +198,12 @@ class Follower:
             self.progress = Progress.ARRIVED
         elif (localizer := self._look_at_goal(observation)) is not None:
             self._looks.append(localizer.pose)
-            # By bearings alone one look is as good as several: it goes on with all that was seen on the way.
-            if isinstance(localizer, BearingLocalizer) or len(self._looks) == self._settings.goal_looks:
-                if isinstance(localizer, Localizer):
-                    localizer.restart(averaged(self._looks))
+            if len(self._looks) == self._settings.goal_looks:
+                localizer.restart(averaged(self._looks))
                 self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
+                self._rounds += 1
+                if self._rounds > 1 and _indistinct(localizer.pose):
+                    self.progress = Progress.ARRIVED
         else:
             self._hidden += self._description.tick
             if self._hidden > self._settings.hidden:
@@ -269,6 +272,12 @@ class Follower:
 
     def _off_reference(self) -> float:
         return math.hypot(self.fix.node_from_robot.mean.x, self.fix.node_from_robot.mean.y)
+
+
+def _indistinct(goal_from_robot: PoseGaussian) -> bool:
+    """Whether a robot that stands at the goal could be seen there as likely: within two standard deviations."""
+    mean, sigmas = goal_from_robot.mean, 2.0 * np.sqrt(np.diag(goal_from_robot.covariance))
+    return bool(math.hypot(mean.x, mean.y) <= sigmas[:2].max() and abs(mean.heading) <= sigmas[2])
 
 
 def _lies_ahead(target_from_robot: Pose2) -> bool:

@@ -161,10 +161,11 @@ class Search:
             return Fix.of(
                 Localizer(self._description, self._lens, node, image, features, recognition, s.localizer)
             )
-        if told is None or told.certainty is not Certainty.FOUND:
+        if told is None or told.certainty not in (Certainty.FOUND, Certainty.PLACE):
             return None
         best = told.candidates[0]
-        if not self._exact(best.node_from_robot, leniency):
+        # How far away a photograph was taken shows on the way to it, not by looking again.
+        if best.distance_known and not self._exact(best.node_from_robot, leniency):
             self.detail += ", but not exactly enough"
             return None
         return Fix(best.node, best.node_from_robot)

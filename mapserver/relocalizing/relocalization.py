@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.node import Node, NodeId
-from hybridmap.query import RelocalizeAnswer, View
+from hybridmap.query import Certainty, RelocalizeAnswer, View
 from hybridmap.recognising.closer import look_closer
 from hybridmap.recognising.matching import match
 from hybridmap.recognising.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
@@ -145,7 +145,18 @@ class Relocalizer:
         best, *others = sorted(sightings, key=lambda one: (-one.recognition.inliers, one.node))
         best = self._closer(view, best)
         places = self.judge.places([best, *others, *self.doubled(view, best, ranked)])
-        return self.judge.answer(places, partial(self._counterpart, ranked=[node for node, _ in ranked]))
+        answer = self.judge.answer(places, partial(self._counterpart, ranked=[node for node, _ in ranked]))
+        return self._without_scale(answer)
+
+    def _without_scale(self, answer: RelocalizeAnswer) -> RelocalizeAnswer:
+        """The answer, with what it cannot tell by photographs: how far away from them the view was taken."""
+        nodes = [self._node_of(one.node) for one in answer.candidates]
+        known = [node is None or not node.landmarks.scale_share for node in nodes]
+        candidates = tuple(
+            replace(one, distance_known=measured) for one, measured in zip(answer.candidates, known, strict=True)
+        )
+        place = answer.certainty is Certainty.FOUND and not known[0]
+        return replace(answer, certainty=Certainty.PLACE if place else answer.certainty, candidates=candidates)
 
     def _counterpart(self, place: SeenPlace, ranked: Sequence[NodeId]) -> SeenPlace | None:
         """Where the robot may be as well, by what the surroundings of a place look like."""
