@@ -25,7 +25,7 @@ UNMEASURED_SCALE = 0.2
 known worse than to 0.25, and some of a drive's are always known much better."""
 
 HELD_TILT = 0.02
-"""rad; a camera whose scale nobody measured was held by hand, and neither level nor at its height."""
+"""rad; where nobody measured the scale the camera was held by hand, and neither level nor at its height."""
 
 LEAST_DEPTH_SHARE = 0.03
 """What a depth is off by alone, as a share of it, where what it shares with the others is taken apart: the
@@ -137,12 +137,17 @@ class Landmarks:
         least = float(shares.min(initial=math.inf))
         return least if UNMEASURED_SCALE <= least < math.inf else 0.0
 
+    @property
+    def tilt_sigma(self) -> float:
+        """By which the camera may have been off level, rad."""
+        return HELD_TILT if self.scale_share else 0.0
+
     def points_in_robot(self, camera: Camera) -> Array:
         """(N, 3) m, in the node's robot frame; NaN where there is no depth."""
         return camera.back_project(self.pixels, self.depths)
 
     def covariances_in_robot(
-        self, camera: Camera, pixel_sigma: float = 0.7, scale_share: float = 0.0
+        self, camera: Camera, pixel_sigma: float = 0.7, scale_share: float = 0.0, tilt_sigma: float = 0.0
     ) -> Array:
         """(N, 3, 3) m^2, in the node's robot frame, from the depth's and the pixel's uncertainty.
 
@@ -151,6 +156,7 @@ class Landmarks:
             pixel_sigma: standard deviation of a pixel, px.
             scale_share: what all depths are off by together, as a share of them, is not part of the result:
                 for estimators that account for it.
+            tilt_sigma: by which the camera may have been off level, rad.
         """
         x = (self.pixels[:, 0].astype(np.float64) - camera.cx) / camera.fx
         y = (self.pixels[:, 1].astype(np.float64) - camera.cy) / camera.fy
@@ -162,8 +168,7 @@ class Landmarks:
         covariances: Array = np.einsum("ni,nj,n->nij", ray, ray, variances)
         covariances[:, 1, 1] += (pixel_sigma * depth / camera.fx) ** 2
         covariances[:, 2, 2] += (pixel_sigma * depth / camera.fy) ** 2
-        if self.scale_share:
-            covariances[:, 2, 2] += (HELD_TILT * depth) ** 2
+        covariances[:, 2, 2] += (tilt_sigma * depth) ** 2
         return covariances
 
     def take(self, index: NDArray[Any]) -> Landmarks:

@@ -25,6 +25,7 @@ from hybridmap.recognising.bearing_recognition import (
 )
 from hybridmap.recognising.bearings import BearingFix
 from hybridmap.recognising.closer import look_closer
+from hybridmap.recognising.levelling import level
 from hybridmap.recognising.recognition import RecognitionSettings, recognise
 
 
@@ -127,10 +128,13 @@ class Lookout:
             if found is None or not self._plausible(found.node_from_robot.mean, one):
                 continue
             if found.inliers > s.more * one.tracked:
-                closer = look_closer(one.node, view, found, s.recognition.pose)
+                node, closer = one.node, look_closer(one.node, view, found, s.recognition.pose)
+                if node.landmarks.scale_share:
+                    levelled = level(node, view, found)
+                    node, closer = levelled.node, levelled.node_from_robot
                 found = replace(found, node_from_robot=closer)
                 return one.leg, Localizer(
-                    self._description, self._lens, one.node, image, features, found, s.localizer
+                    self._description, self._lens, node, image, features, found, s.localizer
                 )
         return None
 

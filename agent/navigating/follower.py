@@ -101,7 +101,6 @@ class Follower:
         self._hidden = 0.0
         self._confirmed = False
         self._looks: list[PoseGaussian] = []
-        self._rounds = 0
 
     @property
     def blocked(self) -> tuple[NodeId, NodeId]:
@@ -114,8 +113,6 @@ class Follower:
         s = self._settings
         self._tick += 1
         self.fix.follow(observation, self._description)
-        if self.fix.localizer is not None:
-            self._nodes[self._reference] = self.fix.localizer.node
         if self._tick % s.look_every == 0:
             self._look_for(self._ahead(), observation)
         self._pass_nodes()
@@ -189,8 +186,7 @@ class Follower:
         """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
 
         A view from where the node's was taken shows its features at their own scale, so nothing tells better
-        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there,
-        or if it has been driven by such looks before and they cannot tell it from the goal.
+        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there.
         """
         if state != "arrived":
             self._confirmed, self._hidden, self._looks = False, 0.0, []
@@ -201,9 +197,6 @@ class Follower:
             if len(self._looks) == self._settings.goal_looks:
                 localizer.restart(averaged(self._looks))
                 self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
-                self._rounds += 1
-                if self._rounds > 1 and _indistinct(localizer.pose):
-                    self.progress = Progress.ARRIVED
         else:
             self._hidden += self._description.tick
             if self._hidden > self._settings.hidden:
@@ -272,12 +265,6 @@ class Follower:
 
     def _off_reference(self) -> float:
         return math.hypot(self.fix.node_from_robot.mean.x, self.fix.node_from_robot.mean.y)
-
-
-def _indistinct(goal_from_robot: PoseGaussian) -> bool:
-    """Whether a robot that stands at the goal could be seen there as likely: within two standard deviations."""
-    mean, sigmas = goal_from_robot.mean, 2.0 * np.sqrt(np.diag(goal_from_robot.covariance))
-    return bool(math.hypot(mean.x, mean.y) <= sigmas[:2].max() and abs(mean.heading) <= sigmas[2])
 
 
 def _lies_ahead(target_from_robot: Pose2) -> bool:

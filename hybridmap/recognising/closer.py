@@ -55,13 +55,13 @@ def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSett
     landmarks, pixels = landmarks.take(known), pixels[known]
     points = landmarks.points_in_robot(node.camera)
     best, sigma = found.node_from_robot, pose.pixel_sigma
-    scale_share = node.landmarks.scale_share
+    scale_share, tilt_sigma = node.landmarks.scale_share, node.landmarks.tilt_sigma
     for _ in range(ROUNDS):
         fresh = min(max(_noise(points, pixels, view, best), LEAST_SIGMA), pose.pixel_sigma)
         if fresh > 0.95 * sigma:
             break
         sigma = fresh
-        covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share)
+        covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share, tilt_sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
         fix = refine(Stack.build([sightings]), best.mean, pose.scale_sigma, None, pose.rounds, SHIFT_SIGMA)
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:

@@ -260,12 +260,13 @@ def _sightings(
     scale_share: float,
 ) -> Sightings:
     """Points of the known side, pixels and depths of the seen side."""
+    tilt_sigma = known.tilt_sigma
     known, seen = known.take(pairs[:, 0]), seen.take(pairs[:, 1])
     return Sightings.build(
         known.points_in_robot(known_camera),
         seen.pixels,
         seen_camera,
-        covariances=known.covariances_in_robot(known_camera, s.pose.pixel_sigma, scale_share),
+        covariances=known.covariances_in_robot(known_camera, s.pose.pixel_sigma, scale_share, tilt_sigma),
         pixel_sigma=s.pose.pixel_sigma,
         depths=seen.depths,
         depth_sigmas=seen.depth_sigmas,
