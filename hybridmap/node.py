@@ -21,8 +21,8 @@ CODE_BYTES = 32
 """Length of a compact descriptor in memory, a byte for each coordinate (hybridmap.descriptor)."""
 
 UNMEASURED_SCALE = 0.2
-"""Where no depth is known better than by this share, the scale is what is not known. Mapping keeps no depth that is
-known worse than to 0.25, and some of a drive's are always known much better."""
+"""Where no depth is known better than by this share, the scale is what is not known. Mapping keeps no depth
+that is known worse than to 0.25, and some of a drive's are always known much better."""
 
 HELD_TILT = 0.02
 """rad; where nobody measured the scale the camera was held by hand, and neither level nor at its height."""
@@ -130,8 +130,8 @@ class Landmarks:
     def scale_share(self) -> float:
         """Share by which all depths may be off together, as they are where nobody has measured the scale.
 
-        A drive knows it by the wheels, so that some depths are known well. Photographs leave it open: there the best
-        known depth is as uncertain as the scale.
+        A drive knows it by the wheels, so that some depths are known well. Photographs leave it open: there
+        the best known depth is as uncertain as the scale.
         """
         shares = self.depth_sigmas[self.has_depth] / self.depths[self.has_depth]
         least = float(shares.min(initial=math.inf))

@@ -1,9 +1,9 @@
-"""A map from photographs alone: of a stretch, in order, by a calibrated camera that somebody carries.
+"""A map from photographs alone: of a stretch, in order, taken by hand with a calibrated camera.
 
-Each photograph becomes a node, with an edge to the next. Structure from motion gives the depths of their landmarks
-in proportion to each other. How large all of it is follows from the spacing that the photographer states, so
-every depth, and every way between nodes, carries the uncertainty of that statement. A robot that drives along
-finds the scale by its wheels.
+Each photograph becomes a node, with an edge to the next. Structure from motion gives the depths of their
+landmarks in proportion to each other. How large all of it is follows from the spacing that the photographer
+states, so each depth, and each way between nodes, carries the uncertainty of that statement. A robot that
+drives along finds the scale by its wheels.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.drivers.image_file import read_grey
 from agent.observation import RobotDescription
@@ -23,7 +24,7 @@ from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.camera import Camera
 from hybridmap.change import ChangeBody, EdgePut, NodePut
-from hybridmap.errors import DeviceError, InvalidValue
+from hybridmap.errors import InvalidValue
 from hybridmap.grid import settle
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
@@ -70,23 +71,24 @@ def map_of_photographs(
     structure = reconstruct(views, spacing)
     levels = [_level(structure, k) for k in range(len(views))]
     changes: list[ChangeBody] = []
-    seats = []
+    seats: list[NDArray[np.int64]] = []
+    ids = [NodeId(map_id.agent, map_id.epoch, number) for number in range(1, 2 * len(images))]
     for k, image in enumerate(images):
         landmarks, points = _landmarks(structure, k, levels[k], camera, views[k].codes)
         if len(landmarks) < LEAST_LANDMARKS:
             raise InvalidValue(f"{image}: only {len(landmarks)} points of it are in its neighbours too")
         seats.append(points)
-        way = levels[0].inverse() @ levels[k]
-        node_id = NodeId(map_id.agent, map_id.epoch, k + 1)
-        changes.append(NodePut(Node(node_id, k, _spread(way), camera, landmarks)))
+        map_from_robot = _uncertain(levels[0].inverse() @ levels[k])
+        changes.append(NodePut(Node(ids[k], k, map_from_robot, camera, landmarks)))
     for k in range(len(images) - 1):
         _, a, b = np.intersect1d(seats[k], seats[k + 1], return_indices=True)
-        nodes = [NodeId(map_id.agent, map_id.epoch, k + 1 + end) for end in (0, 1)]
-        edge_id = NodeId(map_id.agent, map_id.epoch, len(images) + k + 1)
-        way = _spread(levels[k].inverse() @ levels[k + 1])
         shared = np.stack([a, b], axis=1).astype(np.int64)
+        a_from_b = _uncertain(levels[k].inverse() @ levels[k + 1])
         evidence = {"shared": float(len(shared))}
-        changes.append(EdgePut(Edge(edge_id, *nodes, way, EdgeKind.MAPPED, shared, evidence)))
+        edge_id = ids[len(images) + k]
+        changes.append(
+            EdgePut(Edge(edge_id, ids[k], ids[k + 1], a_from_b, EdgeKind.MAPPED, shared, evidence))
+        )
     return changes
 
 
@@ -138,8 +140,8 @@ def _level(structure: Structure, k: int) -> Pose2:
 
 
 def _landmarks(
-    structure: Structure, k: int, level: Pose2, camera: Camera, codes: Array
-) -> tuple[Landmarks, Array]:
+    structure: Structure, k: int, level: Pose2, camera: Camera, codes: NDArray[np.uint8]
+) -> tuple[Landmarks, NDArray[np.int64]]:
     """What the k-th photograph shows, as a level camera at the stated height sees it; and which points."""
     points = np.flatnonzero(structure.features[k] >= 0)
     here = structure.points[points].copy()
@@ -148,7 +150,9 @@ def _landmarks(
     depths = here[:, 0] - camera.mount_forward
     pixels = camera.project(here)
     sigmas = np.hypot(_depth_sigmas(structure, k, points, camera), SCALE_SHARE * depths)
-    good = camera.contains(pixels, -min(camera.width, camera.height) / 4) & (sigmas < 2 * SCALE_SHARE * depths)
+    good = camera.contains(pixels, -min(camera.width, camera.height) / 4) & (
+        sigmas < 2 * SCALE_SHARE * depths
+    )
     points, pixels, depths, sigmas = points[good], pixels[good], depths[good], sigmas[good]
     features = structure.features[k, points]
     landmarks = Landmarks(
@@ -157,10 +161,10 @@ def _landmarks(
     seen = (structure.features[:, points] >= 0).mean(axis=0)
     kept = choose(landmarks, worth(seen, features / len(codes)), camera)
     landmarks, order = settle(landmarks.take(kept), camera)
-    return landmarks, points[kept[order]]
+    return landmarks, points[kept[order]].astype(np.int64)
 
 
-def _depth_sigmas(structure: Structure, k: int, points: Array, camera: Camera) -> Array:
+def _depth_sigmas(structure: Structure, k: int, points: NDArray[np.intp], camera: Camera) -> Array:
     """(M,) m, standard deviations of points along the k-th axis, the cameras taken as true."""
     toward = structure.points[points] - structure.centres[:, None]
     seen = structure.features[:, points] >= 0
@@ -173,10 +177,7 @@ def _depth_sigmas(structure: Structure, k: int, points: Array, camera: Camera) -
     return np.asarray(np.sqrt(np.einsum("i,nij,j->n", axis, covariances, axis)), np.float64)
 
 
-def _spread(way: Pose2) -> PoseGaussian:
+def _uncertain(way: Pose2) -> PoseGaussian:
     """A way with what nobody knows of its scale."""
-    return PoseGaussian(
-        way, np.diag([
-            (SCALE_SHARE * way.x) ** 2 + FLOOR[0] ** 2, (SCALE_SHARE * way.y) ** 2 + FLOOR[0] ** 2, FLOOR[1] ** 2,
-        ])  # fmt: skip
-    )
+    sigmas = [np.hypot(SCALE_SHARE * way.x, FLOOR[0]), np.hypot(SCALE_SHARE * way.y, FLOOR[0]), FLOOR[1]]
+    return PoseGaussian(way, np.diag(np.square(sigmas)))

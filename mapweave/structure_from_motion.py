@@ -1,8 +1,8 @@
 """Structure from motion: where an ordered set of photographs was taken, and what they show, up to scale.
 
-Two photographs give a rotation and a direction (Nister's five points); a walk through them with steps of about
-equal length is where bundle adjustment begins (Triggs et al. 2000, solved by GTSAM). What a person who takes
-photographs holds to softly is part of it: the camera about level, about at one height, the steps about equal.
+Two photographs give a rotation and a direction (Nister 2004, five points). Each further one is placed by the
+points that it shows (PnP), and bundle adjustment (Triggs et al. 2000, solved by GTSAM) follows. What a
+photographer holds to more or less is part of it: a level camera, one height, steps of one length.
 """
 
 from __future__ import annotations
@@ -131,7 +131,11 @@ def _grown(
 
 
 def _start(
-    views: Sequence[View], features: NDArray[np.int64], pair: tuple[int, int], related: _Relation, spacing: float
+    views: Sequence[View],
+    features: NDArray[np.int64],
+    pair: tuple[int, int],
+    related: _Relation,
+    spacing: float,
 ) -> Structure:
     """Two cameras, level but for what they are tilted against each other, and the points that both show."""
     (i, j), count = pair, len(views)
@@ -153,7 +157,10 @@ def _extended(
     low, high = int(placed[0]), int(placed[-1])
     known = (structure.features >= 0) & np.isfinite(structure.points[:, 0])
     inner = [k for k in range(low, high) if k not in placed]
-    k = max(inner or [k for k in (low - 1, high + 1) if 0 <= k < len(views)], key=lambda one: int(known[one].sum()))
+    k = max(
+        inner or [k for k in (low - 1, high + 1) if 0 <= k < len(views)],
+        key=lambda one: int(known[one].sum()),
+    )
     rotations, centres = structure.rotations.copy(), structure.centres.copy()
     seen, camera = np.flatnonzero(known[k]), views[k].camera
     pixels = views[k].pixels[structure.features[k, seen]].astype(np.float64)
@@ -161,7 +168,12 @@ def _extended(
     fits, inside = False, None
     if len(seen) >= LEAST_POINTS:
         fits, turn, shift, inside = cv2.solvePnPRansac(
-            structure.points[seen], pixels, _matrix(camera), None, reprojectionError=GATE_PX, flags=cv2.SOLVEPNP_SQPNP
+            structure.points[seen],
+            pixels,
+            _matrix(camera),
+            None,
+            reprojectionError=GATE_PX,
+            flags=cv2.SOLVEPNP_SQPNP,
         )
     if fits and inside is not None and len(inside) >= LEAST_POINTS:
         rotations[k] = cv2.Rodrigues(turn)[0].T
@@ -207,12 +219,11 @@ def _relate(first: View, second: View) -> _Relation | None:
     # x_second = R x_first + t.
     _, rotation, translation, _ = cv2.recoverPose(essential, a, b, matrix, mask=mask.copy())
     inside = mask[:, 0].astype(bool)
-    return _Relation(rotation.T, -rotation.T @ translation[:, 0], pairs[inside])
+    turn = np.asarray(rotation, np.float64).T
+    return _Relation(turn, -turn @ np.asarray(translation, np.float64)[:, 0], pairs[inside])
 
 
-def _tracks(
-    views: Sequence[View], matches: dict[tuple[int, int], NDArray[np.int64]]
-) -> NDArray[np.int64]:
+def _tracks(views: Sequence[View], matches: dict[tuple[int, int], NDArray[np.int64]]) -> NDArray[np.int64]:
     """(K, N) feature of each photograph that shows each point; what appears twice in one is left out."""
     starts = np.concatenate([[0], np.cumsum([len(view) for view in views])])
     parent = np.arange(starts[-1])
@@ -286,7 +297,7 @@ def _misses(views: Sequence[View], structure: Structure) -> Array:
 def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust: bool) -> Structure:
     camera: Camera = views[0].camera
     lens = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-    pixel = gtsam.noiseModel.Isotropic.Sigma(2, PIXEL_SIGMA)
+    pixel: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, PIXEL_SIGMA)
     if robust:
         pixel = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), pixel)
     pose, point = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
@@ -302,7 +313,11 @@ def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust
         yaw = math.atan2(rotation[1, 2], rotation[0, 2])
         level = gtsam.Rot3.Yaw(yaw).matrix() @ CAMERA_FROM_LEVEL.T
         place = np.array([centre[0], centre[1], camera.mount_height])
-        graph.add(gtsam.PriorFactorPose3(pose(k), gtsam.Pose3(gtsam.Rot3(level), place), first if before is None else held))
+        graph.add(
+            gtsam.PriorFactorPose3(
+                pose(k), gtsam.Pose3(gtsam.Rot3(level), place), first if before is None else held
+            )
+        )
         if before is not None:
             way = (k - before) * spacing
             step = gtsam.noiseModel.Isotropic.Sigma(1, STEP_SHARE * way)
@@ -312,11 +327,16 @@ def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust
         values.insert(point(n), structure.points[n])
         for k in np.flatnonzero(structure.placed & (structure.features[:, n] >= 0)).tolist():
             pixels = views[k].pixels[structure.features[k, n]].astype(np.float64)
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(pixels, pixel, pose(k), point(n), lens, False, False))
+            graph.add(
+                gtsam.GenericProjectionFactorCal3_S2(pixels, pixel, pose(k), point(n), lens, False, False)
+            )
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     rotations, centres, points = structure.rotations.copy(), structure.centres.copy(), structure.points.copy()
     for k in placed:
-        rotations[k], centres[k] = solved.atPose3(pose(k)).rotation().matrix(), solved.atPose3(pose(k)).translation()
+        rotations[k], centres[k] = (
+            solved.atPose3(pose(k)).rotation().matrix(),
+            solved.atPose3(pose(k)).translation(),
+        )
     for n in known:
         points[n] = solved.atPoint3(point(n))
     return replace(structure, rotations=rotations, centres=centres, points=points)

@@ -25,8 +25,8 @@ CORNER = math.radians(35.0)
 TRIES = 4000
 
 ASIDE, YAW, TILT, RISE, STEP = 0.03, math.radians(3.0), math.radians(1.5), 0.02, 0.2
-"""Standard deviations of a camera in the hand: m beside the way, rad to the side, rad of pitch and of roll, m above or
-below its height; and by which share of it a step is longer or shorter at most."""
+"""Standard deviations of a camera in the hand: m beside the way, rad to the side, rad of pitch and of roll, m
+above or below its height; and by which share of it a step is longer or shorter at most."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,7 +116,7 @@ class NodeState:
         )
 
     def of_unknown_scale(self, share: float) -> NodeState:
-        """The state where all lengths in it may be off together by a share: positions by s, inverse depths by -s."""
+        """The state where all lengths may be off together by a share: positions by it, inverse depths by less it."""
         change = np.zeros(len(self.covariance))
         change[:2] = share * self.posture[:2]
         change[5::3] = -share * self.rays[:, 2]

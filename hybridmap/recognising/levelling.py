@@ -1,8 +1,8 @@
 """A photograph taken by hand, brought to level by a robot that sees the same.
 
-A camera in the hand is off level and off its height by amounts that nobody knows, and all that it shows is off by
-them alike. A robot's camera is level and at its height. So the photograph's pitch, roll and rise are found
-together with the robot's posture, by Gauss-Newton on the landmarks that were recognised.
+A camera in the hand is off level and off its height by amounts that nobody knows, and all that it shows is
+off by them alike. A robot's camera is level and at its height. So the photograph's pitch, roll and rise are
+found together with the robot's posture, by Gauss-Newton on the landmarks that were recognised.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TILT_SIGMA, RISE_SIGMA = math.radians(2.0), 0.05
 """By which a camera in the hand is off level, rad, and off its height, m."""
 
 LEAST_PX, USUAL_PX = 0.3, 1.0
-"""What a pixel is off by at least, though the pixels themselves show how much; and by which fits are compared."""
+"""What a pixel is off by at least, though the pixels show how much; and what fits are compared with."""
 
 MAD_TO_SIGMA = 1.4826
 """A Gaussian's standard deviation over the median of its absolute values."""
@@ -102,7 +102,9 @@ def _fit(start: Array, pixels: Array, expected: Callable[[Array, float], Array])
     state, information, cost = np.append(start, np.zeros(3)), prior, math.inf
     for _ in range(ROUNDS):
         now = expected(state, 0.0)
-        by_state = np.stack([(expected(state + step, 0.0) - now) / STEP for step in STEP * np.eye(6)], axis=-1)
+        by_state = np.stack(
+            [(expected(state + step, 0.0) - now) / STEP for step in STEP * np.eye(6)], axis=-1
+        )
         misses = pixels - now
         finite = np.isfinite(misses).all(axis=1) & np.isfinite(by_state).all(axis=(1, 2))
         if not finite.any():
@@ -110,9 +112,11 @@ def _fit(start: Array, pixels: Array, expected: Callable[[Array, float], Array])
         sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(misses[finite]))), LEAST_PX)
         # What a depth is off by alone moves its landmark by the parallax between the two cameras.
         extra = np.square(np.nan_to_num(expected(state, LEAST_DEPTH_SHARE) - now))
-        squares = np.square(np.where(finite[:, None], misses, np.inf))
-        cost = float(np.minimum(squares / (USUAL_PX**2 + extra), GATE**2).sum()) + float(state @ prior @ state)
-        good = (squares < GATE**2 * (sigma**2 + extra)).all(axis=1)
+        squares: Array = np.square(np.where(finite[:, None], misses, np.inf))
+        cost = float(np.minimum(squares / (USUAL_PX**2 + extra), GATE**2).sum()) + float(
+            state @ prior @ state
+        )
+        good = np.flatnonzero((squares < GATE**2 * (sigma**2 + extra)).all(axis=1))
         weighed = by_state[good] / (sigma**2 + extra[good])[..., None]
         information = prior + np.einsum("nki,nkj->ij", weighed, by_state[good])
         if np.linalg.cond(information) > 1e12:

@@ -71,7 +71,7 @@ class Send:
 
 @dataclass(frozen=True)
 class Photograph:
-    """Somebody maps a free way, chosen from the seed, by photographs; a robot is put down where the first was taken.
+    """A free way, chosen from the seed, is mapped by photographs; a robot is put down where it begins.
 
     Attributes:
         robot: name.

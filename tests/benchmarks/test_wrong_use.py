@@ -18,8 +18,6 @@ SEEDED = sorted(
 """Those that people start, with a seed."""
 WRONG = [
     *((name, ["--seed", "-1"]) for name in SEEDED),
-    ("appearance", ["--trials", "0"]),
-    ("appearance", ["--jobs", "0"]),
     ("ekf", ["--runs", "0"]),
     ("explore", ["--robots", "0"]),
     ("fit_belief", ["--seeds", "-1"]),

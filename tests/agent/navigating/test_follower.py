@@ -11,9 +11,9 @@ from agent.navigating.detour import Detour
 from agent.navigating.follower import Follower, Progress
 from agent.navigating.follower_settings import FollowerSettings
 from agent.navigating.headway import Headway
-from agent.navigating.node_servo import NodeServo
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.servo.step import ServoStep
+from agent.servo.supervisor import Servo
 from agent.vision.lens import Lens
 from agent.vision.sift import Sift
 from hybridmap.camera import Camera
@@ -110,11 +110,7 @@ def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypat
     """It once stood before an obstacle for as long as anybody had patience, and the drive around had none."""
     standing = ServoStep(Command(), "driving", None, "standing still to think the way over", 9)
 
-    def stand(servo: NodeServo, leg: int, *_: object) -> ServoStep:
-        servo.leg = leg
-        return standing
-
-    monkeypatch.setattr(NodeServo, "command", stand)
+    monkeypatch.setattr(Servo, "command", lambda *_: standing)
     follower = follower_at_the_goal(node)
     follower.fix.localizer.pose = PoseGaussian.from_sigmas(Pose2(-1.0, 0.0, 0.0), 0.002, 0.001)
     dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
