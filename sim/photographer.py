@@ -90,6 +90,9 @@ def _way(plan: FloorPlan, length: float, rng: np.random.Generator) -> _Way:
         x, y = points[rng.integers(len(points))].tolist()
         start = Pose2(x, y, float(rng.uniform(-math.pi, math.pi)))
         way = _Way(start, 0.5 * length, float(rng.uniform(-CORNER, CORNER)))
+        end = way.at(longest)
+        if not plan.is_free(end.x, end.y, CLEARANCE):
+            continue
         along = [way.at(gone) for gone in np.arange(0.0, longest + VIEW, 0.05).tolist()]
         clearances = plan.clearances(np.array([[place.x, place.y] for place in along]))
         walked = round(longest / 0.05)

@@ -116,7 +116,7 @@ class NodeState:
         )
 
     def of_unknown_scale(self, share: float) -> NodeState:
-        """The state where all lengths may be off together by a share: positions by it, inverse depths by less it."""
+        """The state where all lengths may be off together by a share of them."""
         change = np.zeros(len(self.covariance))
         change[:2] = share * self.posture[:2]
         change[5::3] = -share * self.rays[:, 2]

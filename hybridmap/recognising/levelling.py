@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.node import LEAST_DEPTH_SHARE, Landmarks, Node
@@ -106,16 +107,16 @@ def _fit(start: Array, pixels: Array, expected: Callable[[Array, float], Array])
             [(expected(state + step, 0.0) - now) / STEP for step in STEP * np.eye(6)], axis=-1
         )
         misses = pixels - now
-        finite = np.isfinite(misses).all(axis=1) & np.isfinite(by_state).all(axis=(1, 2))
+        finite: NDArray[np.bool_] = np.isfinite(np.column_stack([misses, by_state.reshape(-1, 12)]))
+        finite = np.asarray(finite.all(axis=1))
         if not finite.any():
             return None
         sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(misses[finite]))), LEAST_PX)
         # What a depth is off by alone moves its landmark by the parallax between the two cameras.
         extra = np.square(np.nan_to_num(expected(state, LEAST_DEPTH_SHARE) - now))
-        squares: Array = np.square(np.where(finite[:, None], misses, np.inf))
-        cost = float(np.minimum(squares / (USUAL_PX**2 + extra), GATE**2).sum()) + float(
-            state @ prior @ state
-        )
+        squares = np.where(finite[:, None], np.square(np.nan_to_num(misses)), np.inf)
+        gated = np.minimum(squares / (USUAL_PX**2 + extra), GATE**2)
+        cost = float(gated.sum() + state @ prior @ state)
         good = np.flatnonzero((squares < GATE**2 * (sigma**2 + extra)).all(axis=1))
         weighed = by_state[good] / (sigma**2 + extra[good])[..., None]
         information = prior + np.einsum("nki,nkj->ij", weighed, by_state[good])

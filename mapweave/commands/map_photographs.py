@@ -18,7 +18,7 @@ def add_to(actions: Any) -> None:
         help="make a map of photographs of a stretch",
         description="Make a map of photographs that were taken one after the other along a stretch, by a "
         "calibrated camera held about level. Each becomes a node that robots can be sent to. With --send the "
-        "map is handed over to a running server; what the server does not take stays in a journal beside OUT.",
+        "map is handed over to a running server, through a journal beside OUT as a robot does.",
     )
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="images, in the order of their numbers")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the .mapweave file")
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
             journal = arguments.out.with_suffix(".sqlite")
             if not send_map(changes, map_id, journal, bus, keys, network.server, arguments.patience):
                 where = ", ".join(network.endpoints)
-                raise NotConnected(f"no server {network.server} at {where} took the map: it is in {journal}")
+                raise NotConnected(f"no server {network.server} at {where} took the map: see {journal}")
         finally:
             bus.close()
     if arguments.json:
