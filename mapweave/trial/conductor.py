@@ -174,8 +174,11 @@ class Conductor:
             case actions.Abduct(robot):
                 self._abduct(robot)
             case actions.Send(robot, goal):
-                last = next(reversed(self.photographed), None) if goal == "photographed" else None
-                self._losing.send(robot, goal if last is None else str(last))
+                if goal == "photographed":
+                    if not self.photographed:
+                        raise InvalidValue("goto: goal = 'photographed', and nothing was photographed before")
+                    goal = str(next(reversed(self.photographed)))
+                self._losing.send(robot, goal)
             case actions.Photograph(robot):
                 self.photographed |= photograph(self._stage, fleet, action)
                 first = next(pose for node, pose in self.photographed.items() if node.agent == action.name)

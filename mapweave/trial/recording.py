@@ -119,12 +119,12 @@ class Recording:
         plan: of the world as it was in the end.
         merged: the server's merged map in the end.
         lost: in order.
-        photographed: where photographs that are nodes were really taken: `world_from_robot`.
         moments: what the scenario did, and what was noticed, in order.
         recoveries_s: wall seconds from the return of a network, server or agent until all was well again.
         sim_s: simulated time.
         wall_s: how long that took.
         wall: s by part, as far as known.
+        photographed: where photographs that are nodes were really taken: `world_from_robot`.
     """
 
     scenario: str
@@ -133,9 +133,9 @@ class Recording:
     plan: FloorPlan
     merged: MapFile
     lost: tuple[Lost, ...] = ()
-    photographed: Mapping[NodeId, Pose2] = field(default_factory=dict)
     moments: tuple[Moment, ...] = ()
     recoveries_s: tuple[float, ...] = ()
     sim_s: float = 0.0
     wall_s: float = 0.0
     wall: Mapping[str, float] = field(default_factory=dict)
+    photographed: Mapping[NodeId, Pose2] = field(default_factory=dict)

@@ -21,6 +21,7 @@ from hybridmap.node import Node
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteLeg
 from hybridmap.recognising.recognition import recognise
+from tests.hand_held import photograph
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
@@ -65,6 +66,31 @@ def test_slid_tracks_do_not_park_the_robot_beside_the_goal(walls, node, begin):
         pose = pose @ odometry.motion()
     assert follower.progress is Progress.ARRIVED
     assert pose.distance(Pose2()) < 0.01
+    assert abs(pose.heading) < np.radians(1.0)
+
+
+@pytest.mark.parametrize(("scale", "pitch", "roll"), [(1.25, 0.02, -0.015), (0.8, -0.02, 0.01)])
+def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch, roll):
+    """Tilted, and of a scale that is off by a quarter: the robot has only the photograph to go by."""
+    held = photograph(node, scale, pitch, roll)
+    pose, lens = Pose2(-0.7, 0.12, -0.1), Lens(ROBOT)
+    lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
+    believed = Pose2(scale * pose.x, scale * pose.y, pose.heading)
+    found = lookout.find(walls.render(pose), [Expected(0, held, believed)])
+    assert found is not None
+    rng, route = np.random.default_rng(0), (RouteLeg(held, HERE, None),)
+    follower = Follower(
+        ROBOT, lens, Sift(lens), route, Fix.of(found[1]), Detour(ROBOT), FollowerSettings(), rng
+    )
+    odometry = Odometry(0.0, 0.0)
+    for tick in range(400):
+        command = follower.step(Observation(tick * 100_000_000, odometry, walls.render(pose)))
+        if follower.progress is Progress.ARRIVED:
+            break
+        odometry = Odometry(command.forward * ROBOT.tick, command.turn * ROBOT.tick)
+        pose = pose @ odometry.motion()
+    assert follower.progress is Progress.ARRIVED
+    assert pose.distance(Pose2()) < 0.02
     assert abs(pose.heading) < np.radians(1.0)
 
 
