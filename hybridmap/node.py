@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,7 +127,7 @@ class Landmarks:
         """(N,) which landmarks have a 3D position."""
         return np.isfinite(self.depths)
 
-    @property
+    @cached_property
     def scale_share(self) -> float:
         """Share by which all depths may be off together, as they are where nobody has measured the scale.
 
