@@ -126,6 +126,7 @@ class Localizer:
 
     def _filter_at(self, pose: PoseGaussian, landmarks: NDArray[np.int64]) -> LocalizationFilter:
         node, description = self.node, self._description
+        scale_share = node.landmarks.scale_share
         return LocalizationFilter(
             description.camera,
             description.axle,
@@ -133,7 +134,8 @@ class Localizer:
             pose,
             landmarks,
             node.points_in_robot[landmarks],
-            node.landmarks.covariances_in_robot(node.camera)[landmarks],
+            node.landmarks.covariances_in_robot(node.camera, scale_share=scale_share)[landmarks],
+            scale_share,
             settings=replace(self._settings.filter, side_slip=description.side_slip),
         )
 

@@ -15,7 +15,7 @@ from hybridmap.pose import Array, PoseGaussian
 from hybridmap.query import View
 from hybridmap.recognising.planar_pose import PlanarPoseSettings
 from hybridmap.recognising.pose_refinement import refine, stack_sightings
-from hybridmap.recognising.recognition import Recognition
+from hybridmap.recognising.recognition import Recognition, of_unknown_scale
 from hybridmap.recognising.sightings import Sightings
 
 LEAST_SIGMA, ROUNDS = 0.1, 3
@@ -55,19 +55,20 @@ def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSett
     landmarks, pixels = landmarks.take(known), pixels[known]
     points = landmarks.points_in_robot(node.camera)
     best, sigma = found.node_from_robot, pose.pixel_sigma
+    scale_share, tilt_sigma = node.landmarks.scale_share, node.landmarks.tilt_sigma
     for _ in range(ROUNDS):
         fresh = min(max(_noise(points, pixels, view, best), LEAST_SIGMA), pose.pixel_sigma)
         if fresh > 0.95 * sigma:
             break
         sigma = fresh
-        covariances = landmarks.covariances_in_robot(node.camera, sigma)
+        covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share, tilt_sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
         fix = refine(
             stack_sightings([sightings]), best.mean, pose.scale_sigma, None, pose.rounds, SHIFT_SIGMA
         )
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
             break
-        best = fix.node_from_robot
+        best = of_unknown_scale(fix.node_from_robot, scale_share, node.camera, view.camera)
     return best
 
 

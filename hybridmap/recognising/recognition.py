@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.node import Landmarks, Node
-from hybridmap.pose import PoseGaussian
+from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import View
 from hybridmap.recognising.evidence import GRID, depth_agreement, gather
 from hybridmap.recognising.matching import MatchSettings, match
@@ -211,9 +211,12 @@ def _examine(
         many = "1 feature matches" if len(pairs) == 1 else f"{len(pairs)} features match"
         words = f"{many}, {len(usable)} with a depth; {s.least_inliers} are needed"
         return Refusal(words, len(pairs))
+    # A view has no depths that could contradict the scale of the node's: then it is not part of each of them.
+    measured = bool(b.has_depth.any())
+    scale_share = 0.0 if measured else a.scale_share
     sightings = [
-        _sightings(a, camera_a, b, camera_b, pairs[forward], s, inverted=False),
-        _sightings(b, camera_b, a, camera_a, pairs[backward][:, ::-1], s, inverted=True),
+        _sightings(a, camera_a, b, camera_b, pairs[forward], s, False, scale_share),
+        _sightings(b, camera_b, a, camera_a, pairs[backward][:, ::-1], s, True, 0.0),
     ]
     fix = solve_sightings(sightings, rng=rng, settings=s.pose)
     if fix is None:
@@ -225,7 +228,25 @@ def _examine(
     reason = _objection(evidence, s)
     if reason:
         return Refusal(reason, len(pairs), inliers, fix.node_from_robot, evidence)
-    return Recognition(fix.node_from_robot, inliers, len(pairs), len(usable), fix, evidence)
+    unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
+    posture = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
+    return Recognition(posture, inliers, len(pairs), len(usable), fix, evidence)
+
+
+def of_unknown_scale(posture: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:
+    """A posture that may be too far away, or too near, by a share of the way between the two cameras.
+
+    Args:
+        posture: node_from_robot.
+        share: Landmarks.scale_share.
+        of_node: camera that took the node.
+        of_view: the robot's.
+    """
+    if not share:
+        return posture
+    camera = (posture.mean @ Pose2(of_view.mount_forward)).vector[:2] - [of_node.mount_forward, 0.0]
+    change = np.append(share * (posture.mean.rotation.T @ camera), 0.0)
+    return PoseGaussian(posture.mean, posture.covariance + np.outer(change, change))
 
 
 def _sightings(
@@ -236,14 +257,16 @@ def _sightings(
     pairs: NDArray[Any],
     s: RecognitionSettings,
     inverted: bool,
+    scale_share: float,
 ) -> Sightings:
     """Points of the known side, pixels and depths of the seen side."""
+    tilt_sigma = known.tilt_sigma
     known, seen = known.take(pairs[:, 0]), seen.take(pairs[:, 1])
     return Sightings.build(
         known.points_in_robot(known_camera),
         seen.pixels,
         seen_camera,
-        covariances=known.covariances_in_robot(known_camera, s.pose.pixel_sigma),
+        covariances=known.covariances_in_robot(known_camera, s.pose.pixel_sigma, scale_share, tilt_sigma),
         pixel_sigma=s.pose.pixel_sigma,
         depths=seen.depths,
         depth_sigmas=seen.depth_sigmas,

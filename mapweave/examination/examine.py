@@ -115,12 +115,12 @@ def _examine_photographs(
     places = AppearanceMap(camera, distortion)
     for number, image in track(list(photographs.places.items()), "first pass", console=console):
         places.add(number, image)
-    verdicts: dict[str, list[Verdict]] = {}
-    for number, image in track(list(photographs.questions.items()), "questions", console=console):
-        for name, verdict in places.ask(number, image, photographs.references[number]):
-            verdicts.setdefault(name, []).append(verdict)
+    verdicts = [
+        places.ask(number, image, photographs.references[number])
+        for number, image in track(list(photographs.questions.items()), "questions", console=console)
+    ]
     about = {"folder": folder.name, "nodes": len(photographs.places), "focal_px": camera.fx}
-    return Examination(about, verdicts)
+    return Examination(about, {"looks": verdicts})
 
 
 def _camera_of(

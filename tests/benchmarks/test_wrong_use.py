@@ -15,8 +15,6 @@ SEEDED = [name for name in NAMES if 'add_argument("--seed"' in (FOLDER / name / 
 """Those that people start, with a seed."""
 WRONG = [
     *((name, ["--seed", "-1"]) for name in SEEDED),
-    ("appearance", ["--trials", "0"]),
-    ("appearance", ["--jobs", "0"]),
     ("ekf", ["--runs", "0"]),
     ("explore", ["--robots", "0"]),
     ("fit_belief", ["--seeds", "-1"]),

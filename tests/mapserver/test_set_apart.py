@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 import merge.belief.memory
-from synthetic.world import World, room, take_map, take_view
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
@@ -32,6 +31,7 @@ from mapserver.merging.merger import Merger
 from mapserver.server import MapServer
 from mapserver.upkeep import Upkeep
 from merge.graph.merged import MergedMap
+from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.contents import content
 from tests.waiting import eventually
 from wire.bus import Reply, Request
