@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from hybridmap.node import Node, NodeId
@@ -12,7 +12,7 @@ from merge.graph.merged import MergedMap
 
 
 class LivingPlaces:
-    """The place index without superseded nodes and retired maps, and nodes without what has faded.
+    """The place index without superseded nodes, retired maps and misplaced nodes, and nodes without what has faded.
 
     It stands for one merged map; make another for the next. New nodes are compared with all of the index.
     """
@@ -30,7 +30,8 @@ class LivingPlaces:
         self._index, self._node_of, self._merged = index, node_of, merged
         self._retired = frozenset(merged.rulings.retired)
         retired = (node for one in self._retired if one in merged.maps for node in merged.maps[one].nodes)
-        self._hidden = frozenset((*merged.superseded, *retired))
+        self._gone = frozenset((*retired, *_misplaced(merged)))
+        self._hidden = self._gone.union(merged.superseded)
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
         """At most k living nodes with how much they look like a view, best first."""
@@ -39,9 +40,24 @@ class LivingPlaces:
         return [(node, score) for node, score in ranked if node.map not in self._retired]
 
     def node(self, node_id: NodeId) -> Node | None:
-        """A node with the landmarks that are thought to be there; None if it is gone."""
+        """A node with the landmarks that are thought to be there; None if it is gone, or nothing is told of it."""
+        if node_id in self._gone or node_id.map in self._retired:
+            return None
         known = self._node_of(node_id)
         return None if known is None else without_faded(known, self._merged)
+
+
+def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
+    """Nodes of maps with wrong geometry that show places of other maps.
+
+    Each is the same place as the node that it is linked to, seen by a robot that has it elsewhere: no second place
+    that a robot could be at. What such a map knows alone is told as before.
+    """
+    for refusal in merged.refused if merged.wrong else ():
+        if refusal.link is not None and not refusal.link.within:
+            ends = [node for node in refusal.pair if node.map in merged.wrong]
+            if len(ends) == 1:
+                yield ends[0]
 
 
 def without_faded(node: Node, merged: MergedMap) -> Node:

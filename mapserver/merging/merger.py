@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
@@ -18,8 +18,9 @@ from mapserver.merging.succession import Succession
 from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.lookalikes import LookAlikes
 from merge.graph.candidates import CandidateSettings, Pair
-from merge.graph.links import Link
-from merge.graph.merged import MergedMap
+from merge.belief.contradiction import Contradictions, MapPair
+from merge.graph.links import Link, RefusedLink, refuse
+from merge.graph.merged import MergedMap, WrongGeometry
 from merge.graph.verification import VerificationSettings, verify
 from merge.incremental.islands import Islands
 from merge.incremental.pairs import PairTable
@@ -79,6 +80,10 @@ class Merger:
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._verdicts = Verdicts()
         self._islands = Islands(self.settings.merging)
+        merging = self.settings.merging
+        self._contradictions = Contradictions(merging.consistency, merging.strain)
+        self._wrong: dict[MapId, WrongGeometry] = {}
+        self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
         self._changed: set[MapId] = set()
@@ -173,6 +178,7 @@ class Merger:
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others."""
         self._rulings = rulings
+        self._stale |= self._verdicts.at(self.maps.keys())
         self._dirty = True
 
     def merged(self) -> MergedMap:
@@ -184,24 +190,50 @@ class Merger:
             self._verify(pair for pair in changed if pair in self._pairs)
             for pair in changed:
                 self._touched |= {pair[0].map, pair[1].map}
+                self._stale.add((pair[0].map, pair[1].map))
                 if pair in self._pairs and pair[1] in self._known.get(pair[0], {}):
-                    self._verdicts.put(pair, self._known[pair[0]][pair[1]])
+                    self._verdicts.put(pair, self._told(self._known[pair[0]][pair[1]]))
                 else:
                     self._verdicts.drop(pair)
             for map_id in self._changed:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+            self._find_wrong_geometry()
             merged = self._islands.merge(
                 self._kept, self._verdicts, self._touched, self._rulings, self._succession.past
             )
             renewed = self._renewer.renewed(merged)
             self._succession.follow(renewed.superseded)
-            self._merged = self._fader.fade(renewed)
+            self._merged = replace(self._fader.fade(renewed), wrong=self._wrong)
             self.counters.merges += 1
             self._touched, self._changed = set(), set()
             self._dirty = False
         return self._merged
+
+    def _find_wrong_geometry(self) -> None:
+        """Maps that contradict others that agree are merged with nobody."""
+        self._stale |= self._verdicts.at(self._changed)
+        before, retired = self._wrong, self._rulings.retired
+        self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, retired.keys())
+        self._stale = set()
+        differ = {which for which, _ in before.items() ^ self._wrong.items()}
+        for maps in self._verdicts.at(differ):
+            self._touched |= {*maps}
+            for pair in list(self._verdicts.between(maps)):
+                self._verdicts.put(pair, self._told(self._known[pair[0]][pair[1]]))
+
+    def _links(self, maps: MapPair) -> list[Link]:
+        """The links between two maps that people have not ruled out, also those of maps with wrong geometry."""
+        known = (self._known[a][b] for a, b in self._verdicts.between(maps))
+        return [v for v in known if isinstance(v, Link) and self._rulings.against(*v.pair) is None]
+
+    def _told(self, verdict: Verdict) -> Verdict:
+        """A verdict, or why it does not count."""
+        if isinstance(verdict, RefusedLink) or verdict.within:
+            return verdict
+        wrong = self._wrong.get(verdict.a.map) or self._wrong.get(verdict.b.map)
+        return verdict if wrong is None else refuse(verdict, wrong.reason)
 
     def again(self) -> Callable[[], None] | None:
         """What should be decided again as a whole, by any thread; the next merge takes it up."""

@@ -87,6 +87,24 @@ class Postures(Mapping[NodeId, Placement]):
         return sum(len(graph.nodes) for graph in self._graphs)
 
 
+class WrongGeometry(NamedTuple):
+    """A map that contradicts others, see merge.belief.contradiction.
+
+    Attributes:
+        which: the map.
+        agreeing: maps that agree with each other and not with it, at least two.
+    """
+
+    which: MapId
+    agreeing: tuple[MapId, ...]
+
+    @property
+    def reason(self) -> str:
+        """For example `map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong`."""
+        *most, last = map(str, self.agreeing)
+        return f"map {self.which} contradicts {', '.join(most)} and {last}, which agree: its geometry is wrong"
+
+
 @dataclass(frozen=True, eq=False)
 class MergedMap:
     """A merge of maps. It keeps the maps as they are, so it can be explained, and made anew without a link.
@@ -103,6 +121,7 @@ class MergedMap:
             tying postures; questions are answered from the others.
         faded: (N,) of nodes, which of their landmarks are thought to be gone, see merge.life.fading. Nodes
             where none is are left out.
+        wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -114,6 +133,7 @@ class MergedMap:
     rulings: Rulings = field(default_factory=Rulings)
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
+    wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
 
     @staticmethod
     def empty() -> MergedMap:
