@@ -177,6 +177,8 @@ class Merger:
 
     def rule(self, rulings: Rulings) -> None:
         """Heed these rulings of people from now on, and no others."""
+        if self._rulings.retired.keys() - rulings.retired.keys():
+            self.alike.forget()
         self._rulings = rulings
         self._stale |= self._verdicts.at(self.maps.keys())
         self._dirty = True
@@ -217,6 +219,8 @@ class Merger:
         before, retired = self._wrong, self._rulings.retired
         self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, retired.keys())
         self._stale = set()
+        if before.keys() - self._wrong.keys():
+            self.alike.forget()
         differ = {which for which, _ in before.items() ^ self._wrong.items()}
         for maps in self._verdicts.at(differ):
             self._touched |= {*maps}

@@ -29,7 +29,7 @@ from scipy.stats import mannwhitneyu
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node, NodeId
-from hybridmap.pose import Array, Pose2
+from hybridmap.pose import Array, Pose2, wrap_angle
 from hybridmap.recognising.pose_arrays import PoseGaussians
 from merge.belief.cliques import independent_links
 from merge.belief.consistency import ConsistencySettings, loop_distances2
@@ -57,6 +57,8 @@ MOST_SIGMA_XY, MOST_SIGMA_HEADING = 0.25, math.radians(5.0)
 """Nodes whose place is known less well, by the surest link of a placement, are not compared, m and rad."""
 LEAST_LANDMARKS = 50
 """In all views with which a node is compared."""
+SAME_XY, SAME_HEADING = 0.5, math.radians(20.0)
+"""Links of one node agree where it is if they differ by less, m and rad."""
 REACH, MOST_NEAR = 5.0, 20
 """A node is compared with at most so many others, and not farther away, m: beyond few landmarks have depths."""
 SIGMAS, MARGIN = 3.0, 0.2
@@ -231,6 +233,8 @@ def all_refuted(
         nodes: of both.
         s: when links agree.
     """
+    if not _nodes_agree(links, fixed):
+        return False
     sets = link_sets(links, placed, fixed, s)
     sets = [one for one in sets if len(one) >= LEAST_SHARE * len(sets[0])]
     sets = [one for one in sets if independent_links(one, s.least_links) >= s.least_links]
@@ -242,6 +246,23 @@ def all_refuted(
         strangers.append(_looked_through(story, sorted(everybody - inside), placed, fixed, nodes))
     usual = np.concatenate(settled) if settled else np.zeros(0)
     return bool(sets) and all(_more(shares, usual) for shares in strangers)
+
+
+def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
+    """Whether the links of each single node agree where it is.
+
+    So they do whatever the geometry of its map is. Where they do not, many links are false: places look alike, and
+    a map whose links are all false would be refuted everywhere too.
+    """
+    places: dict[NodeId, list[Pose2]] = {}
+    for link in sorted(links, key=lambda link: -link.weight):
+        places.setdefault(link.a, []).append(fixed.graph.pose(link.b) @ link.a_from_b.mean.inverse())
+    agree = [
+        best.distance(other) < SAME_XY and abs(wrap_angle(best.heading - other.heading)) < SAME_HEADING
+        for best, *others in places.values()
+        for other in others
+    ]
+    return len(agree) >= LEAST_NODES and sum(agree) >= AGREEING * len(agree)
 
 
 def _more(shares: Array, usual: Array) -> bool:
