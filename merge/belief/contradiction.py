@@ -12,7 +12,7 @@ another one gives such sets too. Consistency cannot tell these two apart; what s
 
 So a map is wrong if every placement that its links give is refuted like this by several maps that agree with each
 other. How often a view looks through a landmark at a true place (clutter, depths that are off) is read off the
-nodes at which the links of a placement agree: at the others it must be more often. Where others have not looked
+nodes where their own links put them: at those that a placement puts elsewhere it must be more often. Where others have not looked
 nothing is refuted, and the map may be right: it may know a room that only looks like theirs.
 """
 
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import mannwhitneyu
+from scipy.stats import binom
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node, NodeId
@@ -47,12 +47,12 @@ AGREEING = 0.9
 """Two maps agree if this share of their links do; of a sound map's links some miss each other by chance."""
 LEAST_SHARE = 0.25
 """A set of links is a placement if it has this share of the links of the largest set."""
-REFUTED = 0.01
-"""Chance, at most, that nodes of a sound map are looked through so much (Mann and Whitney's rank test)."""
-TIMES = 2.0
-"""And they are looked through so many times as often: among very many nodes any difference is significant."""
+RARE = 0.05
+"""Share of nodes, where their own links put them, that are looked through more than is usual."""
+REFUTED = 0.001
+"""Chance, at most, that so many nodes are under a true placement (binomial)."""
 LEAST_NODES = 4
-"""Nodes on either side of the comparison: of fewer no rank test is significant."""
+"""Nodes on either side of the comparison, at least."""
 MOST_SIGMA_XY, MOST_SIGMA_HEADING = 0.25, math.radians(5.0)
 """Nodes whose place is known less well, by the surest link of a placement, are not compared, m and rad."""
 LEAST_LANDMARKS = 50
@@ -167,7 +167,9 @@ class Contradictions:
         """Maps that agree with each other, of those tied to one; nothing unless it disagrees with two of them."""
         some = sorted(own, key=lambda other: (-len(own[other].links), other))[:MOST_PARTNERS]
         graph: nx.Graph = nx.Graph()
-        graph.add_edges_from((a, b) for a in some for b in some if a < b and b in ties[a] and ties[a][b].agrees)
+        graph.add_edges_from(
+            (a, b) for a in some for b in some if a < b and b in ties[a] and ties[a][b].agrees
+        )
         parts = [part for part in nx.connected_components(graph) if sum(not own[k].agrees for k in part) >= 2]
         return tuple(sorted(max(parts, key=len, default=())))
 
@@ -238,14 +240,17 @@ def all_refuted(
     sets = link_sets(links, placed, fixed, s)
     sets = [one for one in sets if len(one) >= LEAST_SHARE * len(sets[0])]
     sets = [one for one in sets if independent_links(one, s.least_links) >= s.least_links]
-    everybody = {link.a for link in links}
-    settled, strangers = [], []
-    for story in sets:
-        inside = {link.a for link in story}
-        settled.append(_looked_through(story, sorted(inside), placed, fixed, nodes))
-        strangers.append(_looked_through(story, sorted(everybody - inside), placed, fixed, nodes))
-    usual = np.concatenate(settled) if settled else np.zeros(0)
-    return bool(sets) and all(_more(shares, usual) for shares in strangers)
+    if not sets:
+        return False
+    own: dict[NodeId, list[Link]] = {}
+    for link in links:
+        own.setdefault(link.a, []).append(link)
+    # By its own links each node is where it truly is, whatever the map says of the way there.
+    usual = np.concatenate([_looked_through(some, [one], placed, fixed, nodes) for one, some in own.items()])
+    return all(
+        _more(_looked_through(one, sorted(own.keys() - {k.a for k in one}), placed, fixed, nodes), usual)
+        for one in sets
+    )
 
 
 def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
@@ -266,10 +271,11 @@ def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
 
 
 def _more(shares: Array, usual: Array) -> bool:
-    """Whether nodes are looked through more than is usual."""
-    if min(len(shares), len(usual)) < LEAST_NODES or shares.mean() <= TIMES * usual.mean():
+    """Whether more nodes than chance makes are looked through more than is usual."""
+    if min(len(shares), len(usual)) < LEAST_NODES:
         return False
-    return bool(mannwhitneyu(shares, usual, alternative="greater").pvalue < REFUTED)
+    many = int((shares > np.quantile(usual, 1.0 - RARE)).sum())
+    return bool(binom.sf(many - 1, len(shares), RARE) < REFUTED)
 
 
 def _looked_through(

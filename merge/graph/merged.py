@@ -102,7 +102,9 @@ class WrongGeometry(NamedTuple):
     def reason(self) -> str:
         """For example `map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong`."""
         *most, last = map(str, self.agreeing)
-        return f"map {self.which} contradicts {', '.join(most)} and {last}, which agree: its geometry is wrong"
+        return (
+            f"map {self.which} contradicts {', '.join(most)} and {last}, which agree: its geometry is wrong"
+        )
 
 
 @dataclass(frozen=True, eq=False)
