@@ -2,9 +2,9 @@
 
     python -m benchmarks.wrong_geometry --seeds 0 1 2 --kinds slip carried long turns
 
-Nothing is rendered (see benchmarks.synthetic). Three sound robots map a house; a fourth maps the same house with
-one of four faults of its odometry. Lost robots then ask where they are, with and without the fourth robot's map.
-The house may have two rooms that look the same: what is told there must not become surer.
+Nothing is rendered (see benchmarks.synthetic). Three sound robots map a house; a fourth maps the same house
+with one of four faults of its odometry. Lost robots then ask where they are, with and without the fourth
+robot's map. The house may have two rooms that look the same: what is told there must not become surer.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.synthetic import World, room, take_node, take_view
-from hybridmap.change import Change, EdgePut, NodePut
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
@@ -79,7 +79,7 @@ class House:
 
 def draw_house(rng: np.random.Generator, *, twins: bool = False, gap: float = 0.2, count: int = 2) -> House:
     """Rooms in a row. With `twins` the last two look the same."""
-    rooms, boxes, x = [], [], 0.0
+    rooms, boxes, x = list[World](), list[tuple[float, float, float, float]](), 0.0
     for k in range(count):
         width, depth = rng.uniform(4.0, 6.0), rng.uniform(3.5, 5.0)
         if twins and k == count - 1:
@@ -160,7 +160,7 @@ class Fleet:
         queues = []
         for map_id, (nodes, edges) in self.maps.items():
             if map_id not in left_out:
-                bodies = [NodePut(nodes[0])]
+                bodies: list[ChangeBody] = [NodePut(nodes[0])]
                 for node, edge in zip(nodes[1:], edges, strict=True):
                     bodies += [NodePut(node), EdgePut(edge)]
                 queues.append([Change(map_id, n, 0, body) for n, body in enumerate(bodies, start=1)])
@@ -300,7 +300,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=24)
     args = parser.parse_args()
     for name, seed in product(args.scenes, args.seeds):
-        scene, views, row = SCENES[name], [], {"scene": name, "seed": seed}
+        scene, views, row = SCENES[name], list[tuple[View, Pose2]](), {"scene": name, "seed": seed}
         for kind in args.kinds:
             fleet = draw_fleet(seed, scene, Fault(kind))
             if not views:

@@ -15,10 +15,10 @@ from hybridmap.ruling import Rulings
 from mapserver.merging.findings import Findings, Recollection, print_of
 from mapserver.merging.merger_counters import MergerCounters
 from mapserver.merging.succession import Succession
-from mapserver.places.placeindex import PlaceIndex
+from mapserver.places.placeindex import PlaceIndex, bounded
 from mapserver.relocalizing.lookalikes import LookAlikes
-from merge.graph.candidates import CandidateSettings, Pair
 from merge.belief.contradiction import Contradictions, MapPair
+from merge.graph.candidates import CandidateSettings, Pair
 from merge.graph.links import Link, RefusedLink, refuse
 from merge.graph.merged import MergedMap, WrongGeometry
 from merge.graph.verification import VerificationSettings, verify
@@ -228,7 +228,9 @@ class Merger:
                 self._verdicts.put(pair, self._told(self._known[pair[0]][pair[1]]))
 
     def _links(self, maps: MapPair) -> list[Link]:
-        """The links between two maps that people have not ruled out, also those of maps with wrong geometry."""
+        """The links between two maps that people have not ruled out, also those of maps with wrong
+        geometry.
+        """
         known = (self._known[a][b] for a, b in self._verdicts.between(maps))
         return [v for v in known if isinstance(v, Link) and self._rulings.against(*v.pair) is None]
 
@@ -305,7 +307,7 @@ class Merger:
             a, b = self.node(pair[0]), self.node(pair[1])
             if pair[1] in self._known.get(pair[0], {}) or a is None or b is None:
                 continue
-            verdict = verify(a, b, self.settings.verification)
+            verdict = verify(bounded(a), bounded(b), self.settings.verification)
             self._judge(pair, verdict)
             self.counters.verified += 1
             self.counters.recognised += isinstance(verdict, Link)

@@ -93,7 +93,8 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     assert merger.merged().joined(maps[0], maps[2])
     merger.rule(Rulings([retired]))
     assert told(merger, views) == before and before.count(Certainty.FOUND) >= 8
-    # A node that comes meanwhile looks like some of the retired map's, and that is known once it is taken back.
+    # A node that comes meanwhile looks like some of the retired map's, and that is known once it is taken
+    # back.
     late = take_map(world, MapId("d", 1), [Pose2(2.3, 2.0, 0.6)], rng)[0]
     merger.on_change(Change(MapId("d", 1), 1, 0, NodePut(late[0])))
     told(merger, views)
