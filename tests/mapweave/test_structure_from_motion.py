@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from synthetic.world import random_vectors
 from hybridmap.camera import Camera
 from hybridmap.descriptor import quantise
 from hybridmap.errors import InvalidValue
 from hybridmap.query import View
 from mapweave.structure_from_motion import CAMERA_FROM_LEVEL, Structure, reconstruct
+from synthetic.world import random_vectors
 
 CAMERA = Camera(640, 480, 520.0, 522.0, 318.0, 243.0, mount_height=1.3)
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from synthetic.world import Sensing, room, take_node, take_view
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.recognising.levelling import level
 from hybridmap.recognising.recognition import recognise, register
+from synthetic.world import Sensing, room, take_node, take_view
 from tests.hand_held import SCALE_SHARE, photograph
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synthetic.world import Sensing, World, room, take_node, take_view
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
@@ -16,6 +15,7 @@ from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.relocalization import Relocalizer
 from merge.incremental.islands import Islands
 from merge.incremental.verdicts import Verdicts
+from synthetic.world import Sensing, World, room, take_node, take_view
 from tests.hand_held import photograph
 from wire.messages import decode_relocalize_answer, encode_relocalize_answer
 
