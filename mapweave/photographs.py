@@ -16,20 +16,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.drivers.image_file import read_grey
-from agent.observation import RobotDescription
 from agent.sharing.journal import Journal
 from agent.sharing.replication import Replicator
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.camera import Camera
 from hybridmap.change import ChangeBody, EdgePut, NodePut
 from hybridmap.errors import InvalidValue
 from hybridmap.grid import settle
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.recognising.selection import choose, worth
 from mapweave.structure_from_motion import PIXEL_SIGMA, Structure, reconstruct
+from registration.selection import choose, worth
+from storage.image_file import read_grey
+from vision.lens import Lens
+from vision.sift import Sift
 from wire.bus import Bus
 from wire.keys import Keys
 
@@ -65,7 +64,7 @@ def map_of_photographs(
     """
     if not (math.isfinite(spacing) and spacing > 0.0):
         raise InvalidValue(f"spacing {spacing:g}: give the metres between photographs")
-    sift = Sift(Lens(RobotDescription(camera, distortion)))  # type: ignore[arg-type]
+    sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
     features = [sift.extract(read_grey(image, camera)) for image in images]
     views = [one.view(camera) for one in features]
     structure = reconstruct(views, spacing)

@@ -21,7 +21,7 @@ from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array
 from hybridmap.query import View
-from hybridmap.recognising.matching import match
+from registration.matching import match
 
 PIXEL_SIGMA = 0.7
 """px, of a SIFT feature; as in triangulation."""

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from agent.drivers.image_file import read_grey
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError, InvalidValue
+from storage.image_file import read_grey
 from wire.packing import MAX_STAMP_NS
 from wire.whole_file import read_whole
 

@@ -20,7 +20,7 @@ from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.recognising.planar_pose import PlanarPoseSettings, solve_planar_pose
+from registration.planar_pose import PlanarPoseSettings, solve_planar_pose
 
 __all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
 

@@ -12,12 +12,12 @@ from agent.localizing.recall import lookalikes, recall_all
 from agent.mission import WhereAmI
 from agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from agent.observation import Command
-from agent.vision.sift import Features
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View
-from hybridmap.recognising.recognition import Recognition
+from registration.recognition import Recognition
+from vision.sift import Features
 
 RIVAL = 0.5
 """Another node of the own map with this share of the best one's inliers has a say too,"""

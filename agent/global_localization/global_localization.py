@@ -16,8 +16,8 @@ from agent.global_localization.settings import GlobalLocalizationSettings
 from agent.localizing.recall import exact_enough
 from agent.motion_primitives import MotionPrimitives
 from agent.observation import Command, RobotDescription
-from agent.vision.sift import Sift
 from hybridmap.pose import Pose2, wrap_angle
+from vision.sift import Sift
 
 STILL = 0.2
 """Seconds that the robot stands still before a look."""

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from agent.ekf.localization import LocalizationFilter, LocalizationSettings
 from agent.observation import Observation, RobotDescription
-from agent.vision.lens import Lens
 from agent.vision.node_tracks import NodeTracks
-from agent.vision.sift import Features
 from agent.vision.tracker import TrackerSettings
 from hybridmap.node import Node
 from hybridmap.pose import Array, PoseGaussian
-from hybridmap.recognising.recognition import Recognition
+from registration.recognition import Recognition
+from vision.lens import Lens
+from vision.sift import Features
 
 
 @dataclass(frozen=True)

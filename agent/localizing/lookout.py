@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from agent.localizing.localizer import Localizer, LocalizerSettings
 from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.node import Node
 from hybridmap.pose import Pose2, wrap_angle
-from hybridmap.recognising.closer import look_closer
-from hybridmap.recognising.levelling import level
-from hybridmap.recognising.recognition import RecognitionSettings, recognise
+from registration.levelling import level
+from registration.pose_refinement import look_closer
+from registration.recognition import RecognitionSettings, recognise
+from vision.lens import Lens
+from vision.sift import Sift
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from agent.servo.blind import BlindDrive
 from agent.servo.proximity import ranger_points
 from agent.servo.step import State
 from agent.servo.supervisor import Servo
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from hybridmap.query import RouteLeg
+from vision.lens import Lens
+from vision.sift import Sift
 
 MOST_LOOKED_FOR = 8
 """Nodes tried in one image: a route may put any number of them into one place."""

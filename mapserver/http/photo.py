@@ -10,13 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from agent.drivers.image_file import check_cost, decode_grey
-from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.query import View
+from storage.image_file import check_cost, decode_grey
+from vision.lens import Lens
+from vision.sift import Sift
 
 LONG_SIDE = 1024
 """Larger images are made so small, px: a robot's image shows things no larger than that."""
@@ -64,7 +63,7 @@ class Photo:
             camera = scaled(camera, scale)
             small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
             image = np.asarray(small, np.uint8)
-        sift = Sift(Lens(RobotDescription(camera, distortion)))
+        sift = Sift(Lens(camera, distortion))
         return sift.extract(image).view(camera)
 
 

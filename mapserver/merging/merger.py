@@ -14,7 +14,6 @@ from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
-from hybridmap.recognising.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
 from mapserver.merging.findings import Findings, Recollection, print_of
 from mapserver.merging.isolation import Isolation, leave_out, reason_of
@@ -33,6 +32,7 @@ from merge.islands import Islands
 from merge.life.fading import Fader, FadingSettings
 from merge.life.renewal import RenewalSettings, Renewer
 from merge.merging import MergeSettings
+from registration.recognition import RecognitionSettings
 from wire.posture_codec import MAX_POSITION
 
 log = logging.getLogger(__name__)

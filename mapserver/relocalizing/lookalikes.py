@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.matching import match
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings
 from mapserver.relocalizing.doubles import Doubles, same_place, unchanged, unexplained
+from registration.matching import match
+from registration.recognition import Recognition, RecognitionSettings
 
 
 class Retrieval(Protocol):

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from hybridmap.node import Node, NodeId
 from hybridmap.query import Certainty, RelocalizeAnswer, View
-from hybridmap.recognising.closer import look_closer
-from hybridmap.recognising.matching import match
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
 from mapserver.relocalizing.doubles import between, carried, elsewhere, same_place, unexplained
 from mapserver.relocalizing.judgement import Judge, JudgementSettings, unknown
 from mapserver.relocalizing.lookalikes import LookAlikes, Retrieval
 from mapserver.relocalizing.regions import Regions, RegionSettings
 from mapserver.relocalizing.seenplaces import SeenPlace, Sighting, is_lonely
 from merge.graph.merged import MergedMap
+from registration.matching import match
+from registration.pose_refinement import look_closer
+from registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
 
 
 @dataclass(frozen=True)

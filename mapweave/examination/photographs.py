@@ -19,20 +19,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.drivers.image_file import read_grey
 from agent.drivers.replay import images_of
-from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
-from hybridmap.recognising.evidence import cells
-from hybridmap.recognising.matching import match
 from mapserver.places.placeindex import PlaceIndex
 from mapweave.examination.verdict import Verdict
+from registration.evidence import cells
+from registration.matching import match
+from storage.image_file import read_grey
+from vision.lens import Lens
+from vision.sift import Sift
 
 
 @dataclass(frozen=True)
@@ -149,7 +148,7 @@ class AppearanceMap:
     ):
         """Begin with none, for a camera and its lens."""
         self._camera = camera
-        self._sift = Sift(Lens(RobotDescription(camera, distortion)))  # type: ignore[arg-type]
+        self._sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
         self._settings = settings or PhotographSettings()
         self._index = PlaceIndex()
         self._nodes: dict[int, Node] = {}

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array
-from hybridmap.recognising.pose_arrays import PoseGaussians
 from merge.belief.cliques import best_clique, independent_links
 from merge.belief.witnesses import NOTHING, FalseWitnesses, Support, chances, crowds, neighbours, support_of
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link, RefusedLink, place_told, refuse
+from registration.pose_arrays import PoseGaussians
 
 HUNDREDTHS = 100.0
 """Cliques are weighed in whole hundredths of a landmark."""

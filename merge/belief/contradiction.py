@@ -29,7 +29,6 @@ from scipy.special import bdtrc
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, wrap_angle
-from hybridmap.recognising.pose_arrays import PoseGaussians
 from merge.belief.cliques import independent_links
 from merge.belief.consistency import ConsistencySettings, loop_distances2
 from merge.belief.memory import Memory
@@ -37,6 +36,7 @@ from merge.graph.fragments import Fragment
 from merge.graph.links import Link
 from merge.graph.merged import WrongGeometry
 from merge.graph.solver import Solver
+from registration.pose_arrays import PoseGaussians
 
 MOST_LINKS = 60
 """Links between two pieces of map that are looked at, evenly chosen: pairs of links grow by the square."""

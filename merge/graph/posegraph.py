@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
-from hybridmap.recognising.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+from registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
 HUBER = 2.0
 """Normalised residual from which a measurement that may be wrong pulls no harder."""

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
-from hybridmap.recognising.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+from registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
 metres = st.floats(-50, 50)
 angles = st.floats(-10, 10)

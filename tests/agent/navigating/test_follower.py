@@ -14,14 +14,14 @@ from agent.navigating.headway import Headway
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.servo.step import ServoStep
 from agent.servo.supervisor import Servo
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.camera import Camera
 from hybridmap.node import Node
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteLeg
-from hybridmap.recognising.recognition import recognise
+from registration.recognition import recognise
 from tests.hand_held import photograph
+from vision.lens import Lens
+from vision.sift import Sift
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
@@ -44,7 +44,7 @@ class Deluded:
 
 
 def follower_at_the_goal(node: Node) -> Follower:
-    lens = Lens(ROBOT)
+    lens = Lens(ROBOT.camera, ROBOT.distortion)
     fix = Fix(node.id, HERE, Deluded(node))  # type: ignore[arg-type]
     route = (RouteLeg(node, HERE, None),)
     rng = np.random.default_rng(0)
@@ -73,7 +73,7 @@ def test_slid_tracks_do_not_park_the_robot_beside_the_goal(walls, node, begin):
 def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch, roll):
     """Tilted, and of a scale that is off by a quarter: the robot has only the photograph to go by."""
     held = photograph(node, scale, pitch, roll)
-    pose, lens = Pose2(-0.7, 0.12, -0.1), Lens(ROBOT)
+    pose, lens = Pose2(-0.7, 0.12, -0.1), Lens(ROBOT.camera, ROBOT.distortion)
     lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
     believed = Pose2(scale * pose.x, scale * pose.y, pose.heading)
     found = lookout.find(walls.render(pose), [Expected(0, held, believed)])
@@ -109,7 +109,7 @@ def test_who_sees_nothing_of_the_goal_is_not_there(walls, node):
 
 def test_a_fresh_look_takes_over_only_for_many_more_landmarks(walls, node):
     """Tracks have been filtered for a while; a look that knows hardly more has not."""
-    lens, pose = Lens(ROBOT), Pose2(-0.3, 0.1, -0.1)
+    lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
     image = walls.render(pose)
     lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
     view = Sift(lens).extract(image).view(CAMERA)
@@ -123,7 +123,7 @@ def test_a_fresh_look_takes_over_only_for_many_more_landmarks(walls, node):
 
 
 def test_nodes_are_found_where_they_are_expected_only(walls, node):
-    lens, pose = Lens(ROBOT), Pose2(-0.3, 0.1, -0.1)
+    lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
     lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
     image, elsewhere = walls.render(pose), pose @ Pose2(-0.5)
     assert lookout.find(image, [Expected(3, node, elsewhere)]) is None
@@ -163,7 +163,7 @@ def test_headway_counts_since_the_robot_came_nearer(distances):
 def test_a_route_with_a_thousand_nodes_in_one_place_costs_a_few_looks(node, monkeypatch):
     tried = []
     monkeypatch.setattr(Lookout, "find", lambda self, image, wanted: tried.append(len(wanted)))
-    lens = Lens(ROBOT)
+    lens = Lens(ROBOT.camera, ROBOT.distortion)
     ahead = PoseGaussian(Pose2(0.5), np.zeros((3, 3)))
     route = (RouteLeg(node, HERE, None), *[RouteLeg(node, ahead, None)], *[RouteLeg(node, HERE, None)] * 1000)
     follower = Follower(

@@ -9,8 +9,8 @@ import pytest
 
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.recognising.levelling import level
-from hybridmap.recognising.recognition import recognise, register
+from registration.levelling import level
+from registration.recognition import recognise, register
 from synthetic.world import Sensing, room, take_node, take_view
 from tests.hand_held import SCALE_SHARE, photograph
 

@@ -19,8 +19,8 @@ from hybridmap.camera import Camera
 from hybridmap.node import LEAST_DEPTH_SHARE, Landmarks, Node
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.mirror import mirrored
-from hybridmap.recognising.recognition import Recognition, of_unknown_scale
+from registration.planar_ambiguity import mirrored
+from registration.recognition import Recognition, of_unknown_scale
 
 TILT_SIGMA, RISE_SIGMA = math.radians(2.0), 0.05
 """By which a camera in the hand is off level, rad, and off its height, m."""

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap.descriptor import decode
-from hybridmap.recognising.matching import MatchSettings, match, match_vectors, squared_distances, two_nearest
+from registration.matching import MatchSettings, match, match_vectors, squared_distances, two_nearest
 
 
 def brute_force(a: np.ndarray, b: np.ndarray, s: MatchSettings, noise: float) -> set[tuple[int, int]]:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift, SiftSettings
 from hybridmap.camera import Camera
+from vision.lens import Lens
+from vision.sift import Sift, SiftSettings
 
 CAMERA = Camera(320, 240, 277.0, 276.0, 158.0, 121.0, mount_height=0.3)
-IDEAL = Lens(RobotDescription(CAMERA))
+IDEAL = Lens(CAMERA)
 PHOTOGRAPHS = ("camera", "brick", "coins", "page", "text")
 
 
@@ -39,7 +39,7 @@ def test_the_same_image_gives_the_same_features(pictures):
 
 def test_pixels_are_free_of_the_lens(pictures):
     description = RobotDescription(CAMERA, (-0.2, 0.05, 0.001, 0.0, 0.0))
-    features = Sift(Lens(description)).extract(pictures.photograph("camera"))
+    features = Sift(Lens(description.camera, description.distortion)).extract(pictures.photograph("camera"))
     matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
     at_one = (features.pixels - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
     rays = np.column_stack([at_one, np.ones(len(features))])

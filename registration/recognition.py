@@ -20,10 +20,10 @@ from hybridmap.camera import Camera
 from hybridmap.node import Landmarks, Node
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.evidence import GRID, depth_agreement, gather
-from hybridmap.recognising.matching import MatchSettings, match
-from hybridmap.recognising.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
-from hybridmap.recognising.sightings import Sightings
+from registration.evidence import GRID, depth_agreement, gather
+from registration.matching import MatchSettings, match
+from registration.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
+from registration.sightings import Sightings
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.recognising import projection
-from hybridmap.recognising.projection import (
+from registration import projection
+from registration.projection import (
     DEPTH_DECADES,
     GATE,
     Linear,
@@ -25,7 +25,7 @@ from hybridmap.recognising.projection import (
     linearise,
     normal_equations,
 )
-from hybridmap.recognising.sightings import Sightings
+from registration.sightings import Sightings
 
 DEPTH_GATE = 11.34
 """Chi-square 99 % point for 3 degrees of freedom."""

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap.jit import KERNELS
-from hybridmap.recognising.pose_refinement import stack_sightings
-from hybridmap.recognising.projection import improve, linearise, normal_equations
+from registration.gauss_newton import stack_sightings
+from registration.projection import improve, linearise, normal_equations
 from tests.hybridmap.kernel_forms import in_numpy
-from tests.hybridmap.recognising.test_projection import scene
+from tests.registration.test_projection import scene
 
 pytest.importorskip("numba")
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.pose import Array
-from hybridmap.recognising.pose_arrays import inverse_poses
-from hybridmap.recognising.sightings import Sightings
+from registration.pose_arrays import inverse_poses
+from registration.sightings import Sightings
 
 
 def hypotheses(sightings: Sightings, count: int, rng: np.random.Generator) -> Array:

@@ -20,7 +20,7 @@ from hybridmap.grid import FINE_BITS, PixelGrid, round_depths
 from hybridmap.landmark_tables import DIMENSIONS, TOTAL_BITS, landmark_tables
 from hybridmap.node import Landmarks
 from hybridmap.pose import Array
-from hybridmap.recognising.matching import squared_distances
+from registration.matching import squared_distances
 
 FIXED_BYTES = 330
 """A node without landmarks: names, posture, camera, 16 ranges, checksums and the transport's frame."""

@@ -10,8 +10,8 @@ from scipy.stats import multivariate_normal, norm
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2
-from hybridmap.recognising.pose_refinement import stack_sightings
-from hybridmap.recognising.projection import (
+from registration.gauss_newton import stack_sightings
+from registration.projection import (
     DEPTH_DECADES,
     Linear,
     Stack,
@@ -19,7 +19,7 @@ from hybridmap.recognising.projection import (
     linearise,
     normal_equations,
 )
-from hybridmap.recognising.sightings import Sightings
+from registration.sightings import Sightings
 from tests.hybridmap.kernel_forms import form
 
 __all__ = ["form"]

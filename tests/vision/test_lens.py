@@ -6,12 +6,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.observation import RobotDescription
-from agent.vision.lens import Lens
 from hybridmap.camera import Camera
+from vision.lens import Lens
 
 CAMERA = Camera(320, 240, 277.0, 276.0, 158.0, 121.0, mount_height=0.3)
-IDEAL = Lens(RobotDescription(CAMERA))
+IDEAL = Lens(CAMERA)
 
 lenses = st.tuples(
     st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-0.003, 0.003), st.floats(-0.003, 0.003),
@@ -22,7 +21,7 @@ some_pixels = st.lists(st.tuples(st.floats(20, 300), st.floats(20, 220)), min_si
 
 @given(lenses, some_pixels)
 def test_removing_distortion_that_was_put_on_changes_nothing(coefficients, pixels):
-    lens = Lens(RobotDescription(CAMERA, coefficients))
+    lens = Lens(CAMERA, coefficients)
     there_and_back = lens.undistort(lens.distort(np.array(pixels)))
     assert np.abs(there_and_back - pixels).max() < 0.05
     back_and_there = lens.distort(lens.undistort(np.array(pixels)))
@@ -39,7 +38,7 @@ def test_distortion_is_brown_and_conradys_formula(coefficients, pixels):
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     expected = np.column_stack([CAMERA.fx * xd + CAMERA.cx, CAMERA.fy * yd + CAMERA.cy])
-    found = Lens(RobotDescription(CAMERA, coefficients)).distort(pixels)
+    found = Lens(CAMERA, coefficients).distort(pixels)
     assert np.allclose(found, expected, atol=1e-6)
 
 
@@ -49,5 +48,5 @@ def test_an_ideal_lens_and_no_points():
     assert np.array_equal(IDEAL.distort(pixels), pixels)
     IDEAL.undistort(pixels)[0] = 9.0
     assert pixels[0, 0] == 1.25, "what comes back is a copy"
-    bent = Lens(RobotDescription(CAMERA, (0.1, 0.0, 0.0, 0.0, 0.0)))
+    bent = Lens(CAMERA, (0.1, 0.0, 0.0, 0.0, 0.0))
     assert bent.undistort(np.zeros((0, 2))).shape == bent.distort(np.zeros((0, 2))).shape == (0, 2)

@@ -9,7 +9,7 @@ import pytest
 from hybridmap.descriptor import decode, quantise, rounding_noise
 from hybridmap.errors import InvalidValue
 from hybridmap.node import Landmarks
-from hybridmap.recognising.selection import FIXED_BYTES, SelectionSettings, choose, distinctness, worth
+from registration.selection import FIXED_BYTES, SelectionSettings, choose, distinctness, worth
 from synthetic.world import CAMERA, random_vectors
 
 PLENTY = SelectionSettings(most_bytes=100_000)

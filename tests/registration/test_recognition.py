@@ -7,7 +7,7 @@ import pytest
 
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.recognising.recognition import (
+from registration.recognition import (
     Recognition,
     RecognitionSettings,
     Refusal,

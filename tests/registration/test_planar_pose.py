@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.recognising.minimal_poses import hypotheses
-from hybridmap.recognising.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
-from hybridmap.recognising.sightings import Sightings
+from registration.minimal_poses import hypotheses
+from registration.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
+from registration.sightings import Sightings
 from tests.hybridmap.kernel_forms import form
 
 __all__ = ["form"]

@@ -7,8 +7,8 @@ import pytest
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Pose2
-from hybridmap.recognising.mirror import mirrored
-from hybridmap.recognising.planar_pose import PlanarPoseSettings, solve_planar_pose
+from registration.planar_ambiguity import mirrored
+from registration.planar_pose import PlanarPoseSettings, solve_planar_pose
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 SETTINGS = PlanarPoseSettings(pixel_sigma=1.0)

@@ -13,10 +13,10 @@ import numpy as np
 from hybridmap.node import Node
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.planar_pose import PlanarPoseSettings
-from hybridmap.recognising.pose_refinement import refine, stack_sightings
-from hybridmap.recognising.recognition import Recognition, of_unknown_scale
-from hybridmap.recognising.sightings import Sightings
+from registration.gauss_newton import refine, stack_sightings
+from registration.planar_pose import PlanarPoseSettings
+from registration.recognition import Recognition, of_unknown_scale
+from registration.sightings import Sightings
 
 LEAST_SIGMA, ROUNDS = 0.1, 3
 """px, pixels are rounded in a node; and how often the noise is measured anew."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from hybridmap.camera import Camera
 from hybridmap.node import Landmarks
 from hybridmap.pose import Pose2
-from hybridmap.recognising.pose_refinement import PlanarFix
-from hybridmap.recognising.sightings import Sightings
+from registration.gauss_newton import PlanarFix
+from registration.sightings import Sightings
 
 GRID = (6, 4)
 """Columns and rows of cells in which the spread over an image is counted."""

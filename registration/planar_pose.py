@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.recognising.minimal_poses import hypotheses
-from hybridmap.recognising.mirror import mirrored
-from hybridmap.recognising.pose_refinement import PlanarFix, improve, refine, stack_sightings
-from hybridmap.recognising.projection import Stack
-from hybridmap.recognising.sightings import Sightings
+from registration.gauss_newton import PlanarFix, improve, refine, stack_sightings
+from registration.minimal_poses import hypotheses
+from registration.planar_ambiguity import mirrored
+from registration.projection import Stack
+from registration.sightings import Sightings
 
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
 

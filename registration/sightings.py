@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from hybridmap.camera import Camera
 from hybridmap.pose import Array
-from hybridmap.recognising.pose_arrays import inverse_poses
-from hybridmap.recognising.projection import Optics, Poses, Seen, log_ratios
+from registration.pose_arrays import inverse_poses
+from registration.projection import Optics, Poses, Seen, log_ratios
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ from scipy.optimize import minimize
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian, averaged
-from hybridmap.recognising.closer import look_closer
-from hybridmap.recognising.planar_pose import PlanarPoseSettings
-from hybridmap.recognising.recognition import recognise
+from registration.planar_pose import PlanarPoseSettings
+from registration.pose_refinement import look_closer
+from registration.recognition import recognise
 from synthetic.world import (
     Sensing,
     room,

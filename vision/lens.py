@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import RobotDescription
+from hybridmap.camera import Camera
 from hybridmap.pose import Array
+
+Distortion = tuple[float, float, float, float, float]
+"""(k1, k2, p1, p2, k3), OpenCV's order."""
 
 EXACT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-10)
 """OpenCV's five steps leave up to 0.1 px in the corners of a webcam's image."""
@@ -18,11 +21,10 @@ EXACT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-10)
 class Lens:
     """Maps pixels of the real image to pixels of the ideal pinhole camera and back."""
 
-    def __init__(self, description: RobotDescription) -> None:
-        """Take the camera's intrinsics and the lens's five coefficients (OpenCV's order)."""
-        camera = description.camera
+    def __init__(self, camera: Camera, distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)) -> None:
+        """Take the camera's intrinsics and the lens's five coefficients."""
         self._matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        self._distortion = np.array(description.distortion)
+        self._distortion = np.array(distortion)
         self._ideal = not self._distortion.any()
 
     def undistort(self, raw: NDArray[Any]) -> Array:
