@@ -170,7 +170,7 @@ class MapServer:
             "refused": sum(refusal.link is not None for refusal in merged.refused),
             "rulings": len(merged.rulings.in_force),
             "set_apart": len(merged.set_apart),
-            "event": self._upkeep.event,
+            "event": self._ingest.failure or self._upkeep.event,
             "settled": self._upkeep.settled,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,

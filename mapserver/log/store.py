@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 import zlib
 from collections.abc import Iterator, Sequence
@@ -48,11 +49,17 @@ CREATE TABLE link (
 CREATE TABLE result (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID
 """
 
+ID = "store id"
+"""Among the results."""
 READ_AT_ONCE = 256
 
 
 class Store:
-    """All logs in one SQLite file. Its methods may be called from any thread."""
+    """All logs in one SQLite file. Its methods may be called from any thread.
+
+    Attributes:
+        id: drawn by chance when the store was made, see wire.log_messages.Ack.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the store, or make one.
@@ -62,6 +69,14 @@ class Store:
         """
         self._lock = threading.RLock()
         self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA)
+        known = self.result(ID)
+        self.id = int.from_bytes(known, "big") if known else secrets.randbits(62) + 1
+        if not known:
+            try:
+                self.put_result(ID, self.id.to_bytes(8, "big"))
+            except InvalidFile as error:
+                # Such a store takes nothing in either, and can still be read.
+                log.warning("%s", error)
 
     def maps(self) -> list[MapId]:
         """All maps of which something is known."""
