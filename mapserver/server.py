@@ -152,7 +152,7 @@ class MapServer:
             "damaged": sum(gap.last - gap.first + 1 for gap in self._store.damaged()),
             "rulings": len(merged.rulings.in_force),
             "set_apart": len(merged.set_apart),
-            "event": self._upkeep.event,
+            "event": self._ingest.failure or self._upkeep.event,
             "settled": self._upkeep.settled,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,

@@ -42,6 +42,7 @@ class Database:
             InvalidFile: damaged, of another kind or version, in use, or not readable.
         """
         self.path = path
+        self._file = path.absolute()
         self.what = what
         self._repair = repair
         self._advice = f"; {advice}" if advice else ""
@@ -55,9 +56,18 @@ class Database:
         try:
             with self.guard():
                 self._prepare(application_id, version, schema)
+            self._inode = self._inode_now()
         except BaseException:
             self.connection.close()
             raise
+
+    def _inode_now(self) -> tuple[int, int] | None:
+        """By which the file of this name is known; None if there is none."""
+        try:
+            found = self._file.stat()
+        except OSError:
+            return None
+        return found.st_dev, found.st_ino
 
     @contextmanager
     def guard(self) -> Iterator[None]:
@@ -79,8 +89,13 @@ class Database:
         """All that is done inside is committed at the end, or nothing of it.
 
         Raises:
-            InvalidFile: the disk does not take it.
+            InvalidFile: the disk does not take it, or the file is gone: what is written would go with it.
         """
+        if self._inode_now() != self._inode:
+            raise InvalidFile(
+                f"{self.path}: {self.what} was deleted or replaced under the running program; "
+                "put it back, or start the program again"
+            )
         with self.guard():
             self.connection.execute("BEGIN IMMEDIATE")
             try:

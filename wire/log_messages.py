@@ -103,17 +103,21 @@ class Ack:
         log_id: see Mark.
         watermark: every change up to this one is settled: stored, or refused for good.
         refusals: the newest of those that were refused.
+        store: drawn by chance when the server's store was made; 0 from a server that does not say. One that
+            has lost its store acknowledges with another, and less.
     """
 
     map: MapId
     log_id: int
     watermark: int
     refusals: tuple[Refusal, ...] = ()
+    store: int = 0
 
     def encode(self) -> bytes:
         """Encode."""
         refusals = [[one.sequence, one.reason[:MAX_REASON]] for one in self.refusals[-MAX_REFUSALS:]]
-        return pack({"m": list(self.map), "l": self.log_id, "q": self.watermark, "r": refusals})
+        fields = {"m": list(self.map), "l": self.log_id, "q": self.watermark, "r": refusals}
+        return pack({**fields, "s": self.store} if self.store else fields)
 
     @staticmethod
     def decode(data: bytes) -> Ack:
@@ -127,7 +131,8 @@ class Ack:
             sequence = reader.as_integer(pair[0], "refused sequence", 0, MAX_NUMBER)
             refusals.append(Refusal(sequence, reader.as_text(pair[1], "reason", MAX_REASON)))
         watermark = reader.integer("q", 0, MAX_NUMBER)
-        return Ack(reader.map_id("m"), _log_id(reader), watermark, tuple(refusals))
+        store = reader.integer("s", 0, 2**63 - 1) if reader.has("s") else 0
+        return Ack(reader.map_id("m"), _log_id(reader), watermark, tuple(refusals), store)
 
 
 @dataclass(frozen=True, slots=True)

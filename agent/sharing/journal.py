@@ -226,8 +226,14 @@ class Journal:
                 decoded = None
             yield Entry(sequence, NodeId(*map_id, number), bool(put), decoded)
 
-    def acknowledge(self, server: str, map_id: MapId, watermark: int) -> None:
+    def acknowledge(self, server: str, map_id: MapId, watermark: int, anew: bool = False) -> None:
         """Remember that a server has every change up to the watermark; it never goes back.
+
+        Args:
+            server: which.
+            map_id: which map.
+            watermark: up to which change.
+            anew: the server has lost its store, so it may go back.
 
         Raises:
             InvalidValue: the log is not that long.
@@ -240,8 +246,8 @@ class Journal:
             with self._database.transaction() as rows:
                 rows.execute(
                     "INSERT INTO ack VALUES (?, ?, ?) ON CONFLICT (epoch, server) "
-                    "DO UPDATE SET watermark = max(watermark, excluded.watermark)",
-                    (map_id.epoch, check_name(server), watermark),
+                    "DO UPDATE SET watermark = max(watermark * ?, excluded.watermark)",
+                    (map_id.epoch, check_name(server), watermark, not anew),
                 )
 
     def acknowledged(self, map_id: MapId) -> dict[str, int]:

@@ -21,6 +21,7 @@ class LogState:
         acknowledged: what is on which server's disk.
         refusals: what servers have refused for good: (server, sequence) to reason.
         failure: why servers do not take this log at all; empty if they do.
+        stores: by which id each server's store was known last, see wire.log_messages.Ack.
     """
 
     map: MapId
@@ -29,6 +30,7 @@ class LogState:
     acknowledged: dict[str, int]
     refusals: dict[tuple[str, int], str] = field(default_factory=dict)
     failure: str = ""
+    stores: dict[str, int] = field(default_factory=dict)
 
     @staticmethod
     def of(journal: Journal, map_id: MapId) -> LogState:
@@ -48,6 +50,13 @@ class LogState:
     def head(self) -> Head:
         """The beacon."""
         return Head(self.log_id, self.newest, dict(self.acknowledged))
+
+    def lost(self, server: str, ack: Ack) -> bool:
+        """Whether a server has less than it once acknowledged: it has another store now."""
+        if not ack.store or self.stores.get(server) == ack.store:
+            return False
+        self.stores[server] = ack.store
+        return ack.watermark < self.acknowledged.get(server, 0)
 
     def take(self, server: str, ack: Ack) -> list[str]:
         """Note what an acknowledgement says besides its watermark.

@@ -269,12 +269,17 @@ class Replicator:
             return
         with self._changed:
             news = one.take(server, ack)
+            lost = one.lost(server, ack)
         for line in news:
             log.warning("%s", line)
-        if not one.acknowledged.get(server, 0) < ack.watermark <= one.newest:
+        if lost:
+            log.warning(
+                "%s has lost what it had of %s after %d: it gets it again", server, one.map, ack.watermark
+            )
+        elif not one.acknowledged.get(server, 0) < ack.watermark <= one.newest:
             return
         try:
-            self._journal.acknowledge(server, one.map, ack.watermark)
+            self._journal.acknowledge(server, one.map, ack.watermark, anew=lost)
         except MapweaveError as error:
             # The server says it again, because the next beacon shows that it was not noted.
             log.warning("%s", error)

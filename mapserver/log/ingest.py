@@ -218,7 +218,8 @@ class Ingest:
             return None
         one.newest = max(one.newest, head.newest)
         one.heard(time.monotonic())
-        if head.acknowledged.get(self._name, 0) < one.watermark:
+        # More than there is: it was another store that had it.
+        if head.acknowledged.get(self._name, 0) != one.watermark:
             self._acknowledge(one)
         return one
 
@@ -280,7 +281,7 @@ class Ingest:
         if one.log_id == log_id:
             return one
         reason = f"another log goes by the name {map_id} here: begin a fresh map"
-        ack = Ack(map_id, log_id, 0, (Refusal(0, reason),))
+        ack = Ack(map_id, log_id, 0, (Refusal(0, reason),), self._store.id)
         self._bus.publish(self._keys.ack(self._name, map_id.agent), ack.encode())
         return None
 
@@ -319,7 +320,7 @@ class Ingest:
                 log.exception("passing on %s %d failed", change.map, change.sequence)
 
     def _acknowledge(self, one: AgentLog) -> None:
-        ack = Ack(one.map, one.log_id, one.watermark, one.refusals)
+        ack = Ack(one.map, one.log_id, one.watermark, one.refusals, self._store.id)
         self._bus.publish(self._keys.ack(self._name, one.map.agent), ack.encode())
 
     def _tell_newest(self, request: Request) -> None:

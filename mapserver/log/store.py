@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,6 +24,8 @@ APPLICATION_ID = 0x4D575354
 """'MWST' in the file's header."""
 
 VERSION = 2
+ID = "store id"
+"""Among the results."""
 READ_AT_ONCE = 256
 ADVICE = (
     "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: robots send "
@@ -33,7 +36,11 @@ MAX_RULINGS = 10_000
 
 
 class Store:
-    """All logs in one SQLite file. Its methods may be called from any thread."""
+    """All logs in one SQLite file. Its methods may be called from any thread.
+
+    Attributes:
+        id: drawn by chance when the store was made, see wire.log_messages.Ack.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the store, or make one. Rows that are damaged are taken out, see `damaged`.
@@ -45,6 +52,14 @@ class Store:
         self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA, repair, ADVICE)
         for gap in self.damaged():
             log.error("%s: %s", path, _words(gap))
+        known = self.result(ID)
+        self.id = int.from_bytes(known, "big") if known else secrets.randbits(62) + 1
+        if not known:
+            try:
+                self.put_result(ID, self.id.to_bytes(8, "big"))
+            except InvalidFile as error:
+                # Such a store takes nothing in either, and can still be read.
+                log.warning("%s", error)
 
     def maps(self) -> list[MapId]:
         """All maps of which something is known."""

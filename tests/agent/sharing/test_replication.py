@@ -41,8 +41,8 @@ class HandServer:
         self.bus.subscribe(KEYS.changes(), self.changes.append)
         self.bus.subscribe(KEYS.heads(), lambda sample: self.heads.append(Head.decode(sample.payload)))
 
-    def acknowledge(self, log_id: int, watermark: int, *refusals: Refusal) -> None:
-        ack = Ack(MAP, log_id, watermark, refusals)
+    def acknowledge(self, log_id: int, watermark: int, *refusals: Refusal, store: int = 0) -> None:
+        ack = Ack(MAP, log_id, watermark, refusals, store)
         self.bus.publish(KEYS.ack(self.name, "r0"), ack.encode())
 
     def ask(self, first: int, last: int) -> LogAnswer:
@@ -229,6 +229,29 @@ def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: H
     server.bus.publish(KEYS.ack("s0", "r0"), b"garbage")
     server.bus.publish(KEYS.ack("s9", "r0"), Ack(MAP, agent.log_id, 1).encode())
     eventually(lambda: agent.journal.acknowledged(MAP) == {"s0": 2, "s9": 1})
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_server_that_has_lost_its_store_lacks_everything_again(
+    hub: MemoryHub, path: Path, server: HandServer, again: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    agent = Agent(hub, path)
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    server.acknowledge(agent.log_id, 3, store=5)
+    server.acknowledge(agent.log_id, 1, store=5)
+    assert agent.replicator.wait_acknowledged(30)
+    if again:
+        agent.close()
+        agent = Agent(hub, path)
+    assert agent.replicator.status().unacknowledged == 0
+    server.acknowledge(agent.log_id, 1, store=6)
+    eventually(lambda: agent.replicator.status().unacknowledged == 2)
+    assert agent.journal.acknowledged(MAP) == {"s0": 1}
+    assert "s0 has lost what it had of r0.1 after 1" in caplog.text
+    server.acknowledge(agent.log_id, 3, store=6)
+    assert agent.replicator.wait_acknowledged(30)
+    agent.close()
 
 
 def test_a_server_that_has_more_than_the_disk(

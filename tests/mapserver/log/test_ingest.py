@@ -17,7 +17,7 @@ from wire.memory import MemoryHub
 def test_changes_are_applied_and_acknowledged(server: Server, agent: HandAgent) -> None:
     for sequence in (1, 2, 3):
         agent.publish(sequence)
-    eventually(lambda: agent.acks and agent.acks[-1] == Ack(MAP, LOG_ID, 3))
+    eventually(lambda: agent.acks and agent.acks[-1] == Ack(MAP, LOG_ID, 3, (), server.store.id))
     eventually(lambda: server.sequences == [1, 2, 3])
     assert server.store.watermark(MAP) == 3
 

@@ -1,0 +1,87 @@
+"""A store that is deleted under the running server: it is said, and robots send everything again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from agent.sharing.journal import Journal
+from agent.sharing.replication import ReplicationSettings, Replicator
+from hybridmap.change import ChangeBody, NodeRetired
+from hybridmap.errors import InvalidFile
+from hybridmap.node import MapId, NodeId
+from mapserver.log.store import Store
+from mapserver.server import MapServer
+from tests.waiting import eventually
+from wire.keys import Keys
+from wire.memory import MemoryBus, MemoryHub
+
+KEYS = Keys("fleet")
+MAP = MapId("r0", 1)
+
+
+def bodies(first: int, last: int) -> list[ChangeBody]:
+    return [NodeRetired(NodeId(*MAP, number)) for number in range(first, last + 1)]
+
+
+def delete(path: Path) -> None:
+    for part in path.parent.glob(f"{path.name}*"):
+        part.unlink()
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["deleted", "replaced"])
+def test_a_store_that_is_deleted_takes_nothing_more(tmp_path: Path, again: bool) -> None:
+    path = tmp_path / "s0.sqlite"
+    store = Store(path)
+    store.put_result("x", b"1")
+    delete(path)
+    if again:
+        path.write_bytes(b"")
+    with pytest.raises(InvalidFile, match="deleted or replaced under the running program"):
+        store.put_result("x", b"2")
+    store.close()
+
+
+def test_a_store_that_was_moved_takes_changes_when_it_is_put_back(tmp_path: Path) -> None:
+    path = tmp_path / "s0.sqlite"
+    store = Store(path)
+    path.rename(tmp_path / "elsewhere")
+    with pytest.raises(InvalidFile, match="deleted or replaced"):
+        store.put_result("x", b"1")
+    (tmp_path / "elsewhere").rename(path)
+    store.put_result("x", b"2")
+    known = store.id
+    store.close()
+    again = Store(path)
+    assert again.result("x") == b"2" and again.id == known
+    again.close()
+
+
+def test_a_server_whose_store_is_deleted_says_so_and_gets_everything_again(tmp_path: Path) -> None:
+    hub, path = MemoryHub(), tmp_path / "s0.sqlite"
+    bus, journal = MemoryBus(hub), Journal(tmp_path / "journal.sqlite", "r0")
+    robot = Replicator(
+        bus, KEYS, journal, journal.open_map(1), ("s0",), ReplicationSettings(beacon_interval=0.05)
+    )
+    server_bus = MemoryBus(hub)
+    with MapServer(server_bus, KEYS, path, "s0") as server:
+        robot.submit(bodies(1, 5), 0)
+        assert robot.wait_acknowledged(30)
+        delete(path)
+        robot.submit(bodies(6, 7), 0)
+        eventually(lambda: "deleted or replaced" in str(server.status()["event"]))
+        assert not robot.wait_acknowledged(0.5)
+        assert robot.unacknowledged() == 2
+    with MapServer(server_bus, KEYS, path, "s0"):
+        assert robot.wait_acknowledged(30)
+        # Acknowledged anew: not because it was before.
+        eventually(lambda: robot.unacknowledged() == 0)
+    kept = Store(path)
+    eventually(lambda: kept.watermark(MAP) == 7)
+    assert [change.sequence for change in kept.replay(MAP)] == list(range(1, 8))
+    kept.close()
+    robot.close()
+    journal.close()
+    bus.close()
+    server_bus.close()
