@@ -121,6 +121,11 @@ class Desk:
         by = now + latest if wait > 0.0 else math.inf
         return self._pool.submit(self._unless_late, work, ticket, by, usual)
 
+    @property
+    def has_workers(self) -> bool:
+        """Whether work is done beside those who ask."""
+        return self._pool is not None
+
     def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
         with self._lock:
