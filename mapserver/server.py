@@ -103,7 +103,7 @@ class MapServer:
         self._ingest = Ingest(self._bus, self._keys, self._store, self._name, upkeep.take, replay=upkeep.read)
         self._services = Services(
             self._bus, self._keys, self._name, upkeep.current, self._desk, self._blockages, self.status,
-            lambda: self._chronicle.happenings, clock.monotonic,
+            lambda: self._chronicle.happenings, clock.monotonic, clock.executor(1),
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, upkeep.current, self._desk, self._rulings, upkeep.rule,

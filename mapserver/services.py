@@ -1,10 +1,10 @@
-"""Robots' questions over the bus. Where a view was taken is for the desk to find out; the rest is quick."""
+"""Robots' questions over the bus. Views are for the desk, the map is packed beside; the rest is quick."""
 
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 
 from hybridmap.errors import Busy, MapweaveError
 from hybridmap.history import Happening
@@ -12,12 +12,11 @@ from hybridmap.query import RouteAnswer
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages
 from mapserver.desk import Desk
-from mapserver.mapfiles import map_file_of
+from mapserver.packed_map import PackedMap
 from mapserver.wire_limits import Pairs, drivable, said
 from wire.bus import Bus, Closing, Request
 from wire.keys import Keys
 from wire.log_messages import Scalar, encode_record
-from wire.mapfile import pack_map_file
 from wire.messages import (
     decode_known_request,
     decode_route_request,
@@ -45,7 +44,8 @@ class Services:
         blockages: Blockages,
         status: Callable[[], dict[str, Scalar]],
         history: Callable[[], Iterable[Happening]],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
+        executor: Executor,
     ) -> None:
         """Begin to answer.
 
@@ -59,18 +59,21 @@ class Services:
             status: of the server.
             history: of the maps, for who takes them along.
             clock: only grows, s.
+            executor: packs the whole map; it is shut down with this.
         """
         self._clock = clock
         self._answers = answers
         self._desk = desk
         self._blockages = blockages
         self._status = status
-        self._history = history
+        self._map = PackedMap(
+            answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor
+        )
         self._closing: list[Closing] = [
             bus.serve(keys.relocalize(name), self._relocalize_later),
             bus.serve(keys.route(name), guarded(self._route)),
             bus.serve(keys.known(name), guarded(self._known)),
-            bus.serve(keys.server_map(name), guarded(self._map)),
+            bus.serve(keys.server_map(name), self._map.ask),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
             bus.announce(keys.server_alive(name)),
         ]
@@ -79,6 +82,7 @@ class Services:
         """Stop answering."""
         for closing in self._closing:
             closing.close()
+        self._map.close()
 
     def _relocalize_later(self, request: Request) -> None:
         done = self._desk.submit(lambda: self._relocalize(request.payload), hash(request.payload))
@@ -104,9 +108,6 @@ class Services:
         request = decode_known_request(payload)
         answer = self._answers().known.answer(request.map, (request.x, request.y), request.reach)
         return encode_known_answer(answer)
-
-    def _map(self, payload: bytes) -> bytes:
-        return pack_map_file(map_file_of(self._answers().merged, self._history()))
 
     def _tell_status(self, payload: bytes) -> bytes:
         self._answers()

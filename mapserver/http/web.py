@@ -55,6 +55,8 @@ PATIENCE = 10.0
 """How long a body may take to come, and an answer to be found, s."""
 MOST_AT_ONCE = 32
 """Questions that are served at once; the next one is refused."""
+WHOLE = "mapweave.whole"
+"""In the scope of a request whose body has come to its end."""
 METHODS = dict.fromkeys((*PAGES, "/status", "/history", "/explain", "/route"), "GET") | {
     "/relocalize": "POST"
 }
@@ -135,7 +137,7 @@ class Reply(Response):
         start = {"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers}
         await send(start)
         await send({"type": "http.response.body", "body": bytes(self.body), "more_body": True})
-        if self.status_code >= HTTPStatus.BAD_REQUEST and scope["method"] == "POST":
+        if self.status_code >= HTTPStatus.BAD_REQUEST and scope["method"] == "POST" and WHOLE not in scope:
             await _hear_out(scope, receive)
         await send({"type": "http.response.body", "body": b"", "more_body": False})
 
@@ -255,6 +257,7 @@ class Questions:
         async with asyncio.timeout(self._patience):
             async for piece in request.stream():
                 body += piece
+        request.scope[WHOLE] = True
         if len(body) < length:
             raise InvalidValue(f"only {len(body)} of {length} bytes came")
         return bytes(body)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.errors import InvalidMessage, InvalidValue
+from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from hybridmap.node import MapId, NodeId
 from mapserver.log.entry import Applied, Entry, Position, Traffic
 from mapserver.log.integrity import SCHEMA, Gap, insert, repair

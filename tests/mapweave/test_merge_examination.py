@@ -144,6 +144,7 @@ def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
         (lambda folder: (folder / "odometry.csv").unlink(), (), "without odometry nothing tells"),
         (lambda folder: (folder / "camera.toml").unlink(), (), "it must give the camera's intrinsics"),
         (lambda folder: shutil.rmtree(folder / "images"), ("--robots", "2"), "no images"),
+        (lambda folder: (folder / "splits.toml").write_text("robot = 5"), (), "write a [[robot]] table"),
         (lambda folder: (folder / "truth.csv").write_text("x\n1\n"), (), "no column"),
         (
             lambda folder: (folder / "splits.toml").write_text('[[robot]]\nname="a"\nfirst=0\nlast=9\n'),

@@ -1,0 +1,104 @@
+"""The whole merged map as a file: packed once for each merge, beside all other questions.
+
+Packing 1000 nodes takes seconds, in which acknowledgements, routes and status messages must go on. A question
+that comes while it is packed waits for the one pack after it, so a crowd costs no more than two.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
+
+from hybridmap.errors import Busy
+from hybridmap.history import Happening
+from mapserver.answers import Answers
+from mapserver.mapfiles import map_file_of
+from merge.graph.merged import MergedMap
+from wire.bus import Request
+from wire.mapfile import pack_map_file
+
+MAX_WAITING = 256
+"""Questions; more are refused."""
+PAUSE = 2.0
+"""After what time these may be asked again, s."""
+
+
+class PackedMap:
+    """Answers questions for the map until closed."""
+
+    def __init__(
+        self,
+        answers: Callable[[], Answers],
+        history: Callable[[], Iterable[Happening]],
+        answer: Callable[[Request, Callable[[], bytes]], None],
+        executor: Executor,
+    ) -> None:
+        """Begin.
+
+        Args:
+            answers: the newest ones. May wait for them.
+            history: of the map, which the file takes along.
+            answer: replies to a question with what a function returns, or refuses with what it raises.
+            executor: packs, one job at a time; it is shut down with this.
+        """
+        self._answers = answers
+        self._history = history
+        self._answer = answer
+        self._executor = executor
+        self._lock = threading.Lock()
+        self._waiting: list[Request] = []
+        self._working = False
+        self._packed: tuple[weakref.ref[MergedMap], tuple[Happening, ...], bytes] | None = None
+
+    def ask(self, request: Request) -> None:
+        """Answer some time later.
+
+        Raises:
+            Busy: too many wait.
+        """
+        with self._lock:
+            if len(self._waiting) >= MAX_WAITING:
+                raise Busy(PAUSE)
+            self._waiting.append(request)
+            if self._working:
+                return
+            self._working = True
+        self._executor.submit(self._work)
+
+    def close(self) -> None:
+        """Answer what has come and stop."""
+        self._executor.shutdown()
+
+    def pack(self) -> bytes:
+        """The file of the newest merge."""
+        merged, history = self._answers().merged, tuple(self._history())
+        if self._packed is not None and self._packed[0]() is merged and self._packed[1] == history:
+            return self._packed[2]
+        data = pack_map_file(map_file_of(merged, history))
+        # Bytes of a map that has been replaced are let go with it.
+        self._packed = weakref.ref(merged, self._forget), history, data
+        return data
+
+    def _forget(self, gone: weakref.ref[MergedMap]) -> None:
+        packed = self._packed
+        if packed is not None and packed[0] is gone:
+            self._packed = None
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                requests, self._waiting = self._waiting, []
+                if not requests:
+                    self._working = False
+                    return
+            data: list[bytes] = []
+
+            def once(data: list[bytes] = data) -> bytes:
+                if not data:
+                    data.append(self.pack())
+                return data[0]
+
+            for request in requests:
+                self._answer(request, once)

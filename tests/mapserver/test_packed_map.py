@@ -1,0 +1,112 @@
+"""The whole map as an answer: it holds up nobody, and costs one pack a merge."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from hybridmap.errors import InvalidValue
+from mapserver import packed_map
+from mapserver.server import MapServer
+from tests.waiting import eventually
+from wire.bus import Reply
+from wire.keys import Keys
+from wire.log_messages import decode_record
+from wire.mapfile import unpack_map_file
+from wire.memory import MemoryBus, MemoryHub
+from wire.messages import RouteRequest, decode_route_answer, encode_route_request
+
+KEYS = Keys("fleet")
+MAP = KEYS.server_map("s0")
+
+
+class Served:
+    """A server with a mapped room, whose packing can be held up."""
+
+    def __init__(self, room, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.hub = MemoryHub()
+        self.bus = MemoryBus(self.hub)
+        self.server = MapServer(self.bus, KEYS, room.path, "s0")
+        self.nodes = sorted(room.truth)
+        self.go_on = threading.Event()
+        self.go_on.set()
+        self.packs = 0
+        pack = packed_map.pack_map_file
+
+        def slowly(content: object) -> bytes:
+            self.packs += 1
+            assert self.go_on.wait(30)
+            return pack(content)
+
+        monkeypatch.setattr(packed_map, "pack_map_file", slowly)
+
+    def ask(self, key: str, payload: bytes = b"") -> Reply:
+        bus = MemoryBus(self.hub)
+        try:
+            return bus.ask(key, payload, 30.0)[0]
+        finally:
+            bus.close()
+
+
+@pytest.fixture
+def served(mapped_room, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    served = Served(mapped_room(), monkeypatch)
+    with served.server:
+        assert served.server.settle(20)
+        yield served
+        served.go_on.set()
+    served.bus.close()
+
+
+def test_everything_else_is_answered_while_the_map_is_packed(served: Served) -> None:
+    served.go_on.clear()
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(served.ask, MAP)
+        eventually(lambda: served.packs == 1)
+        begin = time.monotonic()
+        assert decode_record(served.ask(KEYS.server_status("s0")).payload)["nodes"] == len(served.nodes)
+        route = encode_route_request(RouteRequest(served.nodes[0], served.nodes[-1]))
+        assert decode_route_answer(served.ask(KEYS.route("s0"), route).payload).legs
+        assert time.monotonic() < begin + 10.0 and not asked.done()
+        served.go_on.set()
+        assert unpack_map_file(asked.result(30).payload).kind == "merged"
+
+
+def test_the_same_map_is_packed_once(served: Served) -> None:
+    first = served.ask(MAP).payload
+    assert served.ask(MAP).payload == first and served.packs == 1
+    served.server._chronicle.failed("something")
+    told = unpack_map_file(served.ask(MAP).payload).history
+    assert served.packs == 2 and "something" in told[-1].words
+
+
+def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    served.go_on.clear()
+    with ThreadPoolExecutor(20) as pool:
+        asked = [pool.submit(served.ask, MAP) for _ in range(20)]
+        eventually(lambda: served.packs == 1)
+        services = served.server._services._map
+        eventually(lambda: len(services._waiting) == 19)
+        monkeypatch.setattr(packed_map, "MAX_WAITING", 19)
+        refused = served.ask(MAP)
+        assert refused.retry_after == pytest.approx(packed_map.PAUSE) and "busy" in refused.error
+        served.go_on.set()
+        assert len({one.result(30).payload for one in asked}) == 1
+    assert served.packs <= 2
+
+
+def test_a_map_that_cannot_be_packed_is_refused_and_the_next_one_is_not(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as broken:
+
+        def fail(*_: object) -> bytes:
+            raise InvalidValue("too much")
+
+        broken.setattr(packed_map, "map_file_of", fail)
+        assert "too much" in served.ask(MAP).error
+    assert not served.ask(MAP).error
