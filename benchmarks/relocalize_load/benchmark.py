@@ -250,7 +250,8 @@ def figures(total: Tally, routes: list[float], took: float) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    about = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.relocalize_load", description=about)
     parser.add_argument("--robots", type=int, default=50, help="that ask at once")
     parser.add_argument("--seconds", type=float, default=10.0, help="of asking")
     parser.add_argument("--nodes", type=int, default=400, help="in the map")

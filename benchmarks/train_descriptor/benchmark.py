@@ -214,7 +214,9 @@ def store(tables: LandmarkTables) -> Path:
 def main() -> None:
     """Train, and compare or store."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m benchmarks.train_descriptor",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--write", action="store_true", help="store the tables")
     parser.add_argument("--json", action="store_true")
