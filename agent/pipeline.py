@@ -28,13 +28,13 @@ from agent.observation import Command, Observation, RobotDescription
 from agent.ranger_monitor import RangerMonitor
 from agent.servo.proximity import guard
 from agent.tally import Tally
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap import jit
 from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
+from vision.lens import Lens
+from vision.sift import Sift
 
 IDENTITY = Pose2()
 NOTHING_DRIVEN = Tally()
@@ -131,7 +131,7 @@ class Pipeline:
         self._map_id = map_id
         self._settings = settings or PipelineSettings()
         self._description = description
-        lens = Lens(description)
+        lens = Lens(description.camera, description.distortion)
         self._lens = lens
         self._sift = Sift(lens, self._settings.mapper.sift)
         self._mapper = Mapper(map_id, description, self._settings.mapper, contents, next_number)

@@ -76,7 +76,7 @@ class PairExplanation:
         shared: (K, 2) int64, of these, those that agree on one posture.
         residuals_px: (K,) px, how far these are from where the posture predicts them (NaN: behind the image).
         a_from_b: the posture that the landmarks give; None if they agree on none.
-        evidence: numbers of hybridmap.recognising.recognition, empty without a posture.
+        evidence: numbers of registration.recognition, empty without a posture.
         probability: that the link is right, see merge.belief.credence; None without a posture, or where
             nothing joins the two.
         misfit: against the merged map; None if nothing joins the two.

@@ -85,6 +85,8 @@ class Kernel(Generic[P, R]):
             import scipy.linalg  # noqa: F401, numba takes LAPACK from it
         except ImportError:
             return self.python
+        if numba.config.DISABLE_JIT:
+            return self.python
         form: Callable[P, R] = self._looping(numba) if self._loop else self._kept(numba)
         return form
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +20,17 @@ from hybridmap.wake import Wake
 
 CODE_BYTES = 32
 """Length of a compact descriptor in memory, a byte for each coordinate (hybridmap.descriptor)."""
+
+UNMEASURED_SCALE = 0.2
+"""Where no depth is known better than by this share, the scale is what is not known. Mapping keeps no depth
+that is known worse than to 0.25, and some of a drive's are always known much better."""
+
+HELD_TILT = 0.02
+"""rad; where nobody measured the scale the camera was held by hand, and neither level nor at its height."""
+
+LEAST_DEPTH_SHARE = 0.03
+"""What a depth is off by alone, as a share of it, where what it shares with the others is taken apart: the
+uncertainty of both together is rounded to steps of 13 %."""
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 """What an agent, server or fleet may be called: it becomes a chunk of a key expression."""
@@ -114,19 +127,49 @@ class Landmarks:
         """(N,) which landmarks have a 3D position."""
         return np.isfinite(self.depths)
 
+    @cached_property
+    def scale_share(self) -> float:
+        """Share by which all depths may be off together, as they are where nobody has measured the scale.
+
+        A drive knows it by the wheels, so that some depths are known well. Photographs leave it open: there
+        the best known depth is as uncertain as the scale.
+        """
+        shares = self.depth_sigmas[self.has_depth] / self.depths[self.has_depth]
+        least = float(shares.min(initial=math.inf))
+        return least if UNMEASURED_SCALE <= least < math.inf else 0.0
+
+    @property
+    def tilt_sigma(self) -> float:
+        """By which the camera may have been off level, rad."""
+        return HELD_TILT if self.scale_share else 0.0
+
     def points_in_robot(self, camera: Camera) -> Array:
         """(N, 3) m, in the node's robot frame; NaN where there is no depth."""
         return camera.back_project(self.pixels, self.depths)
 
-    def covariances_in_robot(self, camera: Camera, pixel_sigma: float = 0.7) -> Array:
-        """(N, 3, 3) m^2, in the node's robot frame, from the depth's and the pixel's uncertainty."""
+    def covariances_in_robot(
+        self, camera: Camera, pixel_sigma: float = 0.7, scale_share: float = 0.0, tilt_sigma: float = 0.0
+    ) -> Array:
+        """(N, 3, 3) m^2, in the node's robot frame, from the depth's and the pixel's uncertainty.
+
+        Args:
+            camera: of the node.
+            pixel_sigma: standard deviation of a pixel, px.
+            scale_share: what all depths are off by together, as a share of them, is not part of the result:
+                for estimators that account for it.
+            tilt_sigma: by which the camera may have been off level, rad.
+        """
         x = (self.pixels[:, 0].astype(np.float64) - camera.cx) / camera.fx
         y = (self.pixels[:, 1].astype(np.float64) - camera.cy) / camera.fy
         depth = self.depths.astype(np.float64)
         ray = np.stack([np.ones_like(x), -x, -y], axis=-1)
-        covariances: Array = np.einsum("ni,nj,n->nij", ray, ray, self.depth_sigmas.astype(np.float64) ** 2)
+        variances = self.depth_sigmas.astype(np.float64) ** 2
+        if scale_share:
+            variances = np.maximum(variances - (scale_share * depth) ** 2, (LEAST_DEPTH_SHARE * depth) ** 2)
+        covariances: Array = np.einsum("ni,nj,n->nij", ray, ray, variances)
         covariances[:, 1, 1] += (pixel_sigma * depth / camera.fx) ** 2
         covariances[:, 2, 2] += (pixel_sigma * depth / camera.fy) ** 2
+        covariances[:, 2, 2] += (tilt_sigma * depth) ** 2
         return covariances
 
     def take(self, index: NDArray[Any]) -> Landmarks:

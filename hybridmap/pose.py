@@ -116,12 +116,14 @@ class PoseGaussian:
     def __matmul__(self, other: PoseGaussian) -> PoseGaussian:
         """Compose two independent Gaussian postures to first order."""
         ad = other.mean.inverse().adjoint
-        return PoseGaussian(self.mean @ other.mean, ad @ self.covariance @ ad.T + other.covariance)
+        return PoseGaussian(
+            self.mean @ other.mean, nearest_covariance(ad @ self.covariance @ ad.T + other.covariance)
+        )
 
     def inverse(self) -> PoseGaussian:
         """Return the Gaussian of the inverse posture to first order."""
         ad = self.mean.adjoint
-        return PoseGaussian(self.mean.inverse(), ad @ self.covariance @ ad.T)
+        return PoseGaussian(self.mean.inverse(), nearest_covariance(ad @ self.covariance @ ad.T))
 
     def mahalanobis2(self, other: Pose2) -> float:
         """Squared Mahalanobis distance of a posture from the mean, 3 degrees of freedom."""
@@ -132,6 +134,19 @@ class PoseGaussian:
     def from_sigmas(mean: Pose2, sigma_xy: float, sigma_heading: float) -> PoseGaussian:
         """Build with independent standard deviations, m and rad."""
         return PoseGaussian(mean, np.diag([sigma_xy**2, sigma_xy**2, sigma_heading**2]))
+
+
+def nearest_covariance(matrix: Array) -> Array:
+    """(3, 3) the same if it is a covariance, else the nearest one.
+
+    Of what was worked out with a lever of kilometres, or solved with directions of which hardly anything is
+    known, rounding may leave none.
+    """
+    if _is_covariance(*matrix.ravel().tolist()):
+        return matrix
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    nearest: Array = vectors * np.maximum(values, 0.0) @ vectors.T
+    return nearest
 
 
 def _is_covariance(*p: float) -> bool:

@@ -37,7 +37,7 @@ class Certainty(StrEnum):
 
     FOUND = "found"
     PLACE = "place"
-    """The place is known, but not how far from its node the view was taken: the node has no depths."""
+    """The place is known, but not how far from its node the view was taken: nobody has measured its scale."""
     AMBIGUOUS = "ambiguous"
     UNKNOWN = "unknown"
 
@@ -53,7 +53,7 @@ class Whereabouts:
         component: number of the node's component in the merged map.
         inliers: landmarks that agree.
         probability: that this place is the right one, 0 to 1.
-        distance_known: if not, only heading and direction are known, and the covariance says as much.
+        distance_known: if not, nobody has measured the node's scale, and the covariance says as much.
     """
 
     node: NodeId

@@ -146,7 +146,9 @@ def _part_of(parts: Iterable[frozenset[MapId]]) -> dict[MapId, int]:
 
 
 def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pair, str]:
-    """Two maps that are not one, since two robots cannot have been where the links between them say."""
+    """Maps that are not one, since robots cannot have been where the links between them say, or one is
+    wrong.
+    """
     part_of = _part_of(parts)
     reasons: dict[Pair, Counter[str]] = {}
     speaks_of_bodies: dict[str, bool] = {}
@@ -158,7 +160,11 @@ def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pa
         first, second = sorted((r.a.map, r.b.map))
         if speaks_of_bodies[r.reason] and part_of.get(first) != part_of.get(second):
             reasons.setdefault((first, second), Counter())[r.reason] += 1
-    out = {}
+    # One line for a map with wrong geometry, under its pair with the first of those that it contradicts.
+    out: dict[Pair, str] = {}
+    for wrong in merged.wrong.values():
+        first, second = sorted((wrong.which, wrong.agreeing[0]))
+        out[first, second] = wrong.reason
     for (first, second), found in sorted(reasons.items()):
         count = sum(found.values())
         links = "1 link" if count == 1 else f"{count} links"

@@ -34,7 +34,8 @@ class Known:
         if asking not in self._merged.maps:
             return KnownAnswer(np.zeros((0, 4)), f"map {asking} is not in the merged map")
         views = [view for component in self._merged.components for view in self._views(asking, component)]
-        near = [view for view in views if math.dist(view[:2], position) <= reach]
+        # A view whose principal point is outside of its image looks nowhere.
+        near = [view for view in views if view[3] > 0.0 and math.dist(view[:2], position) <= reach]
         near.sort(key=lambda view: math.dist(view[:2], position))
         told = near[:MAX_KNOWN]
         if not views:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+
+import numpy as np
 
 from hybridmap.node import Node, NodeId
 from hybridmap.query import View
-from mapserver.places.placeindex import PlaceIndex
+from mapserver.places.placeindex import PlaceIndex, bounded
+from mapserver.wire_limits import FARTHEST
 from merge.graph.merged import MergedMap
 
 
 class LivingPlaces:
-    """The place index without superseded nodes and maps that are retired or set apart, and nodes without what
-    has faded.
+    """The place index without superseded and misplaced nodes and maps retired or set apart, and nodes
+    without what has faded.
 
     It stands for one merged map; make another for the next. New nodes are compared with all of the index.
     """
@@ -35,8 +38,9 @@ class LivingPlaces:
         """
         self._index, self._node_of, self._merged = index, node_of, merged
         self._left_out = frozenset((*merged.rulings.retired, *merged.set_apart))
-        retired = (node for one in self._left_out if one in merged.maps for node in merged.maps[one].nodes)
-        self._hidden = frozenset((*merged.superseded, *retired, *set_apart))
+        left_out = (node for one in self._left_out if one in merged.maps for node in merged.maps[one].nodes)
+        self._gone = frozenset((*left_out, *set_apart, *_misplaced(merged), *_out_of_range(merged)))
+        self._hidden = self._gone.union(merged.superseded)
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
         """At most k living nodes with how much they look like a view, best first."""
@@ -45,9 +49,35 @@ class LivingPlaces:
         return [(node, score) for node, score in ranked if node.map not in self._left_out]
 
     def node(self, node_id: NodeId) -> Node | None:
-        """A node with the landmarks that are thought to be there; None if it is gone."""
+        """A node with the landmarks that are thought to be there; None if it is gone, or nothing is told of
+        it.
+        """
+        if node_id in self._gone or node_id.map in self._left_out:
+            return None
         known = self._node_of(node_id)
-        return None if known is None else without_faded(known, self._merged)
+        return None if known is None else bounded(without_faded(known, self._merged))
+
+
+def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
+    """Nodes of maps with wrong geometry that show places of other maps.
+
+    Each is the same place as the node that it is linked to, seen by a robot that has it elsewhere: no second
+    place that a robot could be at. What such a map knows alone is told as before.
+    """
+    for refusal in merged.refused if merged.wrong else ():
+        if refusal.link is not None and not refusal.link.within:
+            ends = [node for node in refusal.pair if node.map in merged.wrong]
+            if len(ends) == 1:
+                yield ends[0]
+
+
+def _out_of_range(merged: MergedMap) -> Iterator[NodeId]:
+    """Nodes that lie where no robot can be. Where the origin of a frame is says nothing; distances do."""
+    for graph in merged.graphs:
+        # Written so that NaN is out of range.
+        away = np.abs(graph.means[:, :2] - np.median(graph.means[:, :2], axis=0))
+        inside = (away <= FARTHEST).all(axis=1)
+        yield from (graph.nodes[k] for k in np.flatnonzero(~inside).tolist())
 
 
 def without_faded(node: Node, merged: MergedMap) -> Node:

@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterable
 
 from hybridmap.errors import Busy, MapweaveError
 from hybridmap.history import Happening
+from hybridmap.query import RouteAnswer
 from mapserver.answers import Answers
 from mapserver.blockages import Blockages
 from mapserver.desk import Desk
 from mapserver.mapfiles import map_file_of
+from mapserver.wire_limits import Pairs, drivable, said
 from wire.bus import Bus, Closing, Request
 from wire.keys import Keys
 from wire.log_messages import Scalar, encode_record
@@ -84,17 +86,19 @@ class Services:
 
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)
-        return encode_relocalize_answer(self._answers().relocalizer.answer(view))
+        return encode_relocalize_answer(said(self._answers().relocalizer.answer(view)))
 
     def _route(self, payload: bytes) -> bytes:
         request = decode_route_request(payload)
         answers = self._answers()
         self._blockages.report(request.blocked, self._clock())
         wary = self._blockages.known(self._clock())
-        answer = answers.router.route(
-            request.start, request.goal, request.blocked, wary, request.start_from_robot
-        )
-        return encode_route_answer(answer)
+
+        def route(blocked: Pairs) -> RouteAnswer:
+            start, goal, here = request.start, request.goal, request.start_from_robot
+            return answers.router.route(start, goal, blocked, wary, here)
+
+        return encode_route_answer(drivable(route, request.blocked))
 
     def _known(self, payload: bytes) -> bytes:
         request = decode_known_request(payload)

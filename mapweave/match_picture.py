@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.vision.lens import Lens
 from hybridmap.errors import DeviceError
 from hybridmap.node import Node
 from hybridmap.pose import Pose2
 from hybridmap.query import View
-from hybridmap.recognising.matching import match
+from registration.matching import match
+from vision.lens import Lens
 
 AGREES_PX = 5.0
 """A match agrees if its landmark lies so near to the feature by the posture that was answered."""

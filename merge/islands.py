@@ -95,7 +95,7 @@ class Islands:
         undone = undo(maps, links, rulings)
         everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._memory
         small = sum(len(one.nodes) for one in maps.values()) <= self._exact
-        before = None if small or not earlier else Standing.together(earlier)
+        before = None if small or not earlier else Standing.union(earlier)
         merged, stands = decide(*everything, before)
         if stands.changed > CHANGED * stands.size:
             merged, stands = decide(*everything)

@@ -13,15 +13,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
 from merge.belief.agglomeration import agglomerate
-from merge.belief.consistency import ConsistencySettings, group_links
+from merge.belief.consistency import ConsistencySettings
 from merge.belief.distinctness import weigh
 from merge.belief.drives import refuse_drives
+from merge.belief.groups import LinkGroup
 from merge.belief.joining import optimise
 from merge.belief.memory import Memory
 from merge.belief.readmission import readmitted
@@ -31,6 +32,7 @@ from merge.graph.candidates import Pair
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap, Postures
+from merge.graph.posegraph import PoseGraph
 from merge.graph.solver import Solver
 from merge.standing import Standing
 
@@ -103,55 +105,38 @@ def decide(
     fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
     weighed = _weighed(given, standing, known, fresh, by_node, maps, memory, s)
     held = [link for pair, link in weighed.items() if pair in standing.believed and pair in known]
-    out = standing.refuted & known
-    part = {node: k for k, graph in enumerate(standing.graphs) for node in graph.nodes}
+    refuted = standing.refuted & known
     closed = {
         pair
         for pair in standing.refused.keys() & known
-        if weighed[pair].maps not in fresh and part.get(pair[0]) == part.get(pair[1])
+        if weighed[pair].maps not in fresh and standing.together(*pair)
     }
     if before is not None:
         gone = [standing.weighed[pair] for pair in standing.believed - known]
         solver.resume(standing.graphs, standing.fragments, held, gone)
     refutation = Refutation(maps, fragments, s.exclusion, memory)
-    groups = {
-        (first, second): memory.group(
-            group,
-            [weighed[link.key] for link in group],
-            by_node[first],
-            by_node[second],
-            s.consistency,
-            refutation.verdict,
-            exact=before is None,
-        )
-        for (first, second), group in group_links(
-            [link for pair, link in weighed.items() if pair not in out], by_node
-        ).items()
-    }
-    earlier = {refutation.key_of(weighed[pair]) for pair in out}
+    open_ = [link for pair, link in weighed.items() if pair not in refuted]
+    groups = memory.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
+    earlier = {refutation.key_of(weighed[pair]) for pair in refuted}
     # Each round refutes a link at least, so there is a last one.
     while True:
-        kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
-        solved, kept, strained = optimise(solver, kept, s.strain, whole=before is None)
-        tried = [r.link for r in (*unjoined, *strained) if r.link is not None]
-        if back := readmitted(solver, kept, tried, s.consistency):
-            kept = [*kept, *back]
-        solved = solver.solve(kept, believed=True)
-        told = {link.key for link in kept}
-        unjoined, strained = ([r for r in some if r.pair not in told] for some in (unjoined, strained))
-        refuted = earlier | {key for key, group in groups.items() if group.refuted}
-        changed = None if before is None else solver.changed
-        impossible = refutation.impossible(solved, kept, refuted, changed)
+        solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
+        impossible = refutation.impossible(
+            solved,
+            kept,
+            earlier | {key for key, group in groups.items() if group.refuted},
+            None if before is None else solver.changed,
+        )
         if not impossible:
             break
         for key, reason in impossible.items():
             story = [link for link in kept if refutation.key_of(link) == key]
             groups[key] = groups[key].without(story, reason, s.consistency, refutation.verdict)
-        impossible_pairs = {r.pair for group in groups.values() for r in group.refuted}
-        held = [link for link in held if link.pair not in impossible_pairs]
-    fallen = {r.pair: r for group in groups.values() for r in group.refuted}
-    because = {pair: standing.refused[pair] for pair in closed | out}
-    because |= {r.pair: r for r in (*unjoined, *strained)} | fallen
+        fallen = {r.pair for group in groups.values() for r in group.refuted}
+        held = [link for link in held if link.pair not in fallen]
+    refutations = {r.pair: r for group in groups.values() for r in group.refuted}
+    because = {pair: standing.refused[pair] for pair in closed | refuted}
+    because |= {r.pair: r for r in unjoined} | refutations
     refusals = [r for r in refused if r.a in by_node and r.b in by_node] + list(because.values())
     refusals += [r for fragment in fragments for r in fragment.refused]
     refusals += refuse_drives(maps, solved, s.consistency)
@@ -168,12 +153,30 @@ def decide(
         weighed,
         frozenset(link.pair for link in merged.links),
         because,
-        frozenset(out | fallen.keys()),
+        frozenset(refuted | refutations.keys()),
         merged.graphs,
         tuple(fragments),
         len(given) if before is None else standing.size,
         0 if before is None else standing.changed + len(news),
     )
+
+
+def _joined(
+    solver: Solver,
+    groups: Mapping[Pair, LinkGroup],
+    held: Sequence[Link],
+    closed: Set[Pair],
+    s: MergeSettings,
+    whole: bool,
+) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
+    """Join and optimise: the components, the links that are kept, and those that are not."""
+    kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
+    _, kept, strained = optimise(solver, kept, s.strain, whole)
+    refused = [*unjoined, *strained]
+    tried = [r.link for r in refused if r.link is not None]
+    kept += readmitted(solver, kept, tried, s.consistency)
+    told = {link.key for link in kept}
+    return solver.solve(kept, believed=True), kept, [r for r in refused if r.pair not in told]
 
 
 def _weighed(

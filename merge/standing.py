@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
+from hybridmap.node import NodeId
 from merge.graph.candidates import Pair
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link, RefusedLink
@@ -40,8 +42,16 @@ class Standing:
     size: int = 0
     changed: int = 0
 
+    @cached_property
+    def _component(self) -> dict[NodeId, int]:
+        return {node: k for k, graph in enumerate(self.graphs) for node in graph.nodes}
+
+    def together(self, a: NodeId, b: NodeId) -> bool:
+        """Whether two nodes are in one component."""
+        return self._component.get(a) == self._component.get(b)
+
     @staticmethod
-    def together(parts: Iterable[Standing]) -> Standing:
+    def union(parts: Iterable[Standing]) -> Standing:
         """Of maps that nothing tied together before."""
         some = list(parts)
         return Standing(

@@ -1,4 +1,4 @@
-"""Pose graphs of drives through a city of square blocks for `benchmarks.merge`, in the manner of Manhattan.
+"""Pose graphs of drives through a city of square blocks, in the manner of Manhattan.
 
 All measurements are right, with the noise that they claim: a back end that refuses none of them and finds the
 optimum costs what GTSAM's batch optimum costs. Headings that are little known lead it astray (Carlone, Tron,

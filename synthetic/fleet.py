@@ -1,4 +1,4 @@
-"""Synthetic fleets for `benchmarks.merge`: maps that drift, links that are true, and links that are false.
+"""Synthetic fleets: maps that drift, links that are true, and links that are false.
 
 Only postures are drawn, no landmarks: what is tried here begins where verification ends. False links come as
 they do in buildings: a place that looks like another gives one to four of them, which agree with each other

@@ -1,4 +1,4 @@
-"""The ways to merge that `benchmarks.merge` compares."""
+"""Ways to merge fleets, and what they are worth by the truth."""
 
 from __future__ import annotations
 

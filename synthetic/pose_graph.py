@@ -1,4 +1,4 @@
-"""Pose graphs of others for `benchmarks.merge`: split among robots, and GTSAM's batch optimum of them."""
+"""Pose graphs of others: split among robots, and GTSAM's batch optimum of them."""
 
 from __future__ import annotations
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.drivers.image_file import decode_grey, image_size
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.errors import InvalidMessage, InvalidValue
+from storage.image_file import decode_grey, image_size
 from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 from wire.posture_codec import pack_camera, unpack_camera
 

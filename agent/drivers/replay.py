@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from agent.drivers.image_file import read_grey
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError, InvalidValue
+from storage.image_file import read_grey
 from wire.packing import MAX_STAMP_NS
 from wire.whole_file import read_whole
 
@@ -63,9 +63,18 @@ def images_of(folder: Path) -> list[Path]:
     Raises:
         DeviceError: there are none.
     """
-    images = [p for p in (folder / "images").glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+    return images_in(folder / "images")
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images in a folder in the order of the numbers in their names.
+
+    Raises:
+        DeviceError: there are none.
+    """
+    images = [p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
     if not images:
-        raise DeviceError(f"{folder}: no images in images/ (png, jpg, pgm or bmp)")
+        raise DeviceError(f"{folder}: no images there (png, jpg, pgm or bmp)")
     return sorted(images, key=_natural_order)
 
 

@@ -20,7 +20,7 @@ from agent.observation import Odometry
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.recognising.planar_pose import PlanarPoseSettings, solve_planar_pose
+from registration.planar_pose import PlanarPoseSettings, solve_planar_pose
 
 __all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
 
@@ -44,6 +44,7 @@ class LocalizationFilter:
         ids: Ids,
         points_in_node: Array,
         covariances: Array,
+        scale_share: float = 0.0,
         settings: LocalizationSettings | None = None,
     ) -> None:
         """Start from a posture, however uncertain, and a node's landmarks.
@@ -56,6 +57,8 @@ class LocalizationFilter:
             ids: (n,) landmark ids as they will come in update.
             points_in_node: (n, 3) m, in the node's robot frame; those that cannot be anchored are left out.
             covariances: (n, 3, 3) m^2, in the node's robot frame.
+            scale_share: by which the points and the prior's position may be off together, besides that, as a
+                share of them: the wheels tell.
             settings: see there.
 
         Raises:
@@ -72,6 +75,7 @@ class LocalizationFilter:
         self._bad_reason = ""
         self._rng = np.random.default_rng(0)
         self._insert(ids, points_in_node, covariances, np.zeros((len(ids), 3, 3)))
+        self._state = self._state.of_unknown_scale(scale_share)
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels. The landmarks stand still in the node's frame."""

@@ -115,6 +115,13 @@ class NodeState:
             self.posture, np.concatenate([self.rays, rays]), np.concatenate([self.first, rays]), grown
         )
 
+    def of_unknown_scale(self, share: float) -> NodeState:
+        """The state where all lengths may be off together by a share of them."""
+        change = np.zeros(len(self.covariance))
+        change[:2] = share * self.posture[:2]
+        change[5::3] = -share * self.rays[:, 2]
+        return NodeState(self.posture, self.rays, self.first, self.covariance + np.outer(change, change))
+
     def kept(self, mask: NDArray[np.bool_]) -> NodeState:
         """The state with only some of its landmarks."""
         index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])

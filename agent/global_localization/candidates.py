@@ -12,12 +12,12 @@ from agent.localizing.recall import lookalikes, recall_all
 from agent.mission import WhereAmI
 from agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from agent.observation import Command
-from agent.vision.sift import Features
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View
-from hybridmap.recognising.recognition import Recognition
+from registration.recognition import Recognition
+from vision.sift import Features
 
 RIVAL = 0.5
 """Another node of the own map with this share of the best one's inliers has a say too,"""
@@ -46,11 +46,13 @@ class Candidate:
         node: of whichever robot's map.
         node_from_robot: posture.
         recognized: how the own map knows it; None if the fleet does.
+        distance_known: False if how far the node is away is not known (a photograph of unknown scale).
     """
 
     node: NodeId
     node_from_robot: PoseGaussian
     recognized: RecognizedNode | None = None
+    distance_known: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,9 @@ class FleetMap:
             return Candidates((), "", answer.error or "no answer")
         told = answer.content
         ambiguous = told.reason if told.certainty is Certainty.AMBIGUOUS else ""
-        found = told.candidates if told.certainty is Certainty.FOUND else ()
-        places = tuple(Candidate(place.node, place.node_from_robot) for place in found)
+        found = told.candidates if told.certainty in (Certainty.FOUND, Certainty.PLACE) else ()
+        places = tuple(
+            Candidate(place.node, place.node_from_robot, distance_known=place.distance_known)
+            for place in found
+        )
         return Candidates(places, ambiguous, told.reason)

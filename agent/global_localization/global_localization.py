@@ -16,8 +16,8 @@ from agent.global_localization.settings import GlobalLocalizationSettings
 from agent.localizing.recall import exact_enough
 from agent.motion_primitives import MotionPrimitives
 from agent.observation import Command, RobotDescription
-from agent.vision.sift import Sift
 from hybridmap.pose import Pose2, wrap_angle
+from vision.sift import Sift
 
 STILL = 0.2
 """Seconds that the robot stands still before a look."""
@@ -178,7 +178,9 @@ class GlobalLocalization:
             self.detail = f"own map: {own.reason}"
             # The robot has stood still while the answer was on its way.
             return mine
-        if theirs is not None and not exact_enough(theirs.node_from_robot, sure, leniency):
+        # How far away a photograph was taken shows on the way to it, not by looking again.
+        vague = theirs is not None and not exact_enough(theirs.node_from_robot, sure, leniency)
+        if theirs is not None and theirs.distance_known and vague:
             self.detail += ", but not exactly enough"
             return None
         return theirs

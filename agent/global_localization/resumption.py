@@ -11,9 +11,9 @@ from agent.global_localization.global_localization import GlobalLocalization
 from agent.global_localization.settings import GlobalLocalizationSettings, ResumptionSettings
 from agent.motion_primitives import Behaviour, MotionPrimitives
 from agent.observation import Command, Observation, RobotDescription
-from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.pose import Array, Pose2
+from vision.sift import Sift
 
 REMEMBERED = 600
 """Readings of the rangers that are kept for the floor, the latest."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agent.homing.localizer import BearingLocalizer
 from agent.localizing.localizer import Localizer
 from agent.observation import Observation, Odometry, RobotDescription
 from hybridmap.node import NodeId
@@ -27,11 +26,11 @@ class Fix:
 
     node: NodeId
     node_from_robot: PoseGaussian
-    localizer: Localizer | BearingLocalizer | None = None
+    localizer: Localizer | None = None
     blind: float = 0.0
 
     @staticmethod
-    def of(localizer: Localizer | BearingLocalizer) -> Fix:
+    def of(localizer: Localizer) -> Fix:
         """A fix on a node whose landmarks are in sight."""
         return Fix(localizer.node.id, localizer.pose, localizer)
 

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from agent.ekf.localization import LocalizationFilter, LocalizationSettings
 from agent.observation import Observation, RobotDescription
-from agent.vision.lens import Lens
 from agent.vision.node_tracks import NodeTracks
-from agent.vision.sift import Features
 from agent.vision.tracker import TrackerSettings
 from hybridmap.node import Node
 from hybridmap.pose import Array, PoseGaussian
-from hybridmap.recognising.recognition import Recognition
+from registration.recognition import Recognition
+from vision.lens import Lens
+from vision.sift import Features
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,7 @@ class Localizer:
 
     def _filter_at(self, pose: PoseGaussian, landmarks: NDArray[np.int64]) -> LocalizationFilter:
         node, description = self.node, self._description
+        scale_share = node.landmarks.scale_share
         return LocalizationFilter(
             description.camera,
             description.axle,
@@ -133,7 +134,8 @@ class Localizer:
             pose,
             landmarks,
             node.points_in_robot[landmarks],
-            node.landmarks.covariances_in_robot(node.camera)[landmarks],
+            node.landmarks.covariances_in_robot(node.camera, scale_share=scale_share)[landmarks],
+            scale_share,
             settings=replace(self._settings.filter, side_slip=description.side_slip),
         )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -10,22 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.homing.localizer import BearingLocalizer, BearingLocalizerSettings
 from agent.localizing.localizer import Localizer, LocalizerSettings
 from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Features, Sift
 from hybridmap.node import Node
-from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
-from hybridmap.query import View
-from hybridmap.recognising.bearing_recognition import (
-    BearingRecognitionSettings,
-    recognise_bearings,
-    usable_depths,
-)
-from hybridmap.recognising.bearings import BearingFix
-from hybridmap.recognising.closer import look_closer
-from hybridmap.recognising.recognition import RecognitionSettings, recognise
+from hybridmap.pose import Pose2, wrap_angle
+from registration.levelling import level
+from registration.pose_refinement import look_closer
+from registration.recognition import RecognitionSettings, recognise
+from vision.lens import Lens
+from vision.sift import Sift
 
 
 @dataclass(frozen=True)
@@ -36,8 +28,6 @@ class LookoutSettings:
         localizer: tracking and filtering of its landmarks from then on.
         recognition: when it counts as recognised. Less is asked than of a lost robot, because the posture
             must also be the expected one.
-        bearings: when a node with too few usable depths counts as recognised, by bearings alone.
-        bearing_localizer: tracking of its landmarks from then on.
         plausible: a recognition this far from where the robot believes to be is not believed, m.
         plausible_turn: likewise, rad.
         more: what is tracked already is given up for a fresh look that finds this many times as many
@@ -50,8 +40,6 @@ class LookoutSettings:
             least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0
         )
     )
-    bearings: BearingRecognitionSettings = field(default_factory=BearingRecognitionSettings)
-    bearing_localizer: BearingLocalizerSettings = field(default_factory=BearingLocalizerSettings)
     plausible: float = 0.3
     plausible_turn: float = 0.25
     more: float = 1.3
@@ -66,7 +54,6 @@ class Expected(NamedTuple):
         node_from_robot: where the robot believes to be.
         doubt: how many times further than usual it may be off.
         tracked: landmarks of the node that are tracked already.
-        held: what follows the node by bearings already, and is renewed by a fresh look.
     """
 
     leg: int
@@ -74,7 +61,6 @@ class Expected(NamedTuple):
     node_from_robot: Pose2
     doubt: float = 1.0
     tracked: int = 0
-    held: BearingLocalizer | None = None
 
 
 class Lookout:
@@ -103,9 +89,7 @@ class Lookout:
         self._settings = settings
         self._rng = rng
 
-    def find(
-        self, image: NDArray[np.uint8], wanted: Iterable[Expected]
-    ) -> tuple[int, Localizer | BearingLocalizer] | None:
+    def find(self, image: NDArray[np.uint8], wanted: Iterable[Expected]) -> tuple[int, Localizer] | None:
         """Look for nodes, in their order.
 
         Args:
@@ -118,55 +102,19 @@ class Lookout:
         s, features = self._settings, self._sift.extract(image)
         view = features.view(self._description.camera)
         for one in wanted:
-            if usable_depths(one.node.landmarks, s.bearings.most_share) < s.recognition.least_inliers:
-                by_bearings = self._find_by_bearings(image, features, view, one)
-                if by_bearings is not None:
-                    return one.leg, by_bearings
-                continue
             found = recognise(one.node, view, s.recognition, self._rng)
             if found is None or not self._plausible(found.node_from_robot.mean, one):
                 continue
             if found.inliers > s.more * one.tracked:
-                closer = look_closer(one.node, view, found, s.recognition.pose)
+                node, closer = one.node, look_closer(one.node, view, found, s.recognition.pose)
+                if node.landmarks.scale_share:
+                    levelled = level(node, view, found)
+                    node, closer = levelled.node, levelled.node_from_robot
                 found = replace(found, node_from_robot=closer)
                 return one.leg, Localizer(
-                    self._description, self._lens, one.node, image, features, found, s.localizer
+                    self._description, self._lens, node, image, features, found, s.localizer
                 )
         return None
-
-    def _find_by_bearings(
-        self, image: NDArray[np.uint8], features: Features, view: View, one: Expected
-    ) -> BearingLocalizer | None:
-        """Look for a node whose landmarks have too few depths to tell where the robot is."""
-        s = self._settings
-        found = recognise_bearings(one.node, view, self._rng, s.bearings)
-        if found is None or found.inliers <= s.more * one.tracked:
-            return None
-        # One wall can be explained from two sides: which is the right one shows on the way.
-        likely = [fix for fix in found.fixes if fix.directed == found.fixes[0].directed]
-        if not any(self._in_line(fix, one) for fix in likely):
-            return None
-        if one.held is not None:
-            one.held.renew(features, found)
-            return one.held
-        sigma, turn = s.plausible * one.doubt, s.plausible_turn * one.doubt
-        prior = PoseGaussian.from_sigmas(one.node_from_robot, sigma, turn)
-        return BearingLocalizer(
-            self._description, self._lens, one.node, image, features, found, prior, s.bearing_localizer
-        )
-
-    def _in_line(self, found: BearingFix, expected: Expected) -> bool:
-        """Whether the robot may be in a direction from the node, however far, by what it believes."""
-        s, camera = self._settings, self._description.camera
-        there = expected.node_from_robot @ Pose2(camera.mount_forward)
-        x, y = there.x - expected.node.camera.mount_forward, there.y
-        way, aside = math.hypot(x, y), 0.0
-        if found.directed:
-            off = abs(wrap_angle(math.atan2(y, x) - found.direction))
-            off = max(off - 2.0 * math.sqrt(found.covariance[1, 1]), 0.0)
-            aside = way * math.sin(min(off, 0.5 * math.pi))
-        turned = abs(wrap_angle(found.heading - there.heading))
-        return turned <= s.plausible_turn * expected.doubt and aside <= s.plausible * expected.doubt
 
     def _plausible(self, found: Pose2, expected: Expected) -> bool:
         """Whether the robot may be there, by what it believes."""

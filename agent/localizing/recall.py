@@ -11,7 +11,7 @@ from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node
 from hybridmap.pose import PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.recognition import Recognition, recognise
+from registration.recognition import Recognition, recognise
 
 
 @dataclass(frozen=True)

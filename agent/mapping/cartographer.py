@@ -21,9 +21,9 @@ from hybridmap.grid import settle
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from hybridmap.pose import PoseGaussian
-from hybridmap.recognising.recognition import Recognition, register
-from hybridmap.recognising.selection import SelectionSettings, choose, worth
 from hybridmap.wake import Wake
+from registration.recognition import Recognition, register
+from registration.selection import SelectionSettings, choose, worth
 
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.vision.lens import Lens
 from agent.vision.tracker import Tracker, TrackerSettings
 from hybridmap.camera import Camera
 from hybridmap.pose import Array
+from vision.lens import Lens
 
 PATCH_PX = 11
 """Side of the square in which texture is measured, about that of a tracked patch."""

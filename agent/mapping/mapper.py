@@ -16,14 +16,14 @@ from agent.mapping.view import View
 from agent.mapping.wayside import Wayside, WaysideSettings
 from agent.observation import Observation, RobotDescription
 from agent.surveying.surveyor import Traverse
-from agent.vision.lens import Lens
 from agent.vision.report import TrackReport
-from agent.vision.sift import Features, Sift, SiftSettings
 from hybridmap.change import ChangeBody
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, Node
 from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.recognising.recognition import Recognition
+from registration.recognition import Recognition
+from vision.lens import Lens
+from vision.sift import Features, Sift, SiftSettings
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Mapper:
         self.typical_depth = settings.depths_per_height * max(description.camera.mount_height, 0.05)
         self._description = description
         self._settings = settings
-        self._lens = Lens(description)
+        self._lens = Lens(description.camera, description.distortion)
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings.tracking)
         self._cartographer = Cartographer(map_id, description, settings.cartographer, contents, next_number)

@@ -21,13 +21,13 @@ from agent.mapping.unheld import Unheld
 from agent.mapping.view import View, associate, even_choice
 from agent.observation import Observation, Odometry, RobotDescription
 from agent.vision.hidden import Hidden
-from agent.vision.lens import Lens
 from agent.vision.report import TrackReport
-from agent.vision.sift import Features
 from agent.vision.strikes import Strikes
 from agent.vision.template import Templates
 from agent.vision.tracker import Tracker
 from hybridmap.pose import Array, Pose2, PoseGaussian
+from vision.lens import Lens
+from vision.sift import Features
 
 
 class LostTracks(NamedTuple):

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.vision.sift import Features
 from hybridmap.pose import Array, PoseGaussian
+from vision.sift import Features
 
 
 @dataclass(eq=False)

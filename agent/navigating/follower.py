@@ -8,23 +8,22 @@ from enum import StrEnum
 
 import numpy as np
 
-from agent.homing.localizer import BearingLocalizer
 from agent.localizing.fix import Fix
 from agent.localizing.localizer import Localizer
 from agent.localizing.lookout import Expected, Lookout
 from agent.navigating.detour import Detour
 from agent.navigating.follower_settings import FollowerSettings
 from agent.navigating.headway import Headway
-from agent.navigating.node_servo import NodeServo
 from agent.observation import Command, Observation, RobotDescription
 from agent.servo.blind import BlindDrive
 from agent.servo.proximity import ranger_points
 from agent.servo.step import State
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
+from agent.servo.supervisor import Servo
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from hybridmap.query import RouteLeg
+from vision.lens import Lens
+from vision.sift import Sift
 
 MOST_LOOKED_FOR = 8
 """Nodes tried in one image: a route may put any number of them into one place."""
@@ -87,9 +86,8 @@ class Follower:
             self._start_from_leg.append(self._start_from_leg[-1] @ hop.previous_from_node.mean)
         self._detour = detour
         self._settings = settings
-        # A landmark without a depth has one for the rest of the drive once the way has told it.
-        self._nodes = [leg.node for leg in route]
-        self._servo = NodeServo(description)
+        self._servo = Servo(description)
+        self._servoing = -1
         self._blind_drive = BlindDrive(description)
         self._start = fix.node
         self._last = len(route) - 1
@@ -129,8 +127,6 @@ class Follower:
         s = self._settings
         self._tick += 1
         self.fix.follow(observation, self._description)
-        if self.fix.localizer is not None:
-            self._nodes[self._reference] = self.fix.localizer.node
         if self._tick % s.look_every == 0:
             self._look_for(self._ahead(), observation)
         self._pass_nodes()
@@ -156,9 +152,13 @@ class Follower:
         obstacles = ranger_points(observation.proximity, self._description)
         localizer = self.fix.localizer
         if localizer is not None and self._may_servo(target, distance, parking):
-            if self._servo.leg != self.leg:
-                self._headway = Headway()
-            step = self._servo.command(self.leg, localizer, target, obstacles)
+            points = localizer.node.points_in_robot
+            if self._servoing != self.leg:
+                self._headway, self._servoing = Headway(), self.leg
+                self._servo.start(target, points)
+            visible = np.zeros(len(points), np.bool_)
+            visible[localizer.visible] = True
+            step = self._servo.command(target, points, visible, obstacles)
             if parking:
                 self.progress = Progress.PARKING
                 self.detail = f"{step.reason}, {distance * 1000:.0f} mm off"
@@ -166,7 +166,7 @@ class Follower:
             if step.state != "stuck":
                 self._approaching = False
                 return step.command
-        self._servo.over()
+        self._servoing = -1
         if not parking or distance > self._settings.near:
             self._approaching = False
             command = self._detour.toward(target.inverse())
@@ -182,7 +182,7 @@ class Follower:
             self.progress = Progress.UNSURE
         return step.command
 
-    def _look_at_goal(self, observation: Observation) -> Localizer | BearingLocalizer | None:
+    def _look_at_goal(self, observation: Observation) -> Localizer | None:
         if observation.image is None:
             return None
         found = self._lookout.find(observation.image, [self._expected(self._last)])
@@ -194,7 +194,7 @@ class Follower:
         self._servo_barred = max(self._servo_barred - tick, 0.0)
         if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
             return False
-        if self._servo.leg == self.leg and not (parking and distance <= s.near):
+        if self._servoing == self.leg and not (parking and distance <= s.near):
             self._headway.take(distance, tick)
             if self._headway.stood > (s.stalled_parking if parking else s.stalled):
                 self._servo_barred = s.barred
@@ -212,10 +212,8 @@ class Follower:
             self.progress = Progress.ARRIVED
         elif (localizer := self._look_at_goal(observation)) is not None:
             self._looks.append(localizer.pose)
-            # By bearings alone one look is as good as several: it goes on with all that was seen on the way.
-            if isinstance(localizer, BearingLocalizer) or len(self._looks) == self._settings.goal_looks:
-                if isinstance(localizer, Localizer):
-                    localizer.restart(averaged(self._looks))
+            if len(self._looks) == self._settings.goal_looks:
+                localizer.restart(averaged(self._looks))
                 self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
         else:
             self._hidden += self._description.tick
@@ -267,9 +265,7 @@ class Follower:
     def _expected(self, index: int) -> Expected:
         """A leg's node, with where the robot should be from it."""
         there = self._from_reference(index) @ self.fix.node_from_robot.mean
-        localizer = self.fix.localizer
-        held = localizer if index == self._reference and isinstance(localizer, BearingLocalizer) else None
-        return Expected(index, self._nodes[index], there, 1.0 + self.fix.blind, held=held)
+        return Expected(index, self._route[index].node, there, 1.0 + self.fix.blind)
 
     def _target(self) -> Pose2:
         """`target_from_robot`."""

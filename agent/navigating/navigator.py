@@ -25,12 +25,12 @@ from agent.observation import Command, Observation, RobotDescription
 from agent.surveying.refinement import Refinement, RefinementSettings
 from agent.surveying.surveyor import Surveyor, SurveyorSettings, Traverse
 from agent.tally import Tally
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import RouteAnswer, RouteLeg
+from vision.lens import Lens
+from vision.sift import Sift
 
 HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
 NOTHING_NEAR = "it gets no further, though nothing is near"

@@ -52,8 +52,7 @@ class Refinement:
             fix: None if the robot is lost, or has arrived.
         """
         before = self._localizer
-        now = None if fix is None else fix.localizer
-        self._localizer = now if isinstance(now, Localizer) else None
+        self._localizer = None if fix is None else fix.localizer
         return None if before is None or before is self._localizer else self._refined(before)
 
     def _refined(self, localizer: Localizer) -> Node | None:

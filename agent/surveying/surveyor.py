@@ -112,7 +112,7 @@ class Surveyor:
 
     def _settled(self, fix: Fix) -> bool:
         """Whether landmarks that the node has with their depths have been in sight for a while."""
-        localizer = fix.localizer if isinstance(fix.localizer, Localizer) and fix.in_sight else None
+        localizer = fix.localizer if fix.in_sight else None
         known = localizer is not None and localizer is self._watched
         self._images = self._images + 1 if known else 0
         self._watched = localizer

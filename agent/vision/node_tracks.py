@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.vision.lens import Lens
-from agent.vision.sift import Features
 from agent.vision.strikes import Strikes
 from agent.vision.tracker import Tracker, TrackerSettings
 from hybridmap.pose import Array
+from vision.lens import Lens
+from vision.sift import Features
 
 
 class NodeTracks:

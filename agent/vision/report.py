@@ -11,7 +11,7 @@ from hybridmap.camera import Camera
 from hybridmap.pose import Array
 
 CELLS = 4
-"""The image is cut into CELLS x CELLS cells, as where features are chosen (agent/vision/sift.py)."""
+"""The image is cut into CELLS x CELLS cells, as where features are chosen (vision/sift.py)."""
 
 
 @dataclass(frozen=True, slots=True)

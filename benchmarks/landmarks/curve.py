@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from benchmarks.landmarks.places import SimulatedPlace
 from benchmarks.landmarks.rivals import DEPTH_FLOOR
 from hybridmap.camera import Camera
@@ -24,8 +22,10 @@ from hybridmap.grid import settle
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.recognition import Recognition, examine_view
-from hybridmap.recognising.selection import FIXED_BYTES, SelectionSettings, choose, worth
+from registration.recognition import Recognition, examine_view
+from registration.selection import FIXED_BYTES, SelectionSettings, choose, worth
+from vision.lens import Lens
+from vision.sift import Sift
 
 BUDGETS = (700, 850, 1000, 1200, 1500, 2000, 2500, 3000)
 QUERIES = 4
@@ -105,7 +105,7 @@ def _site(rng: np.random.Generator) -> Site:
     """The next place that shows enough."""
     while True:
         place = SimulatedPlace.draw(rng)
-        sift = Sift(Lens(place.description))
+        sift = Sift(Lens(place.description.camera, place.description.distortion))
         features = sift.extract(place.picture())
         raw = features.raw
         pixels = place.undistorted(raw)

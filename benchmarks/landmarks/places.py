@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from agent.observation import RobotDescription
-from agent.vision.lens import Lens
 from benchmarks.images.surface_points import Surfaces
 from hybridmap.camera import Camera
 from hybridmap.pose import Array, Pose2
@@ -18,6 +17,7 @@ from sim.scene import Scene
 from sim.texture import Image
 from sim.world import PanelSet
 from sim.worlds.catalog import make_world
+from vision.lens import Lens
 
 WORLDS = ("office", "arena", "warehouse", "corridor")
 CLEARANCE = 0.3
@@ -55,7 +55,7 @@ class SimulatedPlace:
             if np.median(surfaces.see(pose, camera, grid).depths) > LEAST_DEPTH:
                 break
         imager = Imager(setup, world.background, [int(rng.integers(1 << 30))])
-        lens = Lens(RobotDescription(camera, setup.distortion))
+        lens = Lens(camera, setup.distortion)
         return SimulatedPlace(camera, pose, surfaces, lens, imager, Scene([PanelSet.of(world.panels)]))
 
     @property

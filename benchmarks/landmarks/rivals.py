@@ -10,9 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from benchmarks.images.known_warps import Image
 from benchmarks.landmarks.pairs import Pair
 from hybridmap.camera import Camera
@@ -22,8 +19,10 @@ from hybridmap.grid import settle
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
-from hybridmap.recognising.matching import MatchSettings, match_vectors
-from hybridmap.recognising.selection import FIXED_BYTES
+from registration.matching import MatchSettings, match_vectors
+from registration.selection import FIXED_BYTES
+from vision.lens import Lens
+from vision.sift import Sift
 from wire.codec import decode_change, encode_change
 
 FRAMING = 80
@@ -75,7 +74,7 @@ class Packed:
 
 def features(image: Image, camera: Camera) -> tuple[Array, NDArray[np.float32]]:
     """Pixels (N, 2) and SIFT (N, 128) of at most 150 features, chosen as robots choose them."""
-    keypoints, sift = Sift(Lens(RobotDescription(camera))).describe(image)
+    keypoints, sift = Sift(Lens(camera)).describe(image)
     return np.array([k.pt for k in keypoints], np.float64).reshape(-1, 2), sift
 
 

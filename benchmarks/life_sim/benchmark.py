@@ -41,9 +41,9 @@ from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.selection import choose
 from mapserver.merging.merger import Merger
 from merge.graph.merged import MergedMap
+from registration.selection import choose
 from sim.world import World
 from sim.worlds.catalog import make_world
 

@@ -25,8 +25,6 @@ from agent.mapping.tracking import Tracking
 from agent.mapping.view import View
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.servo.image_drive import ImageDrive, ImageDriveSettings
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from benchmarks.images.surface_points import Surfaces
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Array, Pose2, PoseGaussian
@@ -37,6 +35,8 @@ from sim.simulation import Simulation
 from sim.world import World
 from sim.worlds.catalog import make_world
 from synthetic.mapping_run import speeds
+from vision.lens import Lens
+from vision.sift import Sift
 
 NAME = "r0"
 SPEED = 0.15
@@ -180,7 +180,7 @@ class _Run:
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
         self.robot = simulation.describe(NAME)
-        settings, lens = MapperSettings(), Lens(self.robot)
+        settings, lens = MapperSettings(), Lens(self.robot.camera, self.robot.distortion)
         self.tracking = Tracking(self.robot, lens, settings.tracking)
         self.filter_settings = settings.tracking.filter
         # One tick for the wheels to settle on the floor.

@@ -12,11 +12,11 @@ from agent.mission import Answer
 from agent.navigating.follower import Progress
 from agent.navigating.navigator import Navigator
 from agent.servo.proximity import guard
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from benchmarks.parking.scene import ROBOT, Scene
 from hybridmap.pose import Array, Pose2, wrap_angle
 from sim.simulation import Simulation
+from vision.lens import Lens
+from vision.sift import Sift
 
 TIME_LIMIT = 60.0
 """s from being put down."""
@@ -91,7 +91,7 @@ def park(scene: Scene, start: Pose2, shortest: float, seed: int) -> Outcome:
         shortest: length of the shortest path, m.
         seed: of the robot's own chance.
     """
-    description, lens = scene.description, Lens(scene.description)
+    description, lens = scene.description, Lens(scene.description.camera, scene.description.distortion)
     navigator = Navigator(description, lens, Sift(lens), scene.own_map, scene.goal.id, seed=seed)
     record, answers = Record(), list[Answer]()
     with scene.simulate(scene.world_from_goal @ start) as simulation:

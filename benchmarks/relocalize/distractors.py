@@ -25,7 +25,7 @@ from benchmarks.relocalize.places import (
 )
 from hybridmap.descriptor import decode, quantise
 from hybridmap.node import Landmarks, Node, NodeId
-from hybridmap.recognising.matching import match
+from registration.matching import match
 
 AGENT = "d"
 """Of all distractors."""

@@ -14,10 +14,10 @@ from benchmarks.relocalize.queries import Query
 from benchmarks.relocalize.score import Reply
 from hybridmap.descriptor import root_sift
 from hybridmap.query import RelocalizeAnswer
-from hybridmap.recognising.matching import match_vectors, squared_distances
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings, examine_matches
 from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
 from mapserver.relocalizing.seenplaces import Sighting, is_lonely
+from registration.matching import match_vectors, squared_distances
+from registration.recognition import Recognition, RecognitionSettings, examine_matches
 
 AT_MOST = 10_000
 """Nodes; of a larger fleet so many are compared, all that are real among them."""

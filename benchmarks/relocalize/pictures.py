@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 import agent.vision
 import sim
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from benchmarks.images import surface_points as mapping_truth
 from benchmarks.images.surface_points import Surfaces
 from hybridmap.camera import Camera
@@ -39,6 +37,8 @@ from sim.scene import Scene
 from sim.stage import upright
 from sim.texture import Image
 from sim.world import PanelSet, World
+from vision.lens import Lens
+from vision.sift import Sift
 
 FOLDER = Path(tempfile.gettempdir()) / "mapweave-relocalize"
 VERSION = 1
@@ -124,7 +124,8 @@ class Photographer:
         self._world, self._seed = world, tuple(seed)
         self._setup = CAMERAS[camera]
         self.camera = self._setup.intrinsics
-        self._lens = Lens(RobotSetup("r0", self._setup).describe())
+        body = RobotSetup("r0", self._setup).describe()
+        self._lens = Lens(body.camera, body.distortion)
         self._eyes = Sift(self._lens)
         self._surfaces = Surfaces(world)
         self._still = PanelSet.of(world.panels)

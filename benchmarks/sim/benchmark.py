@@ -30,7 +30,6 @@ from agent.ekf.mapping import MappingFilter
 from agent.fleet import FleetLink
 from agent.pipeline import PipelineSettings
 from agent.sharing.replication import Replicator
-from agent.vision.sift import Sift
 from agent.vision.tracker import Tracker
 from benchmarks.sim.bare_view import BareView
 from mapweave.trial.fleet import TICKS_PER_SECOND, Fleet, Stage
@@ -44,6 +43,7 @@ from sim.scene import Scene
 from sim.simulation import Simulation
 from sim.world import PanelSet
 from sim.worlds.catalog import make_world
+from vision.sift import Sift
 
 PARTS: dict[str, tuple[tuple[type[Any], tuple[str, ...]], ...]] = {
     "render": ((Imager, ("picture",)),),

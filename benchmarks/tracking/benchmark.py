@@ -30,11 +30,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from agent.vision.tracker import Tracker, TrackerSettings
 from benchmarks.tracking.scenes import Drive, drives
 from hybridmap.pose import Array
+from vision.lens import Lens
+from vision.sift import Sift
 
 AGES = (1, 10, 20, 40, 80, 159)
 WRONG_PX = 3.0
@@ -112,7 +112,7 @@ class Outcome:
 
 def follow(drive: Drive) -> dict[str, Outcome]:
     """All trackers over one drive, frame by frame in turn."""
-    lens = Lens(drive.description)
+    lens = Lens(drive.description.camera, drive.description.distortion)
     features = Sift(lens).extract(drive.images[0])
     truth = drive.truth(features.pixels)
     runners = followers(lens)

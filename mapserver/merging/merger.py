@@ -14,24 +14,25 @@ from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from hybridmap.reach_book import ReachBook
-from hybridmap.recognising.recognition import RecognitionSettings
 from hybridmap.ruling import Rulings
 from mapserver.merging.findings import Findings, Recollection, print_of
 from mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapserver.merging.merger_counters import MergerCounters
 from mapserver.merging.succession import Succession
-from mapserver.places.placeindex import PlaceIndex
+from mapserver.places.placeindex import PlaceIndex, bounded
 from mapserver.relocalizing.lookalikes import LookAlikes
+from merge.belief.contradiction import Contradictions
 from merge.graph.candidates import CandidateSettings, Pair
-from merge.graph.links import Link, RefusedLink
-from merge.graph.merged import MergedMap
+from merge.graph.links import Link, RefusedLink, refuse
+from merge.graph.merged import MergedMap, WrongGeometry
 from merge.graph.pairs import PairTable
-from merge.graph.verdicts import Verdict, Verdicts
+from merge.graph.verdicts import MapPair, Verdict, Verdicts
 from merge.graph.verification import VerificationSettings, verify
 from merge.islands import Islands
 from merge.life.fading import Fader, FadingSettings
 from merge.life.renewal import RenewalSettings, Renewer
 from merge.merging import MergeSettings
+from registration.recognition import RecognitionSettings
 from wire.posture_codec import MAX_POSITION
 
 log = logging.getLogger(__name__)
@@ -118,6 +119,10 @@ class Merger:
         self._pipeline = Pipeline(self.settings, self.reaches)
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
+        merging = self.settings.merging
+        self._contradictions = Contradictions(merging.consistency, merging.strain)
+        self._wrong: dict[MapId, WrongGeometry] = {}
+        self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
         self._changed: set[MapId] = set()
@@ -212,7 +217,10 @@ class Merger:
         ruled = {*rulings.in_force} ^ {*self._rulings.in_force}
         # A map that is retired harms nobody, and is no longer set apart.
         self._isolation.release(one.retires for one in ruled if one.retires is not None)
+        if self._rulings.retired.keys() - rulings.retired.keys():
+            self.alike.forget()
         self._rulings = rulings
+        self._stale |= self._verdicts.at(self.maps.keys())
         self._dirty = True
 
     def suspect(self, maps: Iterable[MapId]) -> None:
@@ -234,14 +242,19 @@ class Merger:
             self._verify(pair for pair in changed if pair in self._pairs)
             for pair in changed:
                 self._touched |= {pair[0].map, pair[1].map}
+                self._stale.add((pair[0].map, pair[1].map))
                 if pair in self._pairs and pair[1] in self._known.get(pair[0], {}):
-                    self._verdicts.put(pair, self._known[pair[0]][pair[1]])
+                    self._verdicts.put(pair, self._told(self._known[pair[0]][pair[1]]))
                 else:
                     self._verdicts.drop(pair)
             for map_id in self._changed:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+            try:
+                self._find_wrong_geometry()
+            except Exception:  # a defect with one map must not hold up the merge
+                log.exception("maps with wrong geometry could not be looked for")
             self._isolation.changed(self._changed)
             maps = [one for one in self._kept if one not in self._isolation]
             try:
@@ -266,10 +279,38 @@ class Merger:
     ) -> MergedMap:
         kept = {one: self._kept[one] for one in maps}
         merged = pipeline.merged(kept, verdicts, touched, self._rulings)
-        merged = replace(merged, set_apart=self._isolation.reasons)
+        merged = replace(merged, set_apart=self._isolation.reasons, wrong=self._wrong)
         if use is not None:
             use(merged)
         return merged
+
+    def _find_wrong_geometry(self) -> None:
+        """Maps that contradict others that agree are merged with nobody."""
+        self._stale |= self._verdicts.at(self._changed)
+        before, retired = self._wrong, self._rulings.retired
+        self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, retired.keys())
+        self._stale = set()
+        if before.keys() - self._wrong.keys():
+            self.alike.forget()
+        differ = {which for which, _ in before.items() ^ self._wrong.items()}
+        for maps in self._verdicts.at(differ):
+            self._touched |= {*maps}
+            for pair in list(self._verdicts.between(maps)):
+                self._verdicts.put(pair, self._told(self._known[pair[0]][pair[1]]))
+
+    def _links(self, maps: MapPair) -> list[Link]:
+        """The links between two maps that people have not ruled out, also those of maps with wrong
+        geometry.
+        """
+        known = (self._known[a][b] for a, b in self._verdicts.between(maps))
+        return [v for v in known if isinstance(v, Link) and self._rulings.against(*v.pair) is None]
+
+    def _told(self, verdict: Verdict) -> Verdict:
+        """A verdict, or why it does not count."""
+        if isinstance(verdict, RefusedLink) or verdict.within:
+            return verdict
+        wrong = self._wrong.get(verdict.a.map) or self._wrong.get(verdict.b.map)
+        return verdict if wrong is None else refuse(verdict, wrong.reason)
 
     def _made_without_bad(
         self, maps: Collection[MapId], first: Exception, use: Callable[[MergedMap], object] | None
@@ -361,7 +402,7 @@ class Merger:
                 continue
             verdict: Verdict
             try:
-                verdict = verify(a, b, self.settings.verification)
+                verdict = verify(bounded(a), bounded(b), self.settings.verification)
             except Exception as error:  # a defect with two nodes must not hold up all others
                 log.exception("%s and %s cannot be compared", a.id, b.id)
                 verdict = RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})")

@@ -6,11 +6,11 @@ between all of them tell true merges from false ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Set
+from collections.abc import Callable, Collection, Iterable
 
 from hybridmap.node import Node, NodeId
 from mapserver.places import tally
-from mapserver.places.placeindex import PlaceIndex
+from mapserver.places.placeindex import PlaceIndex, bounded
 from merge.graph.candidates import Pair
 from merge.graph.pairs import PairTable
 
@@ -34,11 +34,6 @@ class Succession:
         self._left_out: set[NodeId] = set()
         self._newest: dict[str, tuple[int, int]] = {}
 
-    @property
-    def past(self) -> Set[NodeId]:
-        """Nodes of another day that are superseded."""
-        return self._left_out
-
     def overlaps(self, node: Node, before: Iterable[Pair]) -> dict[NodeId, float]:
         """Which nodes a node is compared with: those in the index, and those left out that it was before.
 
@@ -50,7 +45,8 @@ class Succession:
         for other_id in {one for pair in before for one in pair} & self._left_out:
             other = self._node_of(other_id)
             if other is not None and other_id != node.id:
-                value = tally.pair_overlap(node.landmarks.codes, other.landmarks.codes, s.alike)
+                codes, others = (bounded(one).landmarks.codes for one in (node, other))
+                value = tally.pair_overlap(codes, others, s.alike)
                 if value >= s.least_overlap:
                     found[other_id] = value
         return found

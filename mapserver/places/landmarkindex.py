@@ -22,6 +22,9 @@ from mapserver.places.means import SAMPLE, Codes, Ids, Means, Vectors
 
 log = logging.getLogger(__name__)
 
+MOST_WITHIN = 256
+"""Landmarks that are told as alike to one: where thousands are all alike, pairs of them grow by the square.
+While `within` works there are about 200 nodes, and each shows a thing once."""
 AT_ONCE = 1 << 19
 """Landmarks that are copied at once when new cells are filled from old ones."""
 
@@ -126,12 +129,18 @@ class LandmarkIndex:
             return squared, ids
 
     def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids] | None:
-        """(M,) row of the code, squared distance and id of all landmarks within reach; None if too many."""
+        """(M,) row of the code, squared distance and id of the `MOST_WITHIN` nearest landmarks within reach.
+
+        Returns:
+            None if there are too many landmarks for that.
+        """
         with self.lock:
             if self._flat is None:
                 return None
-            limits, squared, ids = self._flat.range_search(decode(codes), reach**2)
-        return np.repeat(np.arange(len(codes)), np.diff(limits.astype(np.int64))), squared, ids
+            # Where there are fewer, the rest of a row has the greatest distance there is.
+            squared, ids = self._flat.search(decode(codes), MOST_WITHIN)
+        rows, places = np.nonzero(squared < reach**2)
+        return rows.astype(np.int64), squared[rows, places], ids[rows, places]
 
     def keep_up(self) -> None:
         """Wait for cells that are being learned if too much has come meanwhile: it is kept twice."""

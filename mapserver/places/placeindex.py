@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
@@ -20,6 +20,8 @@ SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
 FEW_GONE = 20
 """Of more nodes that go at once, the index is read through once for where they lie."""
+MOST_LANDMARKS = 400
+"""Of a node with more the first ones are compared, see `bounded`: a robot's nodes have up to 150."""
 AT_ONCE = 1024
 """Nodes that are taken in at once."""
 
@@ -41,6 +43,16 @@ class PlaceIndexSettings:
     votes: int = 16
     reach: float = 0.6
     compared: int = 64
+
+
+def bounded(node: Node) -> Node:
+    """A node with at most `MOST_LANDMARKS`, the very same one if it has no more.
+
+    Two nodes take as much time to compare as the product of their landmarks.
+    """
+    if len(node.landmarks) <= MOST_LANDMARKS:
+        return node
+    return replace(node, landmarks=node.landmarks.take(np.arange(MOST_LANDMARKS)))
 
 
 class PlaceIndex:
@@ -117,6 +129,7 @@ class PlaceIndex:
                 seal = self._prints.pop(slot)
                 del self._nodes[slot]
                 # Others than those that are there would leave some behind.
+                codes = None if codes is None else codes[:MOST_LANDMARKS]
                 codes = codes if codes is not None and fingerprint(codes) == seal else None
                 self._landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS, codes)
 
@@ -188,7 +201,7 @@ class PlaceIndex:
         Returns:
             Overlaps of at least `least_overlap`.
         """
-        s = self._settings.candidates
+        s, node = self._settings.candidates, bounded(node)
         if len(node.landmarks) == 0 or len(self._landmarks) == 0:
             return {}
         with self._lock:
@@ -210,7 +223,8 @@ class PlaceIndex:
         for other_id, _ in self._ranked(codes, s.compared, [node.id]):
             other = node_of(other_id)
             if other is not None:
-                told[other_id] = tally.pair_overlap(codes, other.landmarks.codes, s.candidates.alike)
+                others = bounded(other).landmarks.codes
+                told[other_id] = tally.pair_overlap(codes, others, s.candidates.alike)
         return {other: value for other, value in told.items() if value >= s.candidates.least_overlap}
 
     def settle(self) -> None:
@@ -243,7 +257,7 @@ class PlaceIndex:
     def _take(self, nodes: list[Node]) -> None:
         """Take in nodes at once."""
         codes, ids = [np.zeros((0, CODE_BYTES), np.uint8)], [np.zeros(0, np.int64)]
-        for node in nodes:
+        for node in map(bounded, nodes):
             known, seal = self._slots.get(node.id), fingerprint(node.landmarks.codes)
             if known is not None:
                 if self._prints[known] == seal:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.landmark_tables import landmark_tables
-from hybridmap.recognising.matching import squared_distances
 from merge.graph.candidates import overlap
+from registration.matching import squared_distances
 
 Whole = NDArray[np.int64]
 Real = NDArray[np.float64]

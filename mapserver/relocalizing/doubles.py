@@ -21,10 +21,10 @@ from hybridmap.camera import Camera
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, wrap_angle
 from hybridmap.query import View
-from hybridmap.recognising.matching import MatchSettings, match
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings, register
 from mapserver.relocalizing.seenplaces import Sighting
 from merge.graph.merged import MergedMap
+from registration.matching import MatchSettings, match
+from registration.recognition import Recognition, RecognitionSettings, register
 
 REMEMBERED = 20_000
 """Pairs of nodes whose verdict is kept, the last ones asked about."""

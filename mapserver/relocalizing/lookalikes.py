@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.matching import match
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings
 from mapserver.relocalizing.doubles import Doubles, same_place, unchanged, unexplained
+from registration.matching import match
+from registration.recognition import Recognition, RecognitionSettings
 
 
 class Retrieval(Protocol):
@@ -74,6 +74,10 @@ class LookAlikes:
         """See Doubles.compare."""
         return self._doubles.compare(a, b)
 
+    def forget(self) -> None:
+        """Look for everything again: nodes that were hidden when it was looked for are there again."""
+        self._known = {}
+
     def __contains__(self, node_id: NodeId) -> bool:
         """Whether this was found out of a node, as it is or as it was."""
         return node_id in self._known
@@ -105,7 +109,10 @@ class LookAlikes:
             between: what the merged map says of two nodes.
         """
         entry = self._known.get(node.id)
-        parted = entry is not None and any(between(one, node.id) is None for one in entry.same)
+        # What is gone, or is of a map that people have retired, is parted from nothing.
+        parted = entry is not None and any(
+            between(one, node.id) is None and node_of(one) is not None for one in entry.same
+        )
         if entry is None or parted or not unchanged(entry.node, node):
             entry = self._search(node, index, node_of, between)
         alike = []

@@ -16,17 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.node import Node, NodeId
-from hybridmap.query import RelocalizeAnswer, View
-from hybridmap.recognising.closer import look_closer
-from hybridmap.recognising.matching import match
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
-from mapserver.relocalizing.appearance import Appearance, AppearanceSettings
+from hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapserver.relocalizing.doubles import between, carried, elsewhere, same_place, unexplained
 from mapserver.relocalizing.judgement import Judge, JudgementSettings, unknown
 from mapserver.relocalizing.lookalikes import LookAlikes, Retrieval
 from mapserver.relocalizing.regions import Regions, RegionSettings
 from mapserver.relocalizing.seenplaces import SeenPlace, Sighting, is_lonely
 from merge.graph.merged import MergedMap
+from registration.matching import match
+from registration.pose_refinement import look_closer
+from registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,6 @@ class RelocalizationSettings:
         recognition: when a view counts as recognised.
         judgement: when a place that was recognised is told.
         regions: when a place counts as being there twice, by its surroundings.
-        appearance: when a node without depths is recognised.
         candidates: nodes that are compared with the view.
         explained_px: a match nearer than this to where a posture found elsewhere expects it speaks for that.
         faint: a node that looks so much less like the view than one that was recognised is not looked at.
@@ -46,7 +44,6 @@ class RelocalizationSettings:
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
     judgement: JudgementSettings = field(default_factory=JudgementSettings)
     regions: RegionSettings = field(default_factory=RegionSettings)
-    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     candidates: int = 16
     explained_px: float = 12.0
     faint: float = 0.25
@@ -78,7 +75,6 @@ class Relocalizer:
         self._settings = settings or RelocalizationSettings()
         self.alike = alike or LookAlikes(self._settings.recognition)
         self.judge = Judge(merged, self._settings.judgement)
-        self._appearance = Appearance(node_of, merged, self._settings.appearance)
         self._regions = Regions(index, node_of, merged, self.alike, self._settings.regions)
 
     def answer(self, view: View) -> RelocalizeAnswer:
@@ -92,8 +88,7 @@ class Relocalizer:
         sightings, refusals = self.look(view, ranked)
         if sightings:
             return self.conclude(view, sightings, ranked)
-        by_looks = self._appearance.answer(view, [node_id for node_id, _ in ranked])
-        return by_looks or unknown(_best_refusal(refusals))
+        return unknown(_best_refusal(refusals))
 
     def look(
         self, view: View, ranked: Sequence[tuple[NodeId, float]]
@@ -145,7 +140,21 @@ class Relocalizer:
         best, *others = sorted(sightings, key=lambda one: (-one.recognition.inliers, one.node))
         best = self._closer(view, best)
         places = self.judge.places([best, *others, *self.doubled(view, best, ranked)])
-        return self.judge.answer(places, partial(self._counterpart, ranked=[node for node, _ in ranked]))
+        answer = self.judge.answer(places, partial(self._counterpart, ranked=[node for node, _ in ranked]))
+        return self._without_scale(answer)
+
+    def _without_scale(self, answer: RelocalizeAnswer) -> RelocalizeAnswer:
+        """The answer, with what it cannot tell by photographs: how far away from them the view was taken."""
+        nodes = [self._node_of(one.node) for one in answer.candidates]
+        known = [node is None or not node.landmarks.scale_share for node in nodes]
+        candidates = tuple(
+            replace(one, distance_known=measured)
+            for one, measured in zip(answer.candidates, known, strict=True)
+        )
+        place = answer.certainty is Certainty.FOUND and not known[0]
+        return replace(
+            answer, certainty=Certainty.PLACE if place else answer.certainty, candidates=candidates
+        )
 
     def _counterpart(self, place: SeenPlace, ranked: Sequence[NodeId]) -> SeenPlace | None:
         """Where the robot may be as well, by what the surroundings of a place look like."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Array, PoseGaussian
 from hybridmap.query import View
-from hybridmap.recognising.recognition import Recognition
 from mapserver.relocalizing.belief import Support
+from registration.recognition import Recognition
 
 THING_SIGMA = 0.35
 """Largest standard deviation of the landmarks on one thing, seen from above, m: of a table of 1.2 m."""

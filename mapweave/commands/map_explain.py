@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hybridmap.errors import InvalidValue
     from hybridmap.node import MapId, NodeId
     from hybridmap.ruling import EXAMPLE
-    from mapserver.people.explanation_json import explanation_record
+    from mapserver.http.explanation_json import explanation_record
     from mapweave.commands.map_ends import ends_of
     from mapweave.explained import maps_words, pair_words
     from mapweave.extras import need

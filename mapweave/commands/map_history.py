@@ -34,7 +34,7 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from hybridmap.errors import InvalidValue
-    from mapserver.people.explanation_json import history_record, time_of
+    from mapserver.http.explanation_json import history_record, time_of
 
     if arguments.most < 1:
         raise InvalidValue(f"--most {arguments.most}: give 1 or more")

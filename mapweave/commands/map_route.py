@@ -41,7 +41,7 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapserver.people.explanation_json import route_values
+    from mapserver.http.explanation_json import route_values
     from mapweave.commands.map_ends import node_of
     from mapweave.explained import route_words
     from mapweave.extras import need

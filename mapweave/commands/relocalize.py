@@ -45,15 +45,14 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from agent.drivers.image_file import read_grey
     from agent.drivers.replay import read_camera
-    from agent.observation import RobotDescription
-    from agent.vision.lens import Lens
-    from agent.vision.sift import Sift
     from hybridmap.errors import DeviceError
     from hybridmap.query import Certainty
-    from mapserver.people.answer_json import answer_record
+    from mapserver.http.answer_json import answer_record
     from mapweave.match_picture import draw_matches
+    from storage.image_file import read_grey
+    from vision.lens import Lens
+    from vision.sift import Sift
     from wire.messages import decode_relocalize_answer, encode_view
 
     if not arguments.image.exists():
@@ -68,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise DeviceError(f"{arguments.draw}: the picture will be a PNG; end its name with .png")
     camera, distortion = read_camera(camera_file)
     grey = read_grey(arguments.image, camera, str(camera_file))
-    lens = Lens(RobotDescription(camera, distortion))
+    lens = Lens(camera, distortion)
     view = Sift(lens).extract(grey).view(camera)
     network = network_of(arguments, settings_of(arguments))
     bus, keys = connect(network)

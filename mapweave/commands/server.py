@@ -41,7 +41,6 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
     from hybridmap.node import check_name
-    from mapserver.people.web import Web, parse_address
     from mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapserver.server import MapServer, ServerSettings
     from mapweave.settings import merge_settings
@@ -56,7 +55,11 @@ def run(arguments: argparse.Namespace) -> int:
     merge = merge_settings(settings, arguments.settings)
     network = network_of(arguments, settings)
     name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
-    address = parse_address(arguments.http) if arguments.http is not None else None
+    address = None
+    if arguments.http is not None:
+        from mapserver.http.web import Web, parse_address
+
+        address = parse_address(arguments.http)
     stop = stop_on_signals()
     bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
     try:

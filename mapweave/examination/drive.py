@@ -15,8 +15,6 @@ from agent.drivers.replay import Replay
 from agent.mission import Carried
 from agent.observation import RobotDescription
 from agent.pipeline import Pipeline, PipelineSettings
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.change import Change
 from hybridmap.errors import DeviceError, InvalidValue
 from hybridmap.node import MapId, NodeId
@@ -25,6 +23,8 @@ from hybridmap.query import Certainty
 from mapserver.merging.merger import Merger
 from mapserver.relocalizing.relocalization import Relocalizer
 from mapweave.examination.verdict import LEVELS, Verdict
+from vision.lens import Lens
+from vision.sift import Sift
 
 REACH = 1.5
 """A place counts as mapped if the mapping robot has been this near to it, m,"""
@@ -115,7 +115,7 @@ class DriveMap:
         self._truth = truth
         self._merger = merger
         self._relocalizer = Relocalizer(merger.index, merger.node, merged)
-        self._sift = Sift(Lens(self.description))
+        self._sift = Sift(Lens(self.description.camera, self.description.distortion))
 
     def questions(self, robot: Replay) -> Iterator[Verdict]:
         """Ask where each image of another pass was taken."""

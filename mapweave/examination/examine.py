@@ -11,7 +11,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import track
 
-from agent.drivers.image_file import read_grey
 from agent.drivers.replay import Replay, images_of, read_camera
 from agent.pipeline import PipelineSettings
 from hybridmap.camera import Camera
@@ -20,6 +19,7 @@ from mapweave.examination.drive import DriveMap, Truth
 from mapweave.examination.photographs import AppearanceMap, Photographs
 from mapweave.examination.splits import robots_of
 from mapweave.examination.verdict import Verdict, figures
+from storage.image_file import read_grey
 
 STAND_IN_HEIGHT = 0.8
 """Of a camera of which only the focal length is known, m: bearings do not depend on it."""
@@ -115,12 +115,12 @@ def _examine_photographs(
     places = AppearanceMap(camera, distortion)
     for number, image in track(list(photographs.places.items()), "first pass", console=console):
         places.add(number, image)
-    verdicts: dict[str, list[Verdict]] = {}
-    for number, image in track(list(photographs.questions.items()), "questions", console=console):
-        for name, verdict in places.ask(number, image, photographs.references[number]):
-            verdicts.setdefault(name, []).append(verdict)
+    verdicts = [
+        places.ask(number, image, photographs.references[number])
+        for number, image in track(list(photographs.questions.items()), "questions", console=console)
+    ]
     about = {"folder": folder.name, "nodes": len(photographs.places), "focal_px": camera.fx}
-    return Examination(about, verdicts)
+    return Examination(about, {"looks": verdicts})
 
 
 def _camera_of(

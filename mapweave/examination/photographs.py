@@ -1,9 +1,8 @@
 """Photographs of a walk without odometry: images of the first pass are places, those of the second ask.
 
 Depths cannot be had from one image every few metres without a known focal length, so the places are nodes
-whose landmarks have none: appearance alone. A candidate is verified by epipolar geometry. That of a robot,
-whose camera stays level at one height, is more exacting than that of a camera that is carried by hand; both
-judge the same candidates.
+whose landmarks have none: appearance alone. A candidate is verified by epipolar geometry, which leaves the
+camera free in all six directions.
 """
 
 from __future__ import annotations
@@ -12,26 +11,27 @@ import csv
 import math
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from agent.drivers.image_file import read_grey
 from agent.drivers.replay import images_of
-from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.camera import Camera
 from hybridmap.errors import DeviceError
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
-from hybridmap.recognising.bearing_recognition import recognise_bearings
 from mapserver.places.placeindex import PlaceIndex
-from mapserver.relocalizing.appearance import agreeing, rivals
 from mapweave.examination.verdict import Verdict
+from registration.evidence import cells
+from registration.matching import match
+from storage.image_file import read_grey
+from vision.lens import Lens
+from vision.sift import Sift
 
 
 @dataclass(frozen=True)
@@ -85,23 +85,59 @@ class Photographs:
             raise DeviceError(f"{path}: every image is a question, so there is no first pass")
 
 
-Geometry = Callable[[Node, View], int]
-"""How many landmarks of a place agree with a view; 0 if it is not recognised."""
+GATE_PX = 2.0
+"""Largest distance from an epipolar line."""
+LEAST_INLIERS, LEAST_SHARE, LEAST_CELLS = 12, 0.5, 4
+"""Matches that agree, as a number and as a share of all; cells of the grid with one, in either image."""
+LEAST_EVIDENCE = 20.0
+"""How much likelier than chance, nats."""
 
 
-def planar(node: Node, view: View) -> int:
-    """By the geometry of a level camera at one height (hybridmap.recognising.bearing_recognition)."""
-    found = recognise_bearings(node, view, np.random.default_rng(node.id.number))
-    return 0 if found is None else found.inliers
+def agreeing(node: Node, view: View) -> NDArray[np.int64] | None:
+    """Landmarks of a node and features of a view that agree on one fundamental matrix (RANSAC).
+
+    Returns:
+        (K, 2) pairs, or None if the view does not show the place.
+    """
+    pairs = match(node.landmarks.codes, view.codes)
+    if len(pairs) < LEAST_INLIERS:
+        return None
+    here, there = node.landmarks.pixels[pairs[:, 0]], view.pixels[pairs[:, 1]]
+    _, mask = cv2.findFundamentalMat(here, there, cv2.FM_RANSAC, GATE_PX, 0.999, 2000)
+    inside = np.zeros(len(pairs), bool) if mask is None else mask[:, 0].astype(bool)
+    count = int(inside.sum())
+    if count < max(LEAST_INLIERS, LEAST_SHARE * len(pairs)):
+        return None
+    if evidence(count, len(pairs), GATE_PX, view.camera.height) < LEAST_EVIDENCE:
+        return None
+    if min(cells(here[inside], node.camera), cells(there[inside], view.camera)) < LEAST_CELLS:
+        return None
+    found: NDArray[np.int64] = pairs[inside]
+    return found
 
 
-def general(node: Node, view: View) -> int:
-    """By the fundamental matrix, as a map server does (mapserver.relocalizing.appearance)."""
-    found = agreeing(node, view)
-    return 0 if found is None else len(found)
+def evidence(
+    inliers: int, matches: int, gate_px: float, height_px: int, used: int = 7, tries: int = 2000
+) -> float:
+    """Nats: Chernoff's bound on so many wrong matches near their lines, without those that made the lines."""
+    inliers, matches = inliers - used, matches - used
+    chance = 2.0 * gate_px / height_px
+    if matches <= 0 or inliers <= chance * matches:
+        return 0.0
+    share = inliers / matches
+    rest = (1.0 - share) * math.log((1.0 - share) / (1.0 - chance)) if share < 1.0 else 0.0
+    return matches * (share * math.log(share / chance) + rest) - math.log(tries)
 
 
-GEOMETRIES: dict[str, Geometry] = {"general": general, "planar": planar}
+def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], comparable: float) -> list[int]:
+    """The place with most inliers, and one node each of others that come into question as well."""
+    order = sorted(inliers, key=lambda name: -inliers[name])
+    found = order[:1]
+    for name in order[1:]:
+        enough = inliers[name] >= comparable * inliers[order[0]]
+        if enough and not any(together(name, other) for other in found):
+            found.append(name)
+    return found
 
 
 class AppearanceMap:
@@ -112,7 +148,7 @@ class AppearanceMap:
     ):
         """Begin with none, for a camera and its lens."""
         self._camera = camera
-        self._sift = Sift(Lens(RobotDescription(camera, distortion)))  # type: ignore[arg-type]
+        self._sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
         self._settings = settings or PhotographSettings()
         self._index = PlaceIndex()
         self._nodes: dict[int, Node] = {}
@@ -126,37 +162,29 @@ class AppearanceMap:
         self._nodes[number] = Node(NodeId("photo", 1, number), 0, nowhere, self._camera, landmarks)
         self._index.add(self._nodes[number])
 
-    def ask(self, number: int, image: Path, reference: Reference | None) -> Iterator[tuple[str, Verdict]]:
-        """Where an image was taken, by each geometry."""
+    def ask(self, number: int, image: Path, reference: Reference | None) -> Verdict:
+        """Where an image was taken."""
         began = time.perf_counter()
         view = self._view(image)
-        extract_ms = 1e3 * (time.perf_counter() - began)
-        for name, geometry in GEOMETRIES.items():
-            began = time.perf_counter()
-            ranked = [node_id.number for node_id, _ in self._index.query(view, self._settings.candidates)]
-            certainty, place = self._judge(ranked, view, geometry)
-            answer_ms = 1e3 * (time.perf_counter() - began)
-            yield (
-                name,
-                Verdict(
-                    query=str(number),
-                    expected=reference is not None,
-                    certainty=certainty,
-                    place="" if place is None else str(place),
-                    right=None if place is None else _is_right(place, reference),
-                    first=_is_right(ranked[0], reference) if ranked else False,
-                    error_frames=math.nan
-                    if place is None or reference is None
-                    else abs(place - reference.best),
-                    extract_ms=extract_ms,
-                    answer_ms=answer_ms,
-                ),
-            )
+        extracted = time.perf_counter()
+        ranked = [node_id.number for node_id, _ in self._index.query(view, self._settings.candidates)]
+        certainty, place = self._judge(ranked, view)
+        return Verdict(
+            query=str(number),
+            expected=reference is not None,
+            certainty=certainty,
+            place="" if place is None else str(place),
+            right=None if place is None else _is_right(place, reference),
+            first=_is_right(ranked[0], reference) if ranked else False,
+            error_frames=math.nan if place is None or reference is None else abs(place - reference.best),
+            extract_ms=1e3 * (extracted - began),
+            answer_ms=1e3 * (time.perf_counter() - extracted),
+        )
 
-    def _judge(self, ranked: list[int], view: View, geometry: Geometry) -> tuple[Certainty, int | None]:
+    def _judge(self, ranked: list[int], view: View) -> tuple[Certainty, int | None]:
         s = self._settings
-        inliers = {number: geometry(self._nodes[number], view) for number in ranked}
-        seen = {number: count for number, count in inliers.items() if count}
+        pairs = {number: agreeing(self._nodes[number], view) for number in ranked}
+        seen = {number: len(found) for number, found in pairs.items() if found is not None}
         if not seen:
             return Certainty.UNKNOWN, None
         best, *others = rivals(seen, lambda one, other: abs(one - other) <= s.apart, s.comparable)

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from hybridmap.errors import InvalidValue, SettingsError
-from hybridmap.node import NodeId
+from hybridmap.node import NodeId, check_name
 from sim import events
+from sim.robots import camera_from_table
 from wire.tables import build
 
 EVERYBODY = "all"
+GOALS = ("foreign", "own", "photographed")
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Send:
     Attributes:
         robot: name; the robot that was lost last if not given.
         goal: the node; `foreign`: another robot's, in another room; `own`: one of its own, in view of which
-            it is not now.
+            it is not now; `photographed`: the last photograph.
     """
 
     robot: str = ""
@@ -63,8 +65,36 @@ class Send:
 
     def __post_init__(self) -> None:
         """Refuse what is no node (InvalidValue)."""
-        if self.goal not in ("foreign", "own"):
+        if self.goal not in GOALS:
             NodeId.parse(self.goal)
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A free way, chosen from the seed, is mapped by photographs; a robot is put down where it begins.
+
+    Attributes:
+        robot: name.
+        count: of photographs.
+        spacing: m between two of them, about.
+        said_spacing: what the photographer says of it, m; the truth by default.
+        camera: that is carried, by its name.
+        name: of the map.
+    """
+
+    robot: str
+    count: int = 9
+    spacing: float = 0.5
+    said_spacing: float = 0.0
+    camera: str = "phone"
+    name: str = "photos"
+
+    def __post_init__(self) -> None:
+        """Refuse what is no walk (InvalidValue)."""
+        if not (3 <= self.count <= 100 and 0.1 <= self.spacing <= 2.0 and 0.0 <= self.said_spacing <= 4.0):
+            raise InvalidValue("photograph: count must be 3 to 100, spacing 0.1 to 2 m")
+        check_name(self.name)
+        camera_from_table(self.camera, "photograph: camera")
 
 
 @dataclass(frozen=True)
@@ -132,6 +162,7 @@ Action = (
     | SetMission
     | Abduct
     | Send
+    | Photograph
     | KillAgent
     | StartAgent
     | KillServer
@@ -147,6 +178,7 @@ KINDS: dict[str, type[Any]] = {
     "mission": SetMission,
     "abduct": Abduct,
     "goto": Send,
+    "photograph": Photograph,
     "kill_agent": KillAgent,
     "start_agent": StartAgent,
     "kill_server": KillServer,

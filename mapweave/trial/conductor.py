@@ -12,9 +12,12 @@ from agent.fleet import encode_mission
 from agent.mission import Carried, Explore, Idle, Mission
 from agent.report import AgentReport
 from hybridmap.errors import InvalidValue, NotConnected
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2
 from mapweave.trial import actions
 from mapweave.trial.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage
 from mapweave.trial.losing import Losing
+from mapweave.trial.photographing import beside, photograph
 from mapweave.trial.recording import Lost, Moment
 from mapweave.trial.reports import Reports
 from mapweave.trial.scenario import CONDITIONS, LONGEST, ScenarioEvent, When
@@ -45,6 +48,7 @@ class Conductor:
         done: how many events have happened.
         doing: what is waited for, or done.
         agents: what those in reach said last.
+        photographed: where photographs that are nodes were really taken: `world_from_robot`.
     """
 
     def __init__(
@@ -75,6 +79,7 @@ class Conductor:
         self.agents: dict[str, AgentReport] = {}
         self._alive = set(stage.robots)
         self._cut: set[str] = set()
+        self.photographed: dict[NodeId, Pose2] = {}
         self._losing = Losing(stage, fleet, self._command, self.note)
         self._grown: tuple[str, int] = ("", 0)
 
@@ -169,7 +174,17 @@ class Conductor:
             case actions.Abduct(robot):
                 self._abduct(robot)
             case actions.Send(robot, goal):
+                if goal == "photographed":
+                    if not self.photographed:
+                        raise InvalidValue("goto: goal = 'photographed', and nothing was photographed before")
+                    goal = str(next(reversed(self.photographed)))
                 self._losing.send(robot, goal)
+            case actions.Photograph(robot):
+                self.photographed |= photograph(self._stage, fleet, action)
+                first = next(pose for node, pose in self.photographed.items() if node.agent == action.name)
+                self.note(f"{action.count} photographs become map {action.name}")
+                fleet.control.kidnap(robot, beside(first, self._stage.seed))
+                self._losing.mark(robot)
             case events.Kidnap(robot):
                 self._happen(event.table)
                 self._losing.mark(robot)

@@ -124,6 +124,7 @@ class Recording:
         sim_s: simulated time.
         wall_s: how long that took.
         wall: s by part, as far as known.
+        photographed: where photographs that are nodes were really taken: `world_from_robot`.
     """
 
     scenario: str
@@ -137,3 +138,4 @@ class Recording:
     sim_s: float = 0.0
     wall_s: float = 0.0
     wall: Mapping[str, float] = field(default_factory=dict)
+    photographed: Mapping[NodeId, Pose2] = field(default_factory=dict)

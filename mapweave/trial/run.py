@@ -25,7 +25,7 @@ from sim.places import starting_places
 
 OWN = ".mapweave-trial"
 """A file of this name marks a folder as a trial's: only there folders are taken away."""
-FOLDERS = ("agents", "server", "logs")
+FOLDERS = ("agents", "server", "logs", "photographs")
 FILES = (
     "*.tum", "*.mapweave", "figures.json", "report.*", "map.png", "errors.png", "film.webm", "scenario.toml",
 )  # fmt: skip
@@ -148,6 +148,7 @@ def _record(stage: Stage, options: TrialOptions, show: Show) -> Recording:
         plan=plan,
         merged=merged,
         lost=tuple(conductor.lost),
+        photographed=conductor.photographed,
         moments=tuple(conductor.moments),
         recoveries_s=tuple(conductor.recoveries_s),
         sim_s=status.stamp_ns / 1e9,

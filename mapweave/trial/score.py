@@ -59,7 +59,7 @@ def score(recording: Recording) -> Figures:
         false_loops=_false(loops, truth),
         links=merged.links,
         false_links=merged.false_links,
-        longest_loop_m=longest_loop(loops, truth, paths, stamps),
+        longest_loop_m=longest_loop([e for e in loops if e.a.agent in paths], truth, paths, stamps),
         explored_share=explored_share(recording.plan, places),
         link_precision=1.0 - merged.false_links / merged.links if merged.links else None,
         link_recall=link_recall(links, truth, recording.plan.walls),
@@ -99,6 +99,9 @@ def node_truth(recording: Recording) -> dict[NodeId, Pose2]:
     """
     truth = {}
     for node in HybridMap(recording.merged.changes).nodes.values():
+        if node.id in recording.photographed:
+            truth[node.id] = recording.photographed[node.id]
+            continue
         if node.id.agent not in recording.robots:
             raise InvalidValue(f"node {node.id} was made by no robot of this trial")
         truth[node.id] = pose_at(recording.robots[node.id.agent].truth, node.stamp_ns)

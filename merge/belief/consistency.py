@@ -10,7 +10,7 @@ Links between the same two places are no independent witnesses and count for les
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array
-from hybridmap.recognising.pose_arrays import PoseGaussians
 from merge.belief.cliques import best_clique, independent_links
 from merge.belief.witnesses import NOTHING, FalseWitnesses, Support, chances, crowds, neighbours, support_of
 from merge.graph.fragments import Fragment
 from merge.graph.links import Link, RefusedLink, place_told, refuse
+from registration.pose_arrays import PoseGaussians
 
 HUNDREDTHS = 100.0
 """Cliques are weighed in whole hundredths of a landmark."""
@@ -262,7 +262,7 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
 
 
 def group_links(
-    links: Sequence[Link], by_node: dict[NodeId, Fragment]
+    links: Sequence[Link], by_node: Mapping[NodeId, Fragment]
 ) -> dict[tuple[NodeId, NodeId], list[Link]]:
     """Links by the names of the two pieces of map, smaller first; each link turned to that direction."""
     groups: dict[tuple[NodeId, NodeId], list[Link]] = {}

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridmap.node import NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
+from hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
 from merge.belief.consistency import ConsistencySettings
 from merge.graph.factors import believable
 from merge.graph.links import Link
@@ -105,7 +105,10 @@ def standpoints(links: Sequence[Link], graph: PoseGraph, *, kept: bool) -> list[
     area = max(float(np.prod(np.ptp(graph.means[:, :2], axis=0))), LEAST_AREA)
     return [
         _standpoint(
-            link, PoseGaussian(Pose2.from_vector(mean), covariance), area, graph.huber if kept else None
+            link,
+            PoseGaussian(Pose2.from_vector(mean), nearest_covariance(covariance)),
+            area,
+            graph.huber if kept else None,
         )
         for link, mean, covariance in zip(links, merged.means, merged.covariances, strict=True)
     ]

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import EdgeKind, MapId, NodeId
 from hybridmap.pose import Array
-from hybridmap.recognising.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 from merge.belief.consistency import ConsistencySettings
 from merge.graph.fragments import Fragment
 from merge.graph.links import DOUBLES, Link, link_of
 from merge.graph.posegraph import PoseGraph
+from registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 
 FOLLOWED = (EdgeKind.MAPPED, EdgeKind.TURNED)
 """Edges whose two nodes share landmarks that were tracked from image to image."""

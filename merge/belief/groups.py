@@ -24,6 +24,7 @@ class LinkGroup:
         second: piece of map; the same for loops within it.
         links: that may be true, from `first` to `second`.
         sorted: what consistency makes of them.
+        given: all that there were at first.
         refuted: those that cannot be true.
     """
 
@@ -31,6 +32,7 @@ class LinkGroup:
     second: Fragment
     links: tuple[Link, ...]
     sorted: Sorted
+    given: tuple[Link, ...] = ()
     refuted: tuple[RefusedLink, ...] = ()
 
     @staticmethod
@@ -39,7 +41,7 @@ class LinkGroup:
     ) -> LinkGroup:
         """Sort links; where two sets contradict each other and neither prevails, one may be impossible."""
         found = sort_links(links, first, second, s)
-        return LinkGroup(first, second, tuple(links), found)._settled(s, verdict)
+        return LinkGroup(first, second, tuple(links), found, tuple(links))._settled(s, verdict)
 
     @property
     def refused(self) -> tuple[RefusedLink, ...]:

@@ -9,11 +9,11 @@ import numpy as np
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array
-from hybridmap.recognising.pose_arrays import PoseGaussians
 from merge.belief.consistency import ConsistencySettings, Sorted
 from merge.graph.links import Link, RefusedLink, refuse
 from merge.graph.posegraph import PoseGraph
 from merge.graph.solver import Solver
+from registration.pose_arrays import PoseGaussians
 
 Groups = Mapping[tuple[NodeId, NodeId], Sorted]
 """Sorted links by the names of the two fragments between which they are."""

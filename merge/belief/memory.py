@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
-from merge.belief.consistency import ConsistencySettings
+from merge.belief.consistency import ConsistencySettings, group_links
 from merge.belief.cutting import fragments_of
 from merge.belief.groups import LinkGroup, Verdict
 from merge.bodies.trails import Trail, trails_of
@@ -29,7 +29,7 @@ class Memory:
     def __init__(self) -> None:
         """Nothing is known yet."""
         self._maps: dict[MapId, tuple[HybridMap, list[Fragment]]] = {}
-        self._groups: dict[Key, tuple[Fragment, Fragment, tuple[Link, ...], LinkGroup]] = {}
+        self._groups: dict[Key, LinkGroup] = {}
         self._weighed: dict[Key, tuple[Link, Link]] = {}
         self._trails: dict[NodeId, tuple[Fragment, tuple[Trail, ...]]] = {}
 
@@ -62,35 +62,35 @@ class Memory:
             found.append(now)
         return found
 
-    def group(
+    def groups(
         self,
         links: Sequence[Link],
-        given: Sequence[Link],
-        first: Fragment,
-        second: Fragment,
+        by_node: Mapping[NodeId, Fragment],
         s: ConsistencySettings,
         verdict: Verdict,
         exact: bool = True,
-    ) -> LinkGroup:
+    ) -> dict[Key, LinkGroup]:
         """See `LinkGroup.of`; links between two fragments are sorted anew only if any of them is new.
 
         Args:
-            links: from `first` to `second`.
-            given: the same as they were given, in the same order.
-            first: piece of map.
-            second: piece of map; may be the same.
+            links: each once.
+            by_node: the fragment of each node.
             s: when links are believed.
             verdict: on sets that are supported alike; it depends on the two fragments alone.
             exact: also if either fragment has changed elsewhere.
+
+        Returns:
+            By the names of the fragments.
         """
-        key = first.name, second.name
-        known = self._groups.get(key)
-        same = known is not None and known[0] is first and known[1] is second
-        if known is not None and (same or not exact) and _same(known[2], given):
-            return known[3]
-        group = LinkGroup.of(links, first, second, s, verdict)
-        self._groups[key] = first, second, tuple(given), group
-        return group
+        out = {}
+        for (a, b), some in group_links(links, by_node).items():
+            first, second = by_node[a], by_node[b]
+            known = self._groups.get((a, b))
+            same = known is not None and known.first is first and known.second is second
+            if known is None or not (same or not exact) or not _same(known.given, some):
+                known = self._groups[a, b] = LinkGroup.of(some, first, second, s, verdict)
+            out[a, b] = known
+        return out
 
     def trails(self, fragment: Fragment, one: HybridMap) -> tuple[Trail, ...]:
         """See `trails_of`; those of a fragment are read once."""

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from hybridmap.node import Node
 from hybridmap.pose import Array, Pose2
-from hybridmap.recognising.matching import match
 from merge.bodies.trails import Trail
 from merge.graph.inview import InView
 from merge.graph.posegraph import PoseGraph
+from registration.matching import match
 
 
 @dataclass(frozen=True)

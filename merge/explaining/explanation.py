@@ -12,7 +12,6 @@ from hybridmap.explanation import Misfit, PairExplanation, Standing, Witness
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, MapId, Node, NodeId
 from hybridmap.pose import Array, Pose2
-from hybridmap.recognising.matching import match
 from hybridmap.ruling import reason_of
 from merge.belief.claims import CLAIMS
 from merge.belief.consistency import ConsistencySettings, group_links, loop_distances2
@@ -24,6 +23,7 @@ from merge.graph.links import Link, RefusedLink, link_of
 from merge.graph.merged import MergedMap
 from merge.graph.verification import VerificationSettings, examine, verify
 from merge.undoing import undo
+from registration.matching import match
 
 
 def explain_nodes(

@@ -14,7 +14,6 @@ from hybridmap.errors import InvalidValue
 from hybridmap.explanation import MapsExplanation, NearMiss
 from hybridmap.node import MapId, NodeId
 from hybridmap.reach import reach_of
-from hybridmap.recognising.matching import match
 from hybridmap.ruling import reason_of
 from merge.explaining.explanation import node_of
 from merge.explaining.own import reach_words
@@ -22,6 +21,7 @@ from merge.explaining.parting import joined_maps
 from merge.graph.links import Link, RefusedLink
 from merge.graph.merged import MergedMap
 from merge.graph.verification import VerificationSettings, examine
+from registration.matching import match
 
 Pair = tuple[MapId, MapId]
 MOST_NEAR = 5

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hybridmap.descriptor import decode
 from hybridmap.node import Edge, Node, NodeId
-from hybridmap.recognising.matching import squared_distances
+from registration.matching import squared_distances
 
 Pair = tuple[NodeId, NodeId]
 

@@ -13,10 +13,10 @@ from scipy.sparse.csgraph import connected_components
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array, Pose2
-from hybridmap.recognising.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 from merge.graph.factors import Factors, Measurement, Rows
 from merge.graph.optimization import ANCHOR_SIGMA, optimized
 from merge.graph.posegraph import HUBER, PoseGraph, factorized
+from registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
 EXACT = 1000
 """Up to as many nodes a covariance is that of all measurements ..."""

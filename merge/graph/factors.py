@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array, PoseGaussian
-from hybridmap.recognising.pose_arrays import adjoints, compose_poses, inverse_poses
+from registration.pose_arrays import adjoints, compose_poses, inverse_poses
 
 Rows = NDArray[np.int64]
 LEAST_SIGMAS = np.array([1e-3, 1e-3, 2e-4])

@@ -36,7 +36,7 @@ class Link:
         b: the greater id.
         a_from_b: posture of b's robot frame in a's.
         shared: (K, 2) int64, landmark indices in a and in b.
-        evidence: of hybridmap.recognising.recognition.
+        evidence: of registration.recognition.
     """
 
     a: NodeId

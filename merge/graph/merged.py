@@ -13,7 +13,7 @@ from hybridmap.change import EdgePut
 from hybridmap.errors import InvalidValue
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
 from hybridmap.ruling import Rulings
 from hybridmap.superseded import Superseded
 from merge.graph.links import Link, RefusedLink
@@ -89,6 +89,26 @@ class Postures(Mapping[NodeId, Placement]):
         return sum(len(graph.nodes) for graph in self._graphs)
 
 
+class WrongGeometry(NamedTuple):
+    """A map that contradicts others, see merge.belief.contradiction.
+
+    Attributes:
+        which: the map.
+        agreeing: maps that agree with each other and not with it, at least two.
+    """
+
+    which: MapId
+    agreeing: tuple[MapId, ...]
+
+    @property
+    def reason(self) -> str:
+        """For example `map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong`."""
+        *most, last = map(str, self.agreeing)
+        return (
+            f"map {self.which} contradicts {', '.join(most)} and {last}, which agree: its geometry is wrong"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class MergedMap:
     """A merge of maps. It keeps the maps as they are, so it can be explained, and made anew without a link.
@@ -106,6 +126,7 @@ class MergedMap:
         faded: (N,) of nodes, which of their landmarks are thought to be gone, see merge.life.fading. Nodes
             where none is are left out.
         set_apart: maps that are not among these, because the merge fails with them, and why.
+        wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -118,6 +139,7 @@ class MergedMap:
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
     set_apart: Mapping[MapId, str] = field(default_factory=dict)
+    wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
 
     @staticmethod
     def empty() -> MergedMap:
@@ -143,7 +165,7 @@ class MergedMap:
         if component is None or component != self.component_of(b):
             return None
         found = self.graphs[component].relative([a], [b])
-        return PoseGaussian(Pose2.from_vector(found.means[0]), found.covariances[0])
+        return PoseGaussian(Pose2.from_vector(found.means[0]), nearest_covariance(found.covariances[0]))
 
     def check(self, end: NodeId | MapId) -> None:
         """Refuse a node or a map that is not there.

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.recognising.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+from hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
+from registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
 HUBER = 2.0
 """Normalised residual from which a measurement that may be wrong pulls no harder."""
@@ -86,7 +86,9 @@ class PoseGraph:
         """A node's posture with its marginal covariance."""
         known = self._known
         if node not in known:
-            known[node] = PoseGaussian(self.pose(node), self.covariance([node])[0, :, 0, :])
+            known[node] = PoseGaussian(
+                self.pose(node), nearest_covariance(self.covariance([node])[0, :, 0, :])
+            )
         return known[node]
 
     def postures(self) -> dict[NodeId, PoseGaussian]:
@@ -96,7 +98,8 @@ class PoseGraph:
             some = self.nodes[first : first + AT_ONCE]
             joint = self.covariance(some)
             for k, node in enumerate(some):
-                out[node] = PoseGaussian(Pose2.from_vector(self.means[first + k]), joint[k, :, k, :])
+                covariance = nearest_covariance(joint[k, :, k, :])
+                out[node] = PoseGaussian(Pose2.from_vector(self.means[first + k]), covariance)
         return out
 
     def relative(self, starts: Sequence[NodeId], ends: Sequence[NodeId]) -> PoseGaussians:

@@ -17,13 +17,13 @@ from scipy.sparse.csgraph import connected_components
 
 from hybridmap.node import NodeId
 from hybridmap.pose import Array, Pose2
-from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
 from merge.graph.component import Component
 from merge.graph.factors import Factors, Rows
 from merge.graph.fragments import Fragment, fragment_by_node
 from merge.graph.links import Link
 from merge.graph.optimization import optimized
 from merge.graph.posegraph import HUBER, PoseGraph
+from registration.pose_arrays import compose_poses, inverse_poses
 
 WHOLE = 1000
 """Components of as many nodes are always optimised as a whole."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 
 from hybridmap.node import MapId
 from hybridmap.ruling import Rulings
@@ -36,6 +36,14 @@ class Verdicts:
         if not known and maps in self._between:
             del self._between[maps]
             self._partners[maps[0]].discard(maps[1])
+
+    def between(self, maps: MapPair) -> Mapping[Pair, Verdict]:
+        """Of the pairs between two maps."""
+        return self._between.get(maps, {})
+
+    def at(self, maps: Set[MapId]) -> set[MapPair]:
+        """Between which maps there is anything, if one of them is among these."""
+        return {pair for pair in self._between if pair[0] in maps or pair[1] in maps} if maps else set()
 
     def ties(self, rulings: Rulings) -> Iterable[MapPair]:
         """Maps between which there are links, those that people have ruled out left out."""

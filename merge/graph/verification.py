@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hybridmap.node import Node
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
 from merge.graph.links import Link, RefusedLink
+from registration.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
 
 
 @dataclass(frozen=True)

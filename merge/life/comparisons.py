@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from hybridmap.node import Node, NodeId
-from hybridmap.recognising.matching import match
 from merge.graph.links import Link
 from merge.graph.verification import VerificationSettings, verify
+from registration.matching import match
 
 MOST = 200_000
 """Comparisons that are remembered; then it begins anew."""

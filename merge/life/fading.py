@@ -26,6 +26,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Array, Pose2
@@ -220,8 +221,7 @@ def things(node: Node, size: float) -> NDArray[np.bool_]:
         size: m, what is nearer to each other may be.
     """
     points = node.points_in_robot
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
-    near: NDArray[np.bool_] = (apart < size) | np.eye(len(points), dtype=np.bool_)
+    near: NDArray[np.bool_] = (cdist(points, points) < size) | np.eye(len(points), dtype=np.bool_)
     return near
 
 

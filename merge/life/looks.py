@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from hybridmap.descriptor import decode, rounding_noise
 from hybridmap.node import Node
 from hybridmap.pose import Pose2
-from hybridmap.recognising.matching import squared_distances
 from merge.graph.inview import InView
 from merge.graph.links import Link
+from registration.matching import squared_distances
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from hybridmap.node import Edge, MapId, NodeId
 from hybridmap.pose import Array
 from hybridmap.reach import RECOGNISED
 from hybridmap.reach_book import ReachBook
-from hybridmap.recognising.pose_arrays import compose_poses, inverse_poses
 from merge.graph.merged import MergedMap
 from merge.graph.posegraph import PoseGraph
 from merge.life.adjacency import Adjacency
+from registration.pose_arrays import compose_poses, inverse_poses
 
 
 class Passages:

@@ -11,8 +11,6 @@ import numpy as np
 from agent.mission import Answer, Question
 from agent.navigating.navigator import Navigator, NavigatorSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Features
 from hybridmap.change import EdgePut, NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Landmarks, MapId, Node, NodeId
@@ -25,6 +23,8 @@ from synthetic.world import (
     take_map,
     take_view,
 )
+from vision.lens import Lens
+from vision.sift import Features
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
 BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)
@@ -94,7 +94,7 @@ class Trial:
 def navigator(
     eyes: Eyes, own: HybridMap, goal: NodeId, settings: NavigatorSettings | None = None
 ) -> Navigator:
-    return Navigator(BODY, Lens(BODY), eyes, own, goal, settings)  # type: ignore[arg-type]
+    return Navigator(BODY, Lens(BODY.camera, BODY.distortion), eyes, own, goal, settings)  # type: ignore[arg-type]
 
 
 def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:

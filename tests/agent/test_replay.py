@@ -216,7 +216,7 @@ def folder_at(name: str):
 ODOMETRY = "frame,turn_rad,forward_m\n" + "0,0,0\n" * COUNT
 WRONG = {
     "no recording": (gone("."), "no such folder"),
-    "no images": (gone("images"), "no images in images/"),
+    "no images": (gone("images"), "images: no images there"),
     "images without a camera": (gone("camera.toml"), "must give the camera's intrinsics"),
     "camera is a folder": (folder_at("camera.toml"), "camera.toml"),
     "camera is no TOML": (written("camera.toml", "width = = 3"), "camera.toml"),

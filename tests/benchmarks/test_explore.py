@@ -143,7 +143,8 @@ def test_figures_by_hand(tmp_path) -> None:
     assert result["minutes_to_half"]["ours"]["2"] == pytest.approx(70 / 60, abs=0.01)
     assert result["nodes"]["ours"]["2"] == 5
     assert table(result).row_count == 3
-    assert draw(done, 2.0, 7, tmp_path).read_bytes()[:4] == b"\x89PNG"
+    mapped = {name: {2: fleets[2].floor} for name, fleets in done.items()}
+    assert draw(mapped, 2.0, 7, tmp_path).read_bytes()[:4] == b"\x89PNG"
     nothing = {name: {2: explored([[inf, inf]], 0)} for name in STRATEGIES}
     assert figures(nothing, 1.0, 7)["speedup_over_random"]["ours"]["2"] is None
     assert table(figures(nothing, 1.0, 7)).row_count == 3

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -41,15 +40,15 @@ def run() -> MappingDrive:
     return drive(3, "arena", "line", 120)
 
 
-def test_the_command_draws_and_tells(tmp_path: Path) -> None:
-    """One short run in a process of its own: its pictures, and its last line for scripts."""
+def test_the_command_draws_and_tells(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One short run: its pictures, and its last line for scripts."""
     out = tmp_path / "a" / "b"
-    command = [sys.executable, "-m", "benchmarks.mapping_run", "--steps", "40", "--runs", "line"]
-    done = subprocess.run(
-        [*command, "--seed", "2", "--out", str(out), "--json"],
-        capture_output=True, text=True, check=True, timeout=200,
-    )  # fmt: skip
-    told = json.loads(done.stdout.splitlines()[-1])
+    arguments = ["--steps", "40", "--runs", "line", "--seed", "2", "--out", str(out), "--json"]
+    monkeypatch.setattr(sys, "argv", ["mapping_run", *arguments])
+    main()
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert told["seed"] == 2
     assert told["abandoned"] == {"line": ""}
     assert told["seconds"] == {"line": 4.0}

@@ -38,11 +38,11 @@ from hybridmap.descriptor import decode, root_sift
 from hybridmap.node import MapId, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
-from hybridmap.recognising.matching import MatchSettings, match_vectors
 from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.belief import Support
 from mapserver.relocalizing.relocalization import Relocalizer
 from merge.graph.merged import MergedMap
+from registration.matching import MatchSettings, match_vectors
 from sim.worlds.catalog import make_world
 from synthetic.world import (
     CAMERA,

@@ -9,9 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
-from benchmarks.tracking.benchmark import follow
+from benchmarks.tracking.benchmark import follow, main
 from benchmarks.tracking.scenes import (
     TEXEL_PX,
     Drive,
@@ -21,6 +19,8 @@ from benchmarks.tracking.scenes import (
 )
 from hybridmap.pose import Pose2
 from sim.camera import WEBCAM
+from vision.lens import Lens
+from vision.sift import Sift
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -51,7 +51,7 @@ def drive(request: pytest.FixtureRequest) -> Drive:
 
 def test_the_truth_is_what_the_pictures_show(drive: Drive):
     """Features found anew in a later picture, by SIFT alone, are where the truth has those of the first."""
-    lens = Lens(drive.description)
+    lens = Lens(drive.description.camera, drive.description.distortion)
     first, last = (Sift(lens).extract(drive.images[k]) for k in (0, -1))
     truth = drive.truth(first.pixels)
     known = np.isfinite(truth[0]).all(axis=1)
@@ -85,7 +85,12 @@ def test_the_last_line_is_for_scripts():
 
 
 @pytest.mark.parametrize("bad", [("--drives", "0"), ("--frames", "3"), ("--seed", "-1")])
-def test_bad_input_gets_one_line(bad: tuple[str, str]):
-    done = run(*bad)
-    assert done.returncode == 1
-    assert done.stderr.splitlines() == ["tracking: at least 1 drive, 12 frames and seed 0 are needed"]
+def test_bad_input_gets_one_line(
+    bad: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["tracking", *bad])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    words = "tracking: at least 1 drive, 12 frames and seed 0 are needed"
+    assert ended.value.code == 1
+    assert capsys.readouterr().err.splitlines() == [words]

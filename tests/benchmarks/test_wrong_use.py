@@ -10,14 +10,11 @@ import pytest
 import benchmarks
 
 FOLDER = Path(benchmarks.__file__).parent
-SEEDED = sorted(
-    path.parent.name for path in FOLDER.glob("*/benchmark.py") if 'add_argument("--seed"' in path.read_text()
-)
+NAMES = sorted(path.parent.name for path in FOLDER.glob("*/benchmark.py"))
+SEEDED = [name for name in NAMES if 'add_argument("--seed"' in (FOLDER / name / "benchmark.py").read_text()]
 """Those that people start, with a seed."""
 WRONG = [
     *((name, ["--seed", "-1"]) for name in SEEDED),
-    ("appearance", ["--trials", "0"]),
-    ("appearance", ["--jobs", "0"]),
     ("ekf", ["--runs", "0"]),
     ("explore", ["--robots", "0"]),
     ("fit_belief", ["--seeds", "-1"]),
@@ -49,6 +46,13 @@ def test_what_is_wrong_is_said_in_one_line(
     assert "Traceback" not in said
     assert "seed" in said.splitlines()[-1] or wrong[0].strip("-") in said.splitlines()[-1]
     assert not any(tmp_path.rglob("*.*")), "nothing is left behind"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_python_starts_it_by_the_name_of_its_folder(name: str) -> None:
+    """`python -m benchmarks.NAME` runs the package's `__main__`."""
+    started = importlib.import_module(f"benchmarks.{name}.__main__")
+    assert started.main is importlib.import_module(f"benchmarks.{name}.benchmark").main
 
 
 def test_the_benchmarks_are_found() -> None:

@@ -11,7 +11,7 @@ from hybridmap.descriptor import ZERO, decode, encode, project, quantise, root_s
 from hybridmap.descriptor_v1 import _tables_v1, renew, restore_v1
 from hybridmap.errors import InvalidFile, InvalidValue
 from hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, landmark_tables
-from hybridmap.recognising.matching import match, match_vectors
+from registration.matching import match, match_vectors
 
 
 def fake_sift(n: int, seed: int) -> np.ndarray:

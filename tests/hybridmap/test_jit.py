@@ -58,9 +58,10 @@ print(json.dumps(told))
 
 def run(folder: Path, how: str, cache: Path) -> dict[str, object]:
     (folder / "some_kernels.py").write_text(MODULE)
-    environment = {
-        **os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])
-    }  # fmt: skip
+    environment = dict(os.environ)
+    environment["NUMBA_CACHE_DIR"] = str(cache)
+    environment["NUMBA_DISABLE_JIT"] = str(int(how == "disabled"))
+    environment["PYTHONPATH"] = os.pathsep.join([str(folder), *sys.path])
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, how], capture_output=True, text=True, check=False, env=environment
     )
@@ -71,8 +72,9 @@ def run(folder: Path, how: str, cache: Path) -> dict[str, object]:
     return told
 
 
-def test_without_numba_a_kernel_runs_as_it_is_written(tmp_path: Path) -> None:
-    assert run(tmp_path, "without", tmp_path / "cache")["hits"] == -1
+@pytest.mark.parametrize("how", ["without", "disabled"])
+def test_without_numba_a_kernel_runs_as_it_is_written(tmp_path: Path, how: str) -> None:
+    assert run(tmp_path, how, tmp_path / "cache")["hits"] == -1
 
 
 def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
-from hybridmap.recognising.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+from registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
 metres = st.floats(-50, 50)
 angles = st.floats(-10, 10)
@@ -149,3 +149,17 @@ def test_arrays_agree_with_single_postures() -> None:
         assert stacked[0].distances2()[k] == pytest.approx(
             one[k].inverse().inverse().mahalanobis2(Pose2()), abs=1e9
         )
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-6, 2), st.floats(0, 5))
+def test_whatever_comes_through_a_message_can_be_turned_round_and_composed(
+    seed: int, size: float, lever: float
+) -> None:
+    """Of any rank, rounded to float32, and seen from kilometres away, where only rounding is left of it."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(3, rng.integers(1, 4))) * 10.0**size
+    rounded = (root @ root.T).astype(np.float32).astype(np.float64)
+    pose = PoseGaussian(Pose2(*rng.normal(size=2) * 10.0**lever, rng.uniform(-3, 3)), rounded)
+    for one in (pose, pose.inverse(), pose.inverse().inverse(), pose @ pose.inverse(), pose.inverse() @ pose):
+        values = np.linalg.eigvalsh(one.covariance)
+        assert values[0] >= -3e-6 * values[-1]

@@ -36,7 +36,7 @@ ANSWER = RelocalizeAnswer(
 PLACE = RelocalizeAnswer(
     Certainty.PLACE,
     (Whereabouts(NodeId("r0", 1, 7), HERE, None, -1, 31, 0.9, distance_known=False),),
-    "31 landmarks of r0.1.7, which has no depths, agree",
+    "31 landmarks of r0.1.7 agree",
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,46 @@ def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two)
         if not known:
             assert "retired by anna" in route.reason and '"rebuilt"' in route.reason
             assert "1 retired" in answers.merged.summary()
+
+
+def told(merger: Merger, views: Sequence[View]) -> list[Certainty]:
+    """Answers once it is known what all nodes look like, as on a server that has nothing else to do."""
+    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    while relocalizer.prepare(50):
+        pass
+    return [relocalizer.answer(view).certainty for view in views]
+
+
+def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
+    rng = np.random.default_rng(4)
+    world, maps = room(0, 0, 5, 4, 700, rng), [MapId(agent, 1) for agent in "abc"]
+    logs: dict[MapId, list[Change]] = {}
+    for map_id in maps:
+        tour = [Pose2(*rng.uniform([1.2, 1.0], [3.8, 3.0]), 1.26 * k) for k in range(10)]
+        nodes, edges = take_map(world, map_id, tour, rng)
+        bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+        logs[map_id] = [Change(map_id, number, 0, body) for number, body in enumerate(bodies, start=1)]
+    views = [take_view(world, Pose2(2.5, 2.0, 0.5 * k), rng)[0] for k in range(12)]
+    merger, retired = Merger(), Ruling((maps[2], maps[2]), True, "anna", 1, "moved")
+    for map_id in maps[:2]:
+        for change in logs[map_id]:
+            merger.on_change(change)
+    before = told(merger, views)
+    for change in logs[maps[2]]:
+        merger.on_change(change)
+    with_it = told(merger, views)
+    assert merger.merged().joined(maps[0], maps[2])
+    merger.rule(Rulings([retired]))
+    assert told(merger, views) == before and before.count(Certainty.FOUND) >= 8
+    # A node that comes meanwhile looks like some of the retired map's, and that is known once it is taken
+    # back.
+    late = take_map(world, MapId("d", 1), [Pose2(2.3, 2.0, 0.6)], rng)[0]
+    merger.on_change(Change(MapId("d", 1), 1, 0, NodePut(late[0])))
+    told(merger, views)
+    merger.rule(Rulings([retired, replace(retired, apart=False)]))
+    assert told(merger, views) == with_it
+    alike = merger.alike.of(late[0], merger.index, merger.node, lambda a, b: None)
+    assert any(one.other.id.map == maps[2] for one in alike)
 
 
 def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:

@@ -16,8 +16,8 @@ from hybridmap.node import MapId, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.reach import RECOGNISED, reach_of
 from hybridmap.ruling import Ruling, Rulings
+from mapserver.http.explanation_json import route_values
 from mapserver.merging.merger import Merger
-from mapserver.people.explanation_json import route_values
 from mapserver.route_explaining import explain_route
 from mapserver.routes import Router
 from mapweave.explained import route_words

@@ -13,9 +13,6 @@ import numpy as np
 import pytest
 import skimage.data
 
-from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.camera import Camera
 from hybridmap.change import Change, NodePut
 from hybridmap.errors import Busy
@@ -28,6 +25,8 @@ from mapserver.server import MapServer
 from mapserver.services import Services
 from mapweave.cli import main
 from mapweave.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
+from vision.lens import Lens
+from vision.sift import Sift
 from wire.bus_settings import BusSettings
 from wire.codec import encode_change
 from wire.keys import Keys
@@ -62,7 +61,7 @@ def picture(node_from_robot: Pose2) -> np.ndarray:
 
 
 def view_of(image: np.ndarray) -> View:
-    return Sift(Lens(RobotDescription(CAMERA))).extract(image).view(CAMERA)
+    return Sift(Lens(CAMERA)).extract(image).view(CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +167,7 @@ def test_wide_images_stand_above_each_other(node: Node, tmp_path: Path) -> None:
     moved = View(view.pixels + np.array([160, 0], np.float32), view.codes, wide)
     image = np.full((240, 640), 90, np.uint8)
     broad = Node(node.id, 0, node.map_from_robot, wide, node.landmarks)
-    draw_matches(tmp_path / "wide.png", image, Lens(RobotDescription(wide)), broad, moved, MOVED)
+    draw_matches(tmp_path / "wide.png", image, Lens(wide), broad, moved, MOVED)
     drawn = cv2.imread(str(tmp_path / "wide.png"))
     assert drawn.shape[1] == 2 * 640
     assert drawn.shape[0] > 4 * 240

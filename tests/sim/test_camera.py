@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agent.vision.lens import Lens
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
 from hybridmap.pose import Pose2
@@ -22,6 +21,7 @@ from sim.robots import RobotSetup
 from sim.scene import Scene
 from sim.texture import Texture
 from sim.world import PanelSet, upright_panel
+from vision.lens import Lens
 
 COLUMNS, ROWS = 12, 9
 """Squares of a board that fills the picture."""

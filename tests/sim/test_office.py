@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.errors import InvalidValue
 from sim.simulation import Simulation
 from sim.world import World
 from sim.worlds.office import DOOR, make_office
+from vision.lens import Lens
+from vision.sift import Sift
 
 SEEDS = range(9)
 SCALE = 40
@@ -122,7 +122,7 @@ def test_there_is_enough_to_see(offices: list[World]) -> None:
     counts = []
     for world in offices[1:4]:
         with Simulation(world, ["r0"], 1) as simulation:
-            sift = Sift(Lens(simulation.describe("r0")))
+            sift = Sift(Lens(*simulation.describe("r0").optics))
             for _ in range(6):
                 simulation.kidnap("r0", world.plan.random_free_pose(rng, ROBOT))
                 counts.append(len(sift.extract(simulation.observe("r0").image)))

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 
 from agent.observation import Command
-from agent.vision.lens import Lens
 from agent.vision.tracker import Tracker, TrackerSettings
 from sim.simulation import Simulation
 from sim.world import PanelSet, World
+from vision.lens import Lens
 
 PATCH = np.array([(dx, dy) for dx in (-9, 0, 9) for dy in (-9, 0, 9)], float)
 """Around a point, px: all of it must be on one surface, or what is tracked is no point of a wall."""
@@ -27,7 +27,7 @@ def test_tracks_follow_points_of_walls(office: World, caster, stand) -> None:
 
         for command in (Command(0.3, 0.0), Command(0.15, 0.4), Command(0.0, -0.5), Command(-0.2, 0.2)):
             # Small windows: how a large patch grows on the way is Lucas-Kanade's trouble, not the picture's.
-            tracker = Tracker(Lens(simulation.describe("r0")), TrackerSettings(window_px=9))
+            tracker = Tracker(Lens(*simulation.describe("r0").optics), TrackerSettings(window_px=9))
             image = simulation.step({"r0": command})["r0"].image
             pixels = cv2.goodFeaturesToTrack(image, 90, 0.02, 9)[:, 0].astype(float)
             pixels = pixels[camera.contains(pixels, 12.0)]

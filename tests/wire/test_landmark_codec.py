@@ -26,8 +26,8 @@ from hybridmap.landmark_tables import landmark_tables
 from hybridmap.node import Landmarks, Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.ranges import Ranges
-from hybridmap.recognising.recognition import Recognition, examine_nodes
-from hybridmap.recognising.selection import SelectionSettings, choose
+from registration.recognition import Recognition, examine_nodes
+from registration.selection import SelectionSettings, choose
 from tests.hybridmap.kernel_forms import in_numpy
 from wire.codec import decode_body, encode_body, encode_change
 from wire.landmark_codec import (

@@ -260,3 +260,29 @@ def test_prior_keeps_its_convention() -> None:
         Pose2(1.0, 2.0, 2.2), np.array([[0.04, 0.01, 0.0], [0.01, 0.02, 0.003], [0.0, 0.003, 0.01]])
     )
     np.testing.assert_allclose(NodeState.of_prior(prior).pose.covariance, prior.covariance, atol=1e-15)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.25])
+def test_wheels_tell_the_scale_of_a_photograph(scale):
+    """All points, and the prior's way, are off together; a drive later the posture is right, and knows it."""
+    squared = []
+    for seed in range(8):
+        world = World(seed)
+        centre = np.array([world.camera.mount_forward, 0.0, world.camera.mount_height])
+        mapped = centre + scale * (world.mapped - centre)
+        prior = PoseGaussian.from_sigmas(
+            Pose2(scale * world.true.x, scale * world.true.y, world.true.heading), 0.01, 0.01
+        )
+        far = (scale - 1.0) * np.array([world.true.x, world.true.y])
+        located = LocalizationFilter(
+            world.camera, AXLE, WHEEL_NOISE, prior, world.ids, mapped, scale**2 * world.covariances, 0.3
+        )
+        # The prior says that it may be off by so much.
+        assert located.pose.mahalanobis2(world.true) < 16.3
+        assert np.linalg.norm(far) > 0.05
+        for k in range(60):
+            located.predict(world.step(k))
+            located.update(world.ids, world.see())
+        squared.append(located.pose.mahalanobis2(world.true))
+        assert located.pose.mean.distance(world.true) < 0.03
+    assert np.mean(squared) < 6.0, "3 is expected"

@@ -13,7 +13,6 @@ from agent.global_localization.global_localization import MOVE
 from agent.global_localization.resumption import Resumption
 from agent.global_localization.settings import ResumptionSettings
 from agent.observation import Command, Observation, Odometry, RobotDescription
-from agent.vision.sift import Features
 from hybridmap.change import NodePut
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import CODE_BYTES, MapId
@@ -25,6 +24,7 @@ from synthetic.world import (
     take_map,
     take_view,
 )
+from vision.sift import Features
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
 BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)

@@ -11,17 +11,17 @@ import pytest
 
 from agent.localizing.localizer import Localizer
 from agent.observation import Observation, Odometry
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.pose import Pose2
-from hybridmap.recognising.recognition import recognise
+from registration.recognition import recognise
+from vision.lens import Lens
+from vision.sift import Sift
 
 CENTIMETRES_3, DEGREE = 0.03, math.radians(1.0)
 
 
 def located(walls, description, node, world_from_robot, seed=0) -> Localizer:
     """A localizer that has recognised the node from somewhere."""
-    lens = Lens(description)
+    lens = Lens(description.camera, description.distortion)
     image = walls.render(world_from_robot)
     features = Sift(lens).extract(image)
     recognition = recognise(node, features.view(description.camera), None, np.random.default_rng(seed))
@@ -127,7 +127,7 @@ def test_what_moves_by_itself_is_given_up(walls, description, node):
 def test_the_cameras_lens_is_taken_into_account(walls, description, node):
     """The same posture through a lens that bends lines: the image is bent here by hand."""
     bent = replace(description, distortion=(-0.12, 0.02, 0.0, 0.0, 0.0))
-    lens, pose = Lens(bent), STARTS[0]
+    lens, pose = Lens(bent.camera, bent.distortion), STARTS[0]
     rows, columns = np.mgrid[0:240, 0:320].astype(np.float64)
     straight = lens.undistort(np.column_stack([columns.ravel(), rows.ravel()])).reshape(240, 320, 2)
     image = cv2.remap(walls.render(pose), straight.astype(np.float32), None, cv2.INTER_CUBIC)

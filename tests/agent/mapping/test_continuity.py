@@ -13,11 +13,11 @@ from agent.mapping.continuity import Continuity, ContinuitySettings, Sight, reli
 from agent.mapping.mapper import Mapper, MapperSettings
 from agent.mapping.track_settings import TrackingSettings
 from agent.observation import Observation, Odometry
-from agent.vision.lens import Lens
 from agent.vision.tracker import TrackerSettings
 from hybridmap.camera import Camera
 from hybridmap.node import MapId
 from hybridmap.pose import Pose2
+from vision.lens import Lens
 
 HERE = Pose2(0.2, 0.1, 0.05)
 NOTHING = np.zeros((0, 2))
@@ -25,7 +25,12 @@ NOTHING = np.zeros((0, 2))
 
 @pytest.fixture
 def continuity(description) -> Continuity:
-    return Continuity(Lens(description), description.camera, TrackerSettings(), ContinuitySettings())
+    return Continuity(
+        Lens(description.camera, description.distortion),
+        description.camera,
+        TrackerSettings(),
+        ContinuitySettings(),
+    )
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from agent.mapping.placed import HERE
 from agent.mapping.track_settings import TrackingSettings
 from agent.mapping.tracking import Tracking
 from agent.observation import Observation, Odometry
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from hybridmap.pose import Pose2
+from vision.lens import Lens
+from vision.sift import Sift
 
 LEFT = 0.06
 """rad a tick."""
@@ -20,7 +20,7 @@ LEFT = 0.06
 
 def begun(walls, description, settings: TrackingSettings | None = None) -> Tracking:
     """Tracking that has begun at the origin."""
-    lens = Lens(description)
+    lens = Lens(description.camera, description.distortion)
     tracking = Tracking(description, lens, settings or TrackingSettings())
     first = Observation(0, Odometry(0.0, 0.0), walls.render(Pose2()))
     tracking.step(first)

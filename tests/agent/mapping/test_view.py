@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.mapping.view import associate, even_choice
-from agent.vision.sift import Features
 from hybridmap.node import CODE_BYTES
+from vision.sift import Features
 
 places = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), max_size=14, unique=True)
 

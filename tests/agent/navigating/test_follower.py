@@ -11,16 +11,17 @@ from agent.navigating.detour import Detour
 from agent.navigating.follower import MOST_LOOKED_FOR, Follower, Progress
 from agent.navigating.follower_settings import FollowerSettings
 from agent.navigating.headway import Headway
-from agent.navigating.node_servo import NodeServo
 from agent.observation import Command, Observation, Odometry, RobotDescription
 from agent.servo.step import ServoStep
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
+from agent.servo.supervisor import Servo
 from hybridmap.camera import Camera
 from hybridmap.node import Node
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import RouteLeg
-from hybridmap.recognising.recognition import recognise
+from registration.recognition import recognise
+from tests.hand_held import photograph
+from vision.lens import Lens
+from vision.sift import Sift
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
@@ -43,7 +44,7 @@ class Deluded:
 
 
 def follower_at_the_goal(node: Node) -> Follower:
-    lens = Lens(ROBOT)
+    lens = Lens(ROBOT.camera, ROBOT.distortion)
     fix = Fix(node.id, HERE, Deluded(node))  # type: ignore[arg-type]
     route = (RouteLeg(node, HERE, None),)
     rng = np.random.default_rng(0)
@@ -68,6 +69,31 @@ def test_slid_tracks_do_not_park_the_robot_beside_the_goal(walls, node, begin):
     assert abs(pose.heading) < np.radians(1.0)
 
 
+@pytest.mark.parametrize(("scale", "pitch", "roll"), [(1.25, 0.02, -0.015), (0.8, -0.02, 0.01)])
+def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch, roll):
+    """Tilted, and of a scale that is off by a quarter: the robot has only the photograph to go by."""
+    held = photograph(node, scale, pitch, roll)
+    pose, lens = Pose2(-0.7, 0.12, -0.1), Lens(ROBOT.camera, ROBOT.distortion)
+    lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
+    believed = Pose2(scale * pose.x, scale * pose.y, pose.heading)
+    found = lookout.find(walls.render(pose), [Expected(0, held, believed)])
+    assert found is not None
+    rng, route = np.random.default_rng(0), (RouteLeg(held, HERE, None),)
+    follower = Follower(
+        ROBOT, lens, Sift(lens), route, Fix.of(found[1]), Detour(ROBOT), FollowerSettings(), rng
+    )
+    odometry = Odometry(0.0, 0.0)
+    for tick in range(400):
+        command = follower.step(Observation(tick * 100_000_000, odometry, walls.render(pose)))
+        if follower.progress is Progress.ARRIVED:
+            break
+        odometry = Odometry(command.forward * ROBOT.tick, command.turn * ROBOT.tick)
+        pose = pose @ odometry.motion()
+    assert follower.progress is Progress.ARRIVED
+    assert pose.distance(Pose2()) < 0.02
+    assert abs(pose.heading) < np.radians(1.0)
+
+
 def test_who_sees_nothing_of_the_goal_is_not_there(walls, node):
     follower = follower_at_the_goal(node)
     dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
@@ -83,7 +109,7 @@ def test_who_sees_nothing_of_the_goal_is_not_there(walls, node):
 
 def test_a_fresh_look_takes_over_only_for_many_more_landmarks(walls, node):
     """Tracks have been filtered for a while; a look that knows hardly more has not."""
-    lens, pose = Lens(ROBOT), Pose2(-0.3, 0.1, -0.1)
+    lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
     image = walls.render(pose)
     lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
     view = Sift(lens).extract(image).view(CAMERA)
@@ -97,7 +123,7 @@ def test_a_fresh_look_takes_over_only_for_many_more_landmarks(walls, node):
 
 
 def test_nodes_are_found_where_they_are_expected_only(walls, node):
-    lens, pose = Lens(ROBOT), Pose2(-0.3, 0.1, -0.1)
+    lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
     lookout = Lookout(ROBOT, lens, Sift(lens), LookoutSettings(), np.random.default_rng(0))
     image, elsewhere = walls.render(pose), pose @ Pose2(-0.5)
     assert lookout.find(image, [Expected(3, node, elsewhere)]) is None
@@ -110,11 +136,7 @@ def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypat
     """It once stood before an obstacle for as long as anybody had patience, and the drive around had none."""
     standing = ServoStep(Command(), "driving", None, "standing still to think the way over", 9)
 
-    def stand(servo: NodeServo, leg: int, *_: object) -> ServoStep:
-        servo.leg = leg
-        return standing
-
-    monkeypatch.setattr(NodeServo, "command", stand)
+    monkeypatch.setattr(Servo, "command", lambda *_: standing)
     follower = follower_at_the_goal(node)
     follower.fix.localizer.pose = PoseGaussian.from_sigmas(Pose2(-1.0, 0.0, 0.0), 0.002, 0.001)
     dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
@@ -141,7 +163,7 @@ def test_headway_counts_since_the_robot_came_nearer(distances):
 def test_a_route_with_a_thousand_nodes_in_one_place_costs_a_few_looks(node, monkeypatch):
     tried = []
     monkeypatch.setattr(Lookout, "find", lambda self, image, wanted: tried.append(len(wanted)))
-    lens = Lens(ROBOT)
+    lens = Lens(ROBOT.camera, ROBOT.distortion)
     ahead = PoseGaussian(Pose2(0.5), np.zeros((3, 3)))
     route = (RouteLeg(node, HERE, None), *[RouteLeg(node, ahead, None)], *[RouteLeg(node, HERE, None)] * 1000)
     follower = Follower(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from agent.mission import Answer, Question, WhereAmI, WhichWay
@@ -15,7 +16,7 @@ from agent.navigating.own_route import own_route
 from agent.tally import Tally
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import RouteAnswer, RouteLeg
+from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
 from synthetic.world import World
 from tests.agent.scripted_fleet import (
     BODY,
@@ -174,6 +175,26 @@ def test_a_goal_that_shows_nothing_is_reached_by_its_neighbours_and_said_to_be(h
     assert nav.arrived and "its own landmarks" in nav.detail
     assert (start @ Pose2(0.6)).distance(eyes.pose) < 0.03
     assert len(looks) == 2 and looks[1] == pytest.approx(0.6, abs=0.03), "it has looked again at the goal"
+
+
+def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_posture_is_not(home):
+    """Another look from the same spot makes a scale no surer; on the way to the photograph it shows."""
+    vague = PoseGaussian(Pose2(-0.6), np.diag([0.18**2, 0.18**2, 0.01**2]))
+    fixed = []
+    for known in (False, True):
+        eyes = Eyes(home, Pose2(2.0, 2.0))
+        nav = navigator(eyes, NOWHERE, B)
+        certainty = Certainty.FOUND if known else Certainty.PLACE
+        place = replace(here(A, Pose2()), node_from_robot=vague, distance_known=known)
+
+        def fleet(question: Question, certainty=certainty, place=place) -> Answer:
+            if isinstance(question, WhichWay):
+                return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+            return Answer(question.number, RelocalizeAnswer(certainty, (place,), "it looks like a"))
+
+        Trial(nav, eyes, fleet).run(3.0, lambda nav=nav: nav.fix is not None)
+        fixed.append(nav.fix is not None)
+    assert fixed == [True, False]
 
 
 def test_where_it_sees_nothing_it_knows_it_drives_on_a_little_before_it_counts_as_lost(home):

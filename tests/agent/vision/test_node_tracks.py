@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.vision.lens import Lens
 from agent.vision.node_tracks import NodeTracks
-from agent.vision.sift import Features, Sift
 from agent.vision.tracker import TrackerSettings
 from hybridmap.pose import Pose2
-from hybridmap.recognising.recognition import recognise
+from registration.recognition import recognise
+from vision.lens import Lens
+from vision.sift import Features, Sift
 
 HERE, BESIDE = Pose2(), Pose2(0.0, 0.02)
 
@@ -18,7 +18,7 @@ HERE, BESIDE = Pose2(), Pose2(0.0, 0.02)
 @pytest.fixture
 def features(walls, description) -> Features:
     """Of the view from the origin."""
-    return Sift(Lens(description)).extract(walls.render(HERE))
+    return Sift(Lens(description.camera, description.distortion)).extract(walls.render(HERE))
 
 
 @pytest.fixture
@@ -32,7 +32,14 @@ def pairs(node, description, features) -> np.ndarray:
 @pytest.fixture
 def tracks(walls, description, features, pairs) -> NodeTracks:
     """Of the landmarks that were recognised there."""
-    return NodeTracks(Lens(description), walls.render(HERE), features, pairs, TrackerSettings(), strikes=2)
+    return NodeTracks(
+        Lens(description.camera, description.distortion),
+        walls.render(HERE),
+        features,
+        pairs,
+        TrackerSettings(),
+        strikes=2,
+    )
 
 
 def test_they_go_where_the_landmarks_go(walls, description, node, tracks, pairs):

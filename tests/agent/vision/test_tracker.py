@@ -7,15 +7,14 @@ import copy
 import numpy as np
 import pytest
 
-from agent.observation import RobotDescription
-from agent.vision.lens import Lens
-from agent.vision.sift import Sift
 from agent.vision.tracker import Tracker, TrackerSettings
 from hybridmap.camera import Camera
 from hybridmap.errors import InvalidValue
+from vision.lens import Lens
+from vision.sift import Sift
 
 CAMERA = Camera(320, 240, 277.0, 276.0, 158.0, 121.0, mount_height=0.3)
-IDEAL = Lens(RobotDescription(CAMERA))
+IDEAL = Lens(CAMERA)
 PHOTOGRAPHS = ("camera", "brick", "coins", "page", "text")
 
 

@@ -10,7 +10,6 @@ from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from hybridmap.node import EdgeKind, MapId, Node, NodeId
 from hybridmap.pose import Pose2
 from hybridmap.query import Certainty
-from hybridmap.recognising.recognition import examine_matches
 from hybridmap.route import RouteSettings
 from mapserver.merging.merger import Merger
 from mapserver.relocalizing.belief import Support, probabilities
@@ -19,6 +18,7 @@ from mapserver.relocalizing.relocalization import RelocalizationSettings, Reloca
 from mapserver.relocalizing.seenplaces import fuse
 from mapserver.routes import Router, RouterSettings
 from merge.graph.merged import MergedMap
+from registration.recognition import examine_matches
 from synthetic.world import (
     Sensing,
     World,

@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridmap.descriptor import decode, quantise
-from hybridmap.recognising.matching import squared_distances
 from mapserver.places.cells import Cells
 from mapserver.places.means import Means
+from registration.matching import squared_distances
 from synthetic.world import random_vectors
 
 Codes = NDArray[np.uint8]

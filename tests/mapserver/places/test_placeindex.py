@@ -4,22 +4,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridmap.descriptor import decode
+from hybridmap.descriptor import decode, quantise
 from hybridmap.node import Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2
+from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import View
 from mapserver.places import placeindex
 from mapserver.places.cells import Cells
-from mapserver.places.landmarkindex import LandmarkIndexSettings
-from mapserver.places.placeindex import SLOT_BITS, PlaceIndex, PlaceIndexSettings
+from mapserver.places.landmarkindex import MOST_WITHIN, LandmarkIndexSettings
+from mapserver.places.placeindex import MOST_LANDMARKS, SLOT_BITS, PlaceIndex, PlaceIndexSettings
 from merge.graph.candidates import overlaps
-from synthetic.world import (
-    CAMERA,
-    World,
-    room,
-    take_map,
-    take_view,
-)
+from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +86,27 @@ def test_overlaps_are_those_of_the_exhaustive_table(building: tuple[World, list[
         assert set(found) == set(expected)
         for other, value in found.items():
             assert value == pytest.approx(expected[other], rel=1e-3)
+
+
+def test_nodes_whose_landmarks_are_all_alike_cost_no_more_than_others() -> None:
+    """Pairs of them would grow by the square: 12 million for the third such node."""
+    rng, index = np.random.default_rng(5), PlaceIndex()
+    nodes = []
+    for k in range(3):
+        vectors = np.repeat(random_vectors(1, np.random.default_rng(6)), 2000, axis=0)
+        codes = quantise(vectors + rng.normal(0.0, 0.005, vectors.shape))
+        depths = np.full(2000, 2.0, np.float32)
+        marks = Landmarks(np.ones((2000, 2), np.float32), codes, depths, 0.1 * depths)
+        posture = PoseGaussian(Pose2(), np.zeros((3, 3)))
+        nodes.append(Node(NodeId("a", 1, k), k, posture, CAMERA, marks))
+        index.add(nodes[-1])
+    assert len(index.landmarks) == 3 * MOST_LANDMARKS
+    told = index.landmarks.within(nodes[0].landmarks.codes[:10], 0.5)
+    assert told is not None and np.bincount(told[0]).max() <= MOST_WITHIN
+    # The first of equals are told: they need not be of every node.
+    assert index.overlaps(nodes[2], {}.get).keys() <= {nodes[0].id, nodes[1].id}
+    index.remove(nodes[1].id, nodes[1].landmarks.codes)
+    assert len(index.landmarks) == 2 * MOST_LANDMARKS
 
 
 def test_overlaps_in_a_large_fleet_are_exact_of_those_that_are_compared(

@@ -11,13 +11,13 @@ from hybridmap.camera import Camera
 from hybridmap.node import NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
-from hybridmap.recognising.recognition import Recognition, RecognitionSettings, recognise
 from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.doubles import Doubles, carried, unexplained
 from mapserver.relocalizing.relocalization import Relocalizer
 from mapserver.relocalizing.seenplaces import Sighting, hidden, is_lonely
 from merge.graph.component import solve_graph
 from merge.graph.merged import MergedMap, Placement
+from registration.recognition import Recognition, RecognitionSettings, recognise
 from synthetic.world import (
     CAMERA,
     Sensing,

@@ -12,7 +12,6 @@ from hybridmap.change import Change, NodePut
 from hybridmap.node import Node, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
 from hybridmap.query import Certainty, View
-from hybridmap.recognising.recognition import RecognitionSettings, recognise
 from mapserver.places.placeindex import PlaceIndex
 from mapserver.relocalizing.doubles import between
 from mapserver.relocalizing.lookalikes import LookAlikes
@@ -24,6 +23,7 @@ from mapserver.upkeep import PREPARED_AT_ONCE, Upkeep
 from merge.graph.component import solve_graph
 from merge.graph.factors import Measurement
 from merge.graph.merged import MergedMap, Placement
+from registration.recognition import RecognitionSettings, recognise
 from synthetic.world import room, take_node, take_view
 from tests.waiting import eventually
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
+import json
+import re
 import socket
+import sys
 import threading
 import time
 from urllib.parse import urlsplit
@@ -14,6 +18,8 @@ import pytest
 
 from hybridmap.errors import SettingsError
 from mapweave.trial.live import Live
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.waiting import eventually
 
 
 def frame(level: int) -> np.ndarray:
@@ -71,8 +77,9 @@ def test_the_page_shows_the_stream_and_one_frame_can_be_had(live):
     live.show(frame(200))
     status, kind, page = get(live, "/")
     assert (status, kind) == (200, "text/html; charset=utf-8")
-    assert b'<img src="/stream"' in page
-    assert b"<title>twins &lt;b&gt;</title>" in page
+    assert b'<img id="view"' in page and b"twins" not in page
+    assert json.loads(get(live, "/title")[2]) == {"title": "twins <b>"}
+    assert b'view.src = "stream"' in get(live, "/static/live.js")[2]
     status, kind, jpeg = get(live, "/frame.jpg?1")
     assert (status, kind) == (200, "image/jpeg")
     assert level(jpeg) == pytest.approx(200, abs=3)
@@ -134,7 +141,7 @@ def test_viewers_that_go_away_leave_no_word_behind(live, capfd):
 
 def test_a_port_in_use_is_one_line(live):
     port = urlsplit(live.url).port
-    for bad, words in ((port, "in use"), (70000, "must be 0-65535")):
+    for bad, words in ((port, "the port is taken"), (70000, "must be 0-65535")):
         with pytest.raises(SettingsError) as refusal:
             Live(bad)
         assert f"cannot use port {bad}" in str(refusal.value)
@@ -158,9 +165,38 @@ def test_closing_frees_the_port_and_ends_the_threads():
 
 
 def test_waiting_for_a_frame_that_never_comes_ends(live):
-    assert live.wait_for_frame(0, 0.05) is None
+    assert asyncio.run(live.next_frame(0, 0.05)) is None
     live.show(frame(9))
-    number, jpeg = live.wait_for_frame(0, 5.0)
+    number, jpeg = asyncio.run(live.next_frame(0, 5.0))
     assert number == 1
     assert level(jpeg) == pytest.approx(9, abs=3)
-    assert live.wait_for_frame(number, 0.05) is None
+    assert asyncio.run(live.next_frame(number, 0.05)) is None
+
+
+def test_pages_of_other_sites_cannot_watch(live):
+    live.show(frame(9))
+    connection = connect(live)
+    connection.request("GET", "/frame.jpg", headers={"Host": "evil.example"})
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+def test_without_what_serves_pages_it_says_which_extra_is_missing(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith(("mapserver.http", "uvicorn", "starlette"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    monkeypatch.setitem(sys.modules, "starlette", None)
+    with pytest.raises(SettingsError, match=re.escape("pip install 'mapweave[server]'")) as refusal:
+        Live(0)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_a_browser_shows_what_comes_and_says_when_it_is_over(live, tmp_path_factory):
+    size = "const i = document.querySelector('img'); return i && i.naturalWidth"
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        live.show(frame(9))
+        page.open(live.url)
+        # A browser shows a part of a stream when the next one begins.
+        eventually(lambda: live.show(frame(99)) or page.run(size) == 160)
+        eventually(lambda: page.run("return document.title") == "twins <b>")

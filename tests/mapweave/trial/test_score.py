@@ -19,7 +19,7 @@ from hybridmap.errors import InvalidValue
 from hybridmap.node import EdgeKind, NodeId
 from hybridmap.pose import Pose2
 from mapweave.scoring import posture_error
-from mapweave.trial.recording import Fix, Trajectory
+from mapweave.trial.recording import Fix, Lost, Trajectory
 from mapweave.trial.score import fleet_hash, pose_at, score
 from mapweave.trial.trajectories import score_trajectory
 
@@ -247,6 +247,18 @@ def test_an_answer_in_terms_of_an_unknown_place_does_not_count(eventful):
     assert figures.found is False
     assert figures.found_error_m is None
     assert figures.found_s == pytest.approx(3.0)
+
+
+def test_a_photographs_truth_is_where_it_was_taken(eventful):
+    """A node of a map that no robot has made: the goal is where somebody has stood."""
+    last = eventful.truth["r0"].poses[-1]
+    stood = Pose2.from_vector(last) @ Pose2(0.3, 0.4)
+    photo = eventful.add_node("r0", 5, Pose2(), epoch=7)
+    recording = eventful.recording()
+    lost = Lost("r0", "room 0", 0, stood, goal=photo, arrived_ns=int(eventful.truth["r0"].stamps_ns[-1]))
+    figures = score(replace(recording, lost=(lost,), photographed={photo: stood}))
+    assert figures.goal_error_m == pytest.approx(0.5, abs=1e-9)
+    assert not figures.reached
 
 
 def test_nobody_lost_and_nowhere_to_go(eventful):

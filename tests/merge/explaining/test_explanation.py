@@ -14,7 +14,6 @@ from hybridmap.explanation import Standing
 from hybridmap.hybrid_map import HybridMap
 from hybridmap.node import Edge, EdgeKind, MapId, NodeId
 from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.recognising.recognition import RecognitionSettings
 from hybridmap.ruling import Ruling, Rulings, reason_of
 from mapserver.merging.merger import Merger
 from merge.belief.consistency import ConsistencySettings
@@ -29,6 +28,7 @@ from merge.graph.factors import LEAST_SIGMAS, Measurement
 from merge.graph.links import Link
 from merge.graph.merged import MergedMap
 from merge.graph.verification import VerificationSettings
+from registration.recognition import RecognitionSettings
 from synthetic.world import room, take_map
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)

@@ -1,0 +1,1 @@
+"""Robots with wrong geometry: what they do to the answers of others."""

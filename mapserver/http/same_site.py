@@ -1,0 +1,87 @@
+"""Whether a request comes from this server's own pages or from no page at all.
+
+A page of another site can make a browser on the robots' network send requests here. Two headers that a page
+cannot choose tell: `Origin` names the page's site, `Host` the name under which this server was looked up. A
+name that an attacker points at this machine (DNS rebinding) is none of ours; an address is always its own.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from http import HTTPStatus
+
+from starlette.datastructures import Headers
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from hybridmap.errors import InvalidValue
+from mapserver.http.serving import json_bytes
+
+
+class SameSite:
+    """An application that refuses what pages of other sites ask."""
+
+    def __init__(self, app: ASGIApp, listens_at: str) -> None:
+        """Stand before an application.
+
+        Args:
+            app: answers everything else.
+            listens_at: host at which the server listens.
+        """
+        self._app = app
+        self._names = own_names(listens_at)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer, or refuse."""
+        headers = Headers(scope=scope)
+        answer = self._app
+        try:
+            check_site(headers.get("Host"), headers.get("Origin"), self._names)
+        except InvalidValue as error:
+            content = json_bytes({"error": str(error)})
+            answer = Response(content, HTTPStatus.FORBIDDEN, media_type="application/json")
+        await answer(scope, receive, send)
+
+
+def own_names(listens_at: str) -> frozenset[str]:
+    """Names of this machine, besides its addresses.
+
+    Args:
+        listens_at: host at which the server listens.
+    """
+    name = socket.gethostname().lower()
+    return frozenset({"localhost", name, f"{name.partition('.')[0]}.local", listens_at.lower()})
+
+
+def check_site(host: str | None, origin: str | None, names: frozenset[str]) -> None:
+    """Refuse requests that another site's page sends.
+
+    Args:
+        host: the header `Host`.
+        origin: the header `Origin`; browsers send it with what a script or a form of a page asks.
+        names: of this machine.
+
+    Raises:
+        InvalidValue: another site's, in words.
+    """
+    if not host or not (_is_address(name := _without_port(host)) or name in names):
+        raise InvalidValue(
+            f"this server is not {(host or 'named')[:80]!r}: use its address or this machine's name"
+        )
+    if origin is not None and origin.lower() not in (f"http://{host.lower()}", f"https://{host.lower()}"):
+        raise InvalidValue(f"pages of {origin[:80]!r} may not ask here")
+
+
+def _without_port(host: str) -> str:
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.partition(":")[0].lower().removesuffix(".")
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True

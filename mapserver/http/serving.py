@@ -1,0 +1,240 @@
+"""ASGI applications on a thread of their own, by uvicorn, with limits on what a connection may take.
+
+Each connection carries one request. The head of the request has a time limit, so has the connection as a
+whole, and a peer that takes nothing of an answer is dropped. Uvicorn by itself waits for ever in all three
+cases.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import logging
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import h11
+import uvicorn
+from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from hybridmap.errors import NotConnected
+
+MAX_HEAD_BYTES = 16384
+"""Of a request: its first line and headers."""
+MAX_CONNECTIONS = 1024
+MAX_WAITING = 512
+"""Connections that have not sent the head of a request yet; a new one takes the place of the oldest."""
+LINGER = 1.0
+"""s in which a peer may finish sending what is refused: a connection that is reset loses the answer too."""
+START = 10.0
+"""s in which the thread has to be there."""
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""What pages may load: files of this server, nothing inline, nothing of others."""
+HEADERS = {
+    "Connection": "close",
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": POLICY,
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "Server": "Mapweave",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Times after which a connection is dropped, s.
+
+    Attributes:
+        head: until the head of a request is there.
+        whole: from its beginning to its end; None for streams.
+        stall: in which the peer takes nothing of what is sent.
+    """
+
+    head: float = 10.0
+    whole: float | None = 40.0
+    stall: float = 10.0
+
+
+def json_bytes(content: Mapping[str, Any]) -> bytes:
+    """One line."""
+    return json.dumps(content).encode() + b"\n"
+
+
+class Connection(H11Protocol):
+    """One connection with its time limits."""
+
+    limits = Limits()
+    waiting: dict[Connection, None]
+    _head: asyncio.TimerHandle
+    _whole: asyncio.TimerHandle | None = None
+    _stall: asyncio.TimerHandle | None = None
+    _refused = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Start the clocks; make room if there are too many."""
+        super().connection_made(transport)
+        self._head = self.loop.call_later(self.limits.head, transport.abort)
+        if self.limits.whole is not None:
+            self._whole = self.loop.call_later(self.limits.whole, transport.abort)
+        self.waiting[self] = None
+        if len(self.waiting) > MAX_WAITING or len(self.connections) > MAX_CONNECTIONS:
+            oldest = next(iter(self.waiting))
+            del self.waiting[oldest]
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop the clocks."""
+        self.waiting.pop(self, None)
+        for timer in (self._head, self._whole, self._stall):
+            if timer is not None:
+                timer.cancel()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Go on, unless what comes was refused."""
+        if not self._refused:
+            super().data_received(data)
+
+    def eof_received(self) -> bool:  # type: ignore[override]
+        """A peer that has sent a whole request may still wait for the answer."""
+        return self.cycle is not None and not self.cycle.more_body and not self.cycle.response_complete
+
+    def handle_events(self) -> None:
+        """Take note of the head of the request."""
+        super().handle_events()
+        if self.cycle is not None:
+            self._head.cancel()
+            self.waiting.pop(self, None)
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP as everything else is answered, and let the peer finish sending."""
+        body = json_bytes(
+            {"error": f"no HTTP request, or one with a head of more than {MAX_HEAD_BYTES} bytes"}
+        )
+        fixed = {**HEADERS, "Content-Type": "application/json", "Content-Length": str(len(body))}
+        try:
+            answer = h11.Response(status_code=400, headers=list(fixed.items()), reason=b"Bad Request")
+            parts = [self.conn.send(event) for event in (answer, h11.Data(data=body), h11.EndOfMessage())]
+        except h11.LocalProtocolError:
+            # Another answer has begun.
+            self.transport.abort()
+            return
+        self._refused = True
+        self.transport.write(b"".join(part for part in parts if part))
+        self.transport.write_eof()
+        self._head.cancel()
+        self._head = self.loop.call_later(LINGER, self.transport.abort)
+
+    def pause_writing(self) -> None:
+        """The peer is slower than what is sent."""
+        super().pause_writing()
+        self._stall = self.loop.call_later(self.limits.stall, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """It has taken something."""
+        super().resume_writing()
+        if self._stall is not None:
+            self._stall.cancel()
+
+
+class _Server(uvicorn.Server):
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End every connection, also those of peers that take nothing."""
+        await super().shutdown(sockets)
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
+        await asyncio.sleep(0)
+
+
+class HttpThread:
+    """Serves an application from the start until closed. A context manager."""
+
+    def __init__(
+        self, app: ASGIApp, address: tuple[str, int], limits: Limits | None = None, name: str = "http"
+    ) -> None:
+        """Open the port and serve.
+
+        Args:
+            app: answers.
+            address: host and port; port 0 takes any.
+            limits: of connections.
+            name: of the thread.
+
+        Raises:
+            NotConnected: the port cannot be used, with the reason alone.
+        """
+        self._socket = _listen(address)
+        self.port = int(self._socket.getsockname()[1])
+        protocol = type("Connection", (Connection,), {"limits": limits or Limits(), "waiting": {}})
+        config = uvicorn.Config(
+            app,
+            http=protocol,
+            loop="asyncio",
+            ws="none",
+            lifespan="off",
+            interface="asgi3",
+            # The terminal belongs to the program that serves.
+            log_config=None,
+            log_level=logging.CRITICAL,
+            access_log=False,
+            server_header=False,
+            date_header=False,
+            headers=list(HEADERS.items()),
+            h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+            timeout_graceful_shutdown=1,
+        )
+        self._server = _Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, args=([self._socket],), name=name, daemon=True
+        )
+        self._thread.start()
+        end = time.monotonic() + START
+        while not self._server.started and self._thread.is_alive() and time.monotonic() < end:
+            time.sleep(0.005)
+        if not self._server.started:
+            raise NotConnected("the server's thread did not start")
+
+    @property
+    def connections(self) -> int:
+        """Open at present."""
+        return len(self._server.server_state.connections)
+
+    def __enter__(self) -> HttpThread:
+        """Nothing more to do."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop serving."""
+        self.close()
+
+    def close(self) -> None:
+        """Stop serving; connections end. Twice is no error."""
+        self._server.should_exit = True
+        self._thread.join(10.0)
+
+
+def _listen(address: tuple[str, int]) -> socket.socket:
+    listening = socket.socket(socket.AF_INET6 if ":" in address[0] else socket.AF_INET)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind(address)
+        listening.listen(MAX_CONNECTIONS)
+    except (OSError, OverflowError) as error:
+        listening.close()
+        number = getattr(error, "errno", None)
+        reason = "the port is taken" if number == errno.EADDRINUSE else getattr(error, "strerror", None)
+        raise NotConnected(str(reason or error)) from None
+    return listening

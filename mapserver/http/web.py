@@ -1,0 +1,293 @@
+"""The map server for people: a photograph in, JSON out, why maps are one, why routes lead so, and pages.
+
+    GET /             the page for photographs
+    GET /why          the page that says why maps are one, or are not
+    GET /status       what the server holds, JSON
+    GET /history      what has joined, come apart and been ruled, with dates, JSON
+    GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
+    GET /route        why a route leads as it does: ?a=r0.1.17&b=r1.1.5 from the one to the other, JSON
+    POST /relocalize  an image (the body itself, or a form's part `image`) -> where it was taken, JSON
+
+Whatever goes wrong comes back as one JSON object with `error`. A server that is busy answers 503 with
+Retry-After in whole seconds and `retry_after` exactly. The pages are in `static/`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import Future
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, Protocol
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
+from hybridmap.explanation import Explanation
+from hybridmap.history import Happening
+from hybridmap.query import RelocalizeAnswer, View
+from hybridmap.ruling import EXAMPLE, read_ends
+from mapserver.http.answer_json import answer_record
+from mapserver.http.explanation_json import explanation_record, history_record
+from mapserver.http.form import read_photo
+from mapserver.http.same_site import SameSite
+from mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
+from wire.explanation_messages import ExplainRequest
+from wire.log_messages import Scalar
+
+log = logging.getLogger(__name__)
+
+STATIC = Path(__file__).with_name("static")
+PAGES = {"/": "index.html", "/why": "why.html"}
+MOST_BYTES = 16 * 2**20
+"""Longest body, 16 MiB."""
+PATIENCE = 10.0
+"""How long a body may take to come, and an answer to be found, s."""
+MOST_AT_ONCE = 32
+"""Questions that are served at once; the next one is refused."""
+METHODS = dict.fromkeys((*PAGES, "/status", "/history", "/explain", "/route"), "GET") | {
+    "/relocalize": "POST"
+}
+
+
+class Answering(Protocol):
+    """What is asked, as of a MapServer: from any thread; what cannot be answered raises a MapweaveError."""
+
+    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
+        """Where a view was taken."""
+
+    def explain(self, request: ExplainRequest) -> Future[Explanation]:
+        """Why maps are one, or a route leads so."""
+
+    def status(self) -> dict[str, Scalar]:
+        """What the server holds and does."""
+
+    def history(self) -> tuple[Happening, ...]:
+        """What has happened."""
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """`PORT` (loopback only) or `HOST:PORT`.
+
+    Raises:
+        SettingsError: it is neither.
+    """
+    host, colon, port = text.rpartition(":")
+    host = host.strip("[]") if colon else "127.0.0.1"
+    if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
+        raise SettingsError(f"http {text!r}: write a port, or HOST:PORT, for example 8080 or 0.0.0.0:8080")
+    return host, int(port)
+
+
+class Web(HttpThread):
+    """The map server for people. Listens from the start until closed."""
+
+    def __init__(
+        self,
+        address: tuple[str, int],
+        server: Answering,
+        patience: float = PATIENCE,
+        limits: Limits | None = None,
+    ) -> None:
+        """Open the port and serve on a thread of its own.
+
+        Args:
+            address: host and port; port 0 takes any.
+            server: answers.
+            patience: how long a body may take to come, and an answer to be found, s.
+            limits: of connections.
+
+        Raises:
+            NotConnected: nobody can listen there, for example since the port is taken.
+        """
+        app = SameSite(Questions(server, patience).app, address[0])
+        try:
+            super().__init__(app, address, limits)
+        except NotConnected as error:
+            raise NotConnected(f"cannot listen at http {address[0]}:{address[1]}: {error}") from None
+
+
+class Reply(Response):
+    """One JSON object on a line.
+
+    A refusal is sent at once, and what the peer is still sending is read to its end and thrown away: a
+    connection that is reset loses the answer too.
+    """
+
+    def __init__(
+        self, content: Mapping[str, Any], status: int = 200, headers: Mapping[str, str] | None = None
+    ) -> None:
+        """Encode it."""
+        super().__init__(json_bytes(content), status, dict(headers or {}), "application/json")
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        start = {"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers}
+        await send(start)
+        await send({"type": "http.response.body", "body": bytes(self.body), "more_body": True})
+        if self.status_code >= HTTPStatus.BAD_REQUEST and scope["method"] == "POST":
+            await _hear_out(scope, receive)
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+
+async def _hear_out(scope: Scope, receive: Receive) -> None:
+    # To read from a peer that waits to be told to go on would tell it so.
+    if any(name == b"expect" for name, _ in scope["headers"]):
+        return
+    try:
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                async with asyncio.timeout(LINGER):
+                    message = await receive()
+                if not message.get("more_body", False):
+                    return
+    except TimeoutError:
+        return
+
+
+def refusal(status: int, error: str) -> Reply:
+    """Why there is no answer, on one line."""
+    return Reply({"error": " ".join(error.split())}, status)
+
+
+class Questions:
+    """What can be asked over HTTP.
+
+    Attributes:
+        app: the application.
+    """
+
+    def __init__(self, server: Answering, patience: float) -> None:
+        """Make the application."""
+        self._server = server
+        self._patience = patience
+        self._open = 0
+        answering = {
+            "/status": self._status, "/history": self._history, "/explain": self._explain,
+            "/route": self._explain,
+        }  # fmt: skip
+        routes = [
+            *(Route(path, _page(name)) for path, name in PAGES.items()),
+            *(Route(path, self._answering(answer)) for path, answer in answering.items()),
+            Route("/relocalize", self._answering(self._relocalize), methods=["POST"]),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ]
+        app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such})
+        app.router.redirect_slashes = False
+        self.app: ASGIApp = app
+
+    def _answering(
+        self, answer: Callable[[Request], Awaitable[Mapping[str, Any]]]
+    ) -> Callable[[Request], Awaitable[Response]]:
+        """Tell what comes of a question, or why nothing does."""
+
+        async def endpoint(request: Request) -> Response:
+            if self._open >= MOST_AT_ONCE:
+                return _busy(Busy(1.0))
+            self._open += 1
+            try:
+                return Reply(await answer(request))
+            except HTTPException as error:
+                return refusal(error.status_code, error.detail)
+            except Busy as busy:
+                return _busy(busy)
+            except InvalidValue as error:
+                return refusal(HTTPStatus.BAD_REQUEST, str(error))
+            except MapweaveError as error:
+                return refusal(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+            except TimeoutError:
+                words = f"no whole image, or no answer, within {self._patience:g} s"
+                return refusal(HTTPStatus.REQUEST_TIMEOUT, words)
+            except ClientDisconnect:
+                return refusal(HTTPStatus.BAD_REQUEST, "the request is cut off")
+            except Exception as error:  # a defect here must not look like a broken network
+                log.exception("no answer to %s", request.url.path)
+                return refusal(HTTPStatus.INTERNAL_SERVER_ERROR, f"the server failed: {error}")
+            finally:
+                self._open -= 1
+
+        return endpoint
+
+    async def _status(self, _: Request) -> Mapping[str, Any]:
+        return await run_in_threadpool(self._server.status)
+
+    async def _history(self, _: Request) -> Mapping[str, Any]:
+        return await run_in_threadpool(lambda: history_record(self._server.history()))
+
+    async def _explain(self, request: Request) -> Mapping[str, Any]:
+        ends, path, query = None, request.url.path, dict(request.query_params)
+        route = path == "/route"
+        if query or route:
+            if query.keys() != {"a", "b"}:
+                raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}")
+            ends = read_ends(query["a"].strip(), query["b"].strip())
+        asked = ExplainRequest(ends, route)
+        explanation = await self._result(lambda: self._server.explain(asked))
+        return await run_in_threadpool(explanation_record, explanation)
+
+    async def _relocalize(self, request: Request) -> Mapping[str, Any]:
+        body = await self._body(request)
+        content_type, query = request.headers.get("Content-Type", ""), dict(request.query_params)
+        photo = await run_in_threadpool(read_photo, content_type, body, query)
+        photo.check()
+        ticket = hash(photo.data)
+        return answer_record(await self._result(lambda: self._server.locate(photo.view, ticket)))
+
+    async def _result(self, ask: Callable[[], Future[Any]]) -> Any:
+        """Ask on a thread, since in lock-step the asker does the work; then wait for the answer."""
+        async with asyncio.timeout(self._patience):
+            return await asyncio.wrap_future(await run_in_threadpool(ask))
+
+    async def _body(self, request: Request) -> bytes:
+        """All of it, in the time that a body may take; refused before it is sent if it is too long."""
+        length = _length(request)
+        body = bytearray()
+        async with asyncio.timeout(self._patience):
+            async for piece in request.stream():
+                body += piece
+        if len(body) < length:
+            raise InvalidValue(f"only {len(body)} of {length} bytes came")
+        return bytes(body)
+
+
+def _length(request: Request) -> int:
+    text = request.headers.get("Content-Length", "")
+    if "Transfer-Encoding" in request.headers or not (text.isascii() and text.isdigit()):
+        raise HTTPException(HTTPStatus.LENGTH_REQUIRED, "say how long the image is with Content-Length")
+    if len(text) > 12 or int(text) > MOST_BYTES:
+        raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MOST_BYTES >> 20} MiB are taken")
+    if int(text) == 0:
+        raise InvalidValue("send a JPEG or PNG image as the body")
+    return int(text)
+
+
+def _page(name: str) -> Callable[[Request], Awaitable[Response]]:
+    content = (STATIC / name).read_bytes()
+
+    async def endpoint(_: Request) -> Response:
+        return Response(content, media_type="text/html")
+
+    return endpoint
+
+
+async def _no_such(request: Request, error: Exception) -> Response:
+    status = error.status_code if isinstance(error, HTTPException) else HTTPStatus.INTERNAL_SERVER_ERROR
+    if status == HTTPStatus.METHOD_NOT_ALLOWED and request.url.path in METHODS:
+        return refusal(status, f"use {METHODS[request.url.path]} for {request.url.path}")
+    return refusal(status, f"there are {', '.join(f'{method} {path}' for path, method in METHODS.items())}")
+
+
+def _busy(busy: Busy) -> Reply:
+    content = {"error": str(busy), "retry_after": round(busy.retry_after, 2)}
+    headers = {"Retry-After": str(math.ceil(busy.retry_after))}
+    return Reply(content, HTTPStatus.SERVICE_UNAVAILABLE, headers)

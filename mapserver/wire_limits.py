@@ -1,0 +1,80 @@
+"""What cannot be said on the wire is left out of answers: it must not cost the answer.
+
+A map may have its nodes as far away as its robot says, and a camera may have its principal point anywhere.
+What follows from such numbers may be out of the range that messages have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+
+from hybridmap.errors import InvalidValue
+from hybridmap.node import NodeId
+from hybridmap.pose import PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
+from mapserver.relocalizing.judgement import NOWHERE
+from wire.posture_codec import pack_posture
+
+FARTHEST = 1e5
+"""A node that is farther from the middle of its map is no place for robots, m: float32 has steps of 8 mm
+there."""
+LONGEST_LEG = 1e3
+"""No robot drives farther from node to node, m."""
+MOST_DETOURS = 8
+"""Ways around legs that cannot be told, before it is said that there is none."""
+
+Pairs = tuple[tuple[NodeId, NodeId], ...]
+
+
+def can_be_said(posture: PoseGaussian | None) -> bool:
+    """Whether a posture is in the range of messages; none at all is."""
+    try:
+        return posture is None or bool(pack_posture(posture))
+    except InvalidValue:
+        return False
+
+
+def said(answer: RelocalizeAnswer) -> RelocalizeAnswer:
+    """An answer without candidates that cannot be said. One of which only the merged posture cannot stays
+    without.
+
+    The certainty stays: where the robot may be at a place that cannot be said, it is not sure to be at the
+    other. If it is the very place where the robot is that cannot be said, the answer is that it is not known.
+    """
+    fine = [can_be_said(one.node_from_robot) for one in answer.candidates]
+    told = tuple(
+        one if can_be_said(one.merged_from_robot) else replace(one, merged_from_robot=None, component=NOWHERE)
+        for one, good in zip(answer.candidates, fine, strict=True)
+        if good
+    )
+    sure = answer.certainty in (Certainty.FOUND, Certainty.PLACE)
+    if answer.candidates and (not told or (sure and not fine[0])):
+        reason = f"the place is out of the range of messages: {answer.reason}"
+        return RelocalizeAnswer(Certainty.UNKNOWN, (), reason)
+    return replace(answer, candidates=told)
+
+
+def drivable(
+    route: Callable[[Pairs], RouteAnswer], blocked: Collection[tuple[NodeId, NodeId]]
+) -> RouteAnswer:
+    """A way of which every leg can be said, and is no longer than robots drive.
+
+    Args:
+        route: finds the best way that passes none of some pairs of nodes.
+        blocked: pairs that are not to be passed in any case.
+    """
+    around = tuple(blocked)
+    for _ in range(MOST_DETOURS):
+        answer = route(around)
+        names = [leg.node.id for leg in answer.legs]
+        bad = tuple(
+            (before, leg.node.id)
+            for before, leg in zip(names[:1] + names[:-1], answer.legs, strict=True)
+            if not can_be_said(leg.previous_from_node)
+            or max(abs(leg.previous_from_node.mean.x), abs(leg.previous_from_node.mean.y)) > LONGEST_LEG
+        )
+        if not bad:
+            return answer
+        around += bad
+    return RouteAnswer((), f"every way leads over legs longer than {LONGEST_LEG:g} m, which no robot drives")

@@ -1,0 +1,76 @@
+"""`mapweave map from-photos`: a map from photographs of a stretch, taken by hand."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from mapweave.commands.network import add_network, connect, network_of, settings_of
+
+
+def add_to(actions: Any) -> None:
+    """Declare the action."""
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "from-photos",
+        help="make a map of photographs of a stretch",
+        description="Make a map of photographs that were taken one after the other along a stretch, by a "
+        "calibrated camera held about level. Each becomes a node that robots can be sent to. With --send the "
+        "map is handed over to a running server, through a journal beside OUT as a robot does.",
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="images, in the order of their numbers")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the .mapweave file")
+    parser.add_argument(
+        "--spacing", type=float, required=True, metavar="M",
+        help="how far apart the photographs are, on average, to within a third",
+    )  # fmt: skip
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="default: FOLDER/camera.toml")
+    parser.add_argument("--name", help="of the map in the fleet (default: OUT without its ending)")
+    parser.add_argument("--send", action="store_true", help="hand the map over to a running server")
+    parser.add_argument(
+        "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Reconstruct, write, hand over."""
+    from agent.drivers.replay import images_in, read_camera
+    from hybridmap.change import NodePut
+    from hybridmap.errors import NotConnected
+    from hybridmap.node import MapId, check_name
+    from mapweave.photographs import map_of_photographs, send_map
+    from wire.mapfile import MapFile, write_map_file
+    from wire.whole_file import check_place
+
+    check_place(arguments.out)
+    map_id = MapId(check_name(arguments.name or arguments.out.stem), int(time.time()))
+    camera, distortion = read_camera(arguments.camera or arguments.folder / "camera.toml")
+    images = images_in(arguments.folder)
+    changes = map_of_photographs(images, camera, distortion, arguments.spacing, map_id)
+    title = f"{map_id}, of {len(images)} photographs"
+    write_map_file(arguments.out, MapFile("agent", title, tuple(changes), {}))
+    landmarks = [len(change.node.landmarks) for change in changes if isinstance(change, NodePut)]
+    if arguments.send:
+        network = network_of(arguments, settings_of(arguments))
+        bus, keys = connect(network)
+        try:
+            journal = arguments.out.with_suffix(".sqlite")
+            if not send_map(changes, map_id, journal, bus, keys, network.server, arguments.patience):
+                where = ", ".join(network.endpoints)
+                raise NotConnected(f"no server {network.server} at {where} took the map: see {journal}")
+        finally:
+            bus.close()
+    if arguments.json:
+        outcome = {"out": str(arguments.out), "map": str(map_id), "landmarks": landmarks}
+        print(json.dumps({**outcome, "sent": arguments.send}))
+    else:
+        print(
+            f"{arguments.out}: map {map_id}, {len(images)} nodes with {min(landmarks)} to {max(landmarks)} "
+            f"landmarks; its scale is known to a third"
+        )
+    return 0

@@ -1,0 +1,182 @@
+"""A map from photographs alone: of a stretch, in order, taken by hand with a calibrated camera.
+
+Each photograph becomes a node, with an edge to the next. Structure from motion gives the depths of their
+landmarks in proportion to each other. How large all of it is follows from the spacing that the photographer
+states, so each depth, and each way between nodes, carries the uncertainty of that statement. A robot that
+drives along finds the scale by its wheels.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.sharing.journal import Journal
+from agent.sharing.replication import Replicator
+from hybridmap.camera import Camera
+from hybridmap.change import ChangeBody, EdgePut, NodePut
+from hybridmap.errors import InvalidValue
+from hybridmap.grid import settle
+from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.structure_from_motion import PIXEL_SIGMA, Structure, reconstruct
+from registration.selection import choose, worth
+from storage.image_file import read_grey
+from vision.lens import Lens
+from vision.sift import Sift
+from wire.bus import Bus
+from wire.keys import Keys
+
+SCALE_SHARE = 0.3
+"""By which the stated spacing may be off, as a share of it."""
+
+LEAST_LANDMARKS = 12
+"""A photograph that shows fewer points is no place that a robot could recognise."""
+
+FLOOR = (0.01, 0.01)
+"""What a posture is never better than, m and rad: the camera is not quite level."""
+
+
+def map_of_photographs(
+    images: Sequence[Path],
+    camera: Camera,
+    distortion: tuple[float, ...],
+    spacing: float,
+    map_id: MapId,
+) -> list[ChangeBody]:
+    """Make a map.
+
+    Args:
+        images: in the order in which they were taken, by one camera that was held about level.
+        camera: that took them; `mount_height` is how high it was held.
+        distortion: of its lens, OpenCV's five coefficients.
+        spacing: how far apart they were taken, on average, m; 30 % more or less does not matter.
+        map_id: whose nodes they become; the k-th photograph is node k.
+
+    Raises:
+        DeviceError: an image cannot be read.
+        InvalidValue: they are not one stretch, or show too little.
+    """
+    if not (math.isfinite(spacing) and spacing > 0.0):
+        raise InvalidValue(f"spacing {spacing:g}: give the metres between photographs")
+    sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
+    features = [sift.extract(read_grey(image, camera)) for image in images]
+    views = [one.view(camera) for one in features]
+    structure = reconstruct(views, spacing)
+    levels = [_level(structure, k) for k in range(len(views))]
+    changes: list[ChangeBody] = []
+    seats: list[NDArray[np.int64]] = []
+    ids = [NodeId(map_id.agent, map_id.epoch, number) for number in range(1, 2 * len(images))]
+    for k, image in enumerate(images):
+        landmarks, points = _landmarks(structure, k, levels[k], camera, views[k].codes)
+        if len(landmarks) < LEAST_LANDMARKS:
+            raise InvalidValue(f"{image}: only {len(landmarks)} points of it are in its neighbours too")
+        seats.append(points)
+        map_from_robot = _uncertain(levels[0].inverse() @ levels[k])
+        changes.append(NodePut(Node(ids[k], k, map_from_robot, camera, landmarks)))
+    for k in range(len(images) - 1):
+        _, a, b = np.intersect1d(seats[k], seats[k + 1], return_indices=True)
+        shared = np.stack([a, b], axis=1).astype(np.int64)
+        a_from_b = _uncertain(levels[k].inverse() @ levels[k + 1])
+        evidence = {"shared": float(len(shared))}
+        edge_id = ids[len(images) + k]
+        changes.append(
+            EdgePut(Edge(edge_id, ids[k], ids[k + 1], a_from_b, EdgeKind.MAPPED, shared, evidence))
+        )
+    return changes
+
+
+def send_map(
+    changes: Sequence[ChangeBody],
+    map_id: MapId,
+    journal: Path,
+    bus: Bus,
+    keys: Keys,
+    server: str,
+    patience: float,
+) -> bool:
+    """Give a map to a server as a robot does: from a journal that keeps what has not been taken.
+
+    Args:
+        changes: of the map, each once.
+        map_id: no map of this number may be in the journal.
+        journal: its file; made if there is none.
+        bus: to the fleet.
+        keys: of the fleet.
+        server: that shall have it.
+        patience: how long to wait for it, s.
+
+    Returns:
+        Whether the server has it all.
+
+    Raises:
+        MapweaveError: the journal cannot be used.
+    """
+    journal.parent.mkdir(parents=True, exist_ok=True)
+    disk = Journal(journal, map_id.agent)
+    try:
+        disk.open_map(map_id.epoch)
+        replicator = Replicator(bus, keys, disk, map_id, servers=(server,))
+        try:
+            replicator.submit(changes, time.time_ns())
+            return replicator.wait_acknowledged(patience)
+        finally:
+            replicator.close()
+    finally:
+        disk.close()
+
+
+def _level(structure: Structure, k: int) -> Pose2:
+    """Where the k-th camera stood over the floor, and where it looked."""
+    axis = structure.rotations[k][:, 2]
+    x, y, _ = structure.centres[k]
+    return Pose2(float(x), float(y), math.atan2(axis[1], axis[0]))
+
+
+def _landmarks(
+    structure: Structure, k: int, level: Pose2, camera: Camera, codes: NDArray[np.uint8]
+) -> tuple[Landmarks, NDArray[np.int64]]:
+    """What the k-th photograph shows, as a level camera at the stated height sees it; and which points."""
+    points = np.flatnonzero(structure.features[k] >= 0)
+    here = structure.points[points].copy()
+    here[:, :2] = level.inverse().apply(here[:, :2])
+    here[:, 0] += camera.mount_forward
+    depths = here[:, 0] - camera.mount_forward
+    pixels = camera.project(here)
+    sigmas = np.hypot(_depth_sigmas(structure, k, points, camera), SCALE_SHARE * depths)
+    good = camera.contains(pixels, -min(camera.width, camera.height) / 4) & (
+        sigmas < 2 * SCALE_SHARE * depths
+    )
+    points, pixels, depths, sigmas = points[good], pixels[good], depths[good], sigmas[good]
+    features = structure.features[k, points]
+    landmarks = Landmarks(
+        pixels.astype(np.float32), codes[features], depths.astype(np.float32), sigmas.astype(np.float32)
+    )
+    seen = (structure.features[:, points] >= 0).mean(axis=0)
+    kept = choose(landmarks, worth(seen, features / len(codes)), camera)
+    landmarks, order = settle(landmarks.take(kept), camera)
+    return landmarks, points[kept[order]].astype(np.int64)
+
+
+def _depth_sigmas(structure: Structure, k: int, points: NDArray[np.intp], camera: Camera) -> Array:
+    """(M,) m, standard deviations of points along the k-th axis, the cameras taken as true."""
+    toward = structure.points[points] - structure.centres[:, None]
+    seen = structure.features[:, points] >= 0
+    distance = np.linalg.norm(toward, axis=2)
+    rays = toward / distance[..., None]
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    weight = np.where(seen, (camera.fx / PIXEL_SIGMA / distance) ** 2, 0.0)
+    covariances = np.linalg.inv(np.einsum("kn,knij->nij", weight, across))
+    axis = structure.rotations[k][:, 2]
+    return np.asarray(np.sqrt(np.einsum("i,nij,j->n", axis, covariances, axis)), np.float64)
+
+
+def _uncertain(way: Pose2) -> PoseGaussian:
+    """A way with what nobody knows of its scale."""
+    sigmas = [np.hypot(SCALE_SHARE * way.x, FLOOR[0]), np.hypot(SCALE_SHARE * way.y, FLOOR[0]), FLOOR[1]]
+    return PoseGaussian(way, np.diag(np.square(sigmas)))

@@ -1,0 +1,342 @@
+"""Structure from motion: where an ordered set of photographs was taken, and what they show, up to scale.
+
+Two photographs give a rotation and a direction (Nister 2004, five points). Each further one is placed by the
+points that it shows (PnP), and bundle adjustment (Triggs et al. 2000, solved by GTSAM) follows. What a
+photographer holds to more or less is part of it: a level camera, one height, steps of one length.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.errors import InvalidValue
+from hybridmap.pose import Array
+from hybridmap.query import View
+from registration.matching import match
+
+PIXEL_SIGMA = 0.7
+"""px, of a SIFT feature; as in triangulation."""
+
+GATE_PX = 3.0
+"""px; a feature that misses its point by more is no sighting of it."""
+
+TILT_SIGMA = math.radians(2.0)
+"""By which a camera in the hand is off level, pitch and roll alike, rad."""
+
+HEIGHT_SHARE = 0.1
+"""By which it is off its height, as a share of the height."""
+
+STEP_SHARE = 0.3
+"""By which one step differs from the others, as a share of it."""
+
+OVERLAP = 3
+"""Photographs ahead with which each one is compared."""
+
+LEAST_MATCHES = 15
+"""That agree on one essential matrix; with fewer two photographs count as showing nothing in common."""
+
+BEGINNINGS = 5
+"""Pairs of photographs from which it is tried to begin."""
+
+LEAST_POINTS = 12
+"""Known points by which a camera is placed."""
+
+LEAST_PARALLAX = math.radians(1.0)
+"""Angle between the rays to a point, rad; with less its depth is not known to a quarter."""
+
+FREE, FIXED = 1e3, 1e-3
+"""Standard deviations of what nobody knows, and of where the map's frame begins, m and rad."""
+
+CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""(3, 3) from x forward, y left, z up to x right, y down, z forward."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """N points seen in K photographs, in a level frame with z up; its unit is the metre as far as known.
+
+    Attributes:
+        rotations: (K, 3, 3) world_from_camera; NaN where a camera has not been placed yet.
+        centres: (K, 3) m, of the cameras.
+        points: (N, 3) m; NaN where no two rays determine one.
+        features: (K, N) int64, the feature of each photograph that shows the point, -1 where none does.
+    """
+
+    rotations: Array
+    centres: Array
+    points: Array
+    features: NDArray[np.int64]
+
+    @property
+    def placed(self) -> NDArray[np.bool_]:
+        """(K,) which cameras are placed."""
+        return np.isfinite(self.centres[:, 0])
+
+
+def reconstruct(views: Sequence[View], spacing: float) -> Structure:
+    """Find where photographs were taken: from the pair that fixes most points on, one photograph at a time.
+
+    Args:
+        views: of one camera, in the order in which they were taken.
+        spacing: how far apart, on average, m: the scale, of which photographs tell nothing.
+
+    Returns:
+        All cameras, and the points that are determined.
+
+    Raises:
+        InvalidValue: fewer than two photographs, or two that follow each other and have nothing in common.
+    """
+    if len(views) < 2:
+        raise InvalidValue("two photographs are needed at least")
+    relations = {}
+    for i, j in itertools.combinations(range(len(views)), 2):
+        if j - i <= OVERLAP and (related := _relate(views[i], views[j])) is not None:
+            relations[i, j] = related
+    apart = next((i for i in range(len(views) - 1) if (i, i + 1) not in relations), None)
+    if apart is not None:
+        raise InvalidValue(
+            f"photographs {apart + 1} and {apart + 2} do not show the same things: take one in between"
+        )
+    features = _tracks(views, {pair: related.pairs for pair, related in relations.items()})
+    starts = [_start(views, features, pair, related, spacing) for pair, related in relations.items()]
+    starts.sort(key=lambda start: -int(np.isfinite(start.points[:, 0]).sum()))
+    # What two photographs show of one wall has two explanations (Longuet-Higgins 1986); only the right one
+    # goes with the others.
+    whole = [_grown(views, start, relations, spacing) for start in starts[:BEGINNINGS]]
+    best = max(whole, key=lambda one: int((_misses(views, one) < GATE_PX).sum()))
+    found = np.isfinite(best.points[:, 0])
+    return replace(best, points=best.points[found], features=best.features[:, found])
+
+
+def _grown(
+    views: Sequence[View], start: Structure, relations: dict[tuple[int, int], _Relation], spacing: float
+) -> Structure:
+    """All cameras, one after the other, from two on."""
+    structure = start
+    while not structure.placed.all():
+        structure = _triangulated(views, _extended(views, structure, relations))
+        structure = _triangulated(views, _bundled(views, structure, spacing, True))
+    refuted = ~(_misses(views, structure) < GATE_PX)
+    structure = replace(structure, features=np.where(refuted, -1, structure.features))
+    return _triangulated(views, _bundled(views, _triangulated(views, structure), spacing, False))
+
+
+def _start(
+    views: Sequence[View],
+    features: NDArray[np.int64],
+    pair: tuple[int, int],
+    related: _Relation,
+    spacing: float,
+) -> Structure:
+    """Two cameras, level but for what they are tilted against each other, and the points that both show."""
+    (i, j), count = pair, len(views)
+    rotations, centres = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
+    rotations[i], centres[i] = CAMERA_FROM_LEVEL.T, (0.0, 0.0, views[0].camera.mount_height)
+    rotations[j] = rotations[i] @ related.rotation
+    centres[j] = centres[i] + (j - i) * spacing * rotations[i] @ related.direction
+    points = np.full((features.shape[1], 3), np.nan)
+    structure = _triangulated(views, Structure(rotations, centres, points, features))
+    bad = ~(np.nanmax(_misses(views, structure)[[i, j]], axis=0, initial=0.0) < GATE_PX)
+    return replace(structure, points=np.where(bad[:, None], np.nan, structure.points))
+
+
+def _extended(
+    views: Sequence[View], structure: Structure, relations: dict[tuple[int, int], _Relation]
+) -> Structure:
+    """One camera more beside those that are placed: by the points that it shows, or as far on as the last."""
+    placed = np.flatnonzero(structure.placed)
+    low, high = int(placed[0]), int(placed[-1])
+    known = (structure.features >= 0) & np.isfinite(structure.points[:, 0])
+    inner = [k for k in range(low, high) if k not in placed]
+    k = max(
+        inner or [k for k in (low - 1, high + 1) if 0 <= k < len(views)],
+        key=lambda one: int(known[one].sum()),
+    )
+    rotations, centres = structure.rotations.copy(), structure.centres.copy()
+    seen, camera = np.flatnonzero(known[k]), views[k].camera
+    pixels = views[k].pixels[structure.features[k, seen]].astype(np.float64)
+    cv2.setRNGSeed(0)
+    fits, inside = False, None
+    if len(seen) >= LEAST_POINTS:
+        fits, turn, shift, inside = cv2.solvePnPRansac(
+            structure.points[seen],
+            pixels,
+            _matrix(camera),
+            None,
+            reprojectionError=GATE_PX,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    if fits and inside is not None and len(inside) >= LEAST_POINTS:
+        rotations[k] = cv2.Rodrigues(turn)[0].T
+        centres[k] = -rotations[k] @ shift[:, 0]
+    else:
+        near = high if k > high else (low if k < low else k - 1)
+        step = relations[min(k, near), max(k, near)]
+        length = float(np.linalg.norm(centres[high] - centres[low])) / (high - low)
+        if k > near:
+            centres[k] = centres[near] + length * rotations[near] @ step.direction
+            rotations[k] = rotations[near] @ step.rotation
+        else:
+            rotations[k] = rotations[near] @ step.rotation.T
+            centres[k] = centres[near] - length * rotations[k] @ step.direction
+    return replace(structure, rotations=rotations, centres=centres)
+
+
+def _matrix(camera: Camera) -> Array:
+    """(3, 3) px, of a pinhole."""
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Relation:
+    """Rotation first_from_second (3, 3), direction of the second in the first (3,), and (M, 2) matches."""
+
+    rotation: Array
+    direction: Array
+    pairs: NDArray[np.int64]
+
+
+def _relate(first: View, second: View) -> _Relation | None:
+    pairs = match(first.codes, second.codes)
+    if len(pairs) < LEAST_MATCHES:
+        return None
+    matrix = _matrix(first.camera)
+    a = first.pixels[pairs[:, 0]].astype(np.float64)
+    b = second.pixels[pairs[:, 1]].astype(np.float64)
+    cv2.setRNGSeed(0)
+    essential, mask = cv2.findEssentialMat(a, b, matrix, cv2.RANSAC, 0.999, GATE_PX / 2)
+    if essential is None or essential.shape != (3, 3) or int(mask.sum()) < LEAST_MATCHES:
+        return None
+    # x_second = R x_first + t.
+    _, rotation, translation, _ = cv2.recoverPose(essential, a, b, matrix, mask=mask.copy())
+    inside = mask[:, 0].astype(bool)
+    turn = np.asarray(rotation, np.float64).T
+    return _Relation(turn, -turn @ np.asarray(translation, np.float64)[:, 0], pairs[inside])
+
+
+def _tracks(views: Sequence[View], matches: dict[tuple[int, int], NDArray[np.int64]]) -> NDArray[np.int64]:
+    """(K, N) feature of each photograph that shows each point; what appears twice in one is left out."""
+    starts = np.concatenate([[0], np.cumsum([len(view) for view in views])])
+    parent = np.arange(starts[-1])
+
+    def root(k: int) -> int:
+        while parent[k] != k:
+            parent[k] = parent[parent[k]]
+            k = int(parent[k])
+        return k
+
+    for (i, j), pairs in matches.items():
+        for a, b in pairs:
+            parent[root(int(starts[i] + a))] = root(int(starts[j] + b))
+    owner = np.repeat(np.arange(len(views)), np.diff(starts))
+    roots = np.array([root(k) for k in range(len(parent))])
+    columns = []
+    for one in np.unique(roots):
+        members = np.flatnonzero(roots == one)
+        if len(members) >= 2 and len(np.unique(owner[members])) == len(members):
+            column = np.full(len(views), -1, np.int64)
+            column[owner[members]] = members - starts[owner[members]]
+            columns.append(column)
+    return np.array(columns, np.int64).reshape(-1, len(views)).T
+
+
+def _rays(views: Sequence[View], structure: Structure) -> Array:
+    """(K, N, 3) unit vectors in world to where placed photographs show the points; NaN where they do not."""
+    camera = views[0].camera
+    rays = np.full((*structure.features.shape, 3), np.nan)
+    for k, view in enumerate(views):
+        seen = np.flatnonzero(structure.features[k] >= 0)
+        pixels = view.pixels[structure.features[k, seen]]
+        slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        ray = np.column_stack([slopes, np.ones(len(seen))]) @ structure.rotations[k].T
+        rays[k, seen] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    return rays
+
+
+def _triangulated(views: Sequence[View], structure: Structure) -> Structure:
+    """With points where the rays meet best; NaN for those without parallax, or behind a camera."""
+    rays = _rays(views, structure)
+    seen = np.isfinite(rays[..., 0])
+    filled = np.nan_to_num(rays)
+    # Each ray r through c holds the point p to (1 - r r^T)(p - c) = 0.
+    across = (np.eye(3) - filled[..., :, None] * filled[..., None, :]) * seen[..., None, None]
+    normal = across.sum(axis=0) + 1e-9 * np.eye(3)
+    centres = np.nan_to_num(structure.centres)
+    points = np.linalg.solve(normal, np.einsum("knij,kj->ni", across, centres)[..., None])[..., 0]
+    toward = points - centres[:, None]
+    ahead = (np.einsum("kni,kni->kn", toward, filled) > 0.0) | ~seen
+    cosine = np.einsum("kni,lni->nkl", filled, filled)
+    both = seen.T[:, :, None] & seen.T[:, None, :]
+    parallax = np.arccos(np.clip(np.where(both, cosine, 1.0).min(axis=(1, 2)), -1.0, 1.0))
+    good = (seen.sum(axis=0) >= 2) & ahead.all(axis=0) & (parallax > LEAST_PARALLAX)
+    return replace(structure, points=np.where(good[:, None], points, np.nan))
+
+
+def _misses(views: Sequence[View], structure: Structure) -> Array:
+    """(K, N) px by which sightings miss their points; NaN where there are none, or nothing is known."""
+    camera = views[0].camera
+    misses = np.full(structure.features.shape, np.nan)
+    for k, view in enumerate(views):
+        seen = np.flatnonzero(structure.features[k] >= 0)
+        local = (structure.points[seen] - structure.centres[k]) @ structure.rotations[k]
+        ahead = np.where(local[:, 2] > 0.05, local[:, 2], np.nan)
+        expected = local[:, :2] / ahead[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        misses[k, seen] = np.linalg.norm(expected - view.pixels[structure.features[k, seen]], axis=1)
+    return misses
+
+
+def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust: bool) -> Structure:
+    camera: Camera = views[0].camera
+    lens = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
+    pixel: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, PIXEL_SIGMA)
+    if robust:
+        pixel = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), pixel)
+    pose, point = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    # Tangents are in the camera's axes, of which y points down: it turns about y, and moves over the floor.
+    tilt, rise = TILT_SIGMA, HEIGHT_SHARE * camera.mount_height
+    held = gtsam.noiseModel.Diagonal.Sigmas(np.array([tilt, FREE, tilt, FREE, rise, FREE]))
+    first = gtsam.noiseModel.Diagonal.Sigmas(np.array([tilt, FIXED, tilt, FIXED, rise, FIXED]))
+    placed = np.flatnonzero(structure.placed).tolist()
+    for before, k in zip([None, *placed], placed, strict=False):
+        rotation, centre = structure.rotations[k], structure.centres[k]
+        values.insert(pose(k), gtsam.Pose3(gtsam.Rot3(rotation), centre))
+        yaw = math.atan2(rotation[1, 2], rotation[0, 2])
+        level = gtsam.Rot3.Yaw(yaw).matrix() @ CAMERA_FROM_LEVEL.T
+        place = np.array([centre[0], centre[1], camera.mount_height])
+        graph.add(
+            gtsam.PriorFactorPose3(
+                pose(k), gtsam.Pose3(gtsam.Rot3(level), place), first if before is None else held
+            )
+        )
+        if before is not None:
+            way = (k - before) * spacing
+            step = gtsam.noiseModel.Isotropic.Sigma(1, STEP_SHARE * way)
+            graph.add(gtsam.RangeFactorPose3(pose(before), pose(k), way, step))
+    known = np.flatnonzero(np.isfinite(structure.points[:, 0])).tolist()
+    for n in known:
+        values.insert(point(n), structure.points[n])
+        for k in np.flatnonzero(structure.placed & (structure.features[:, n] >= 0)).tolist():
+            pixels = views[k].pixels[structure.features[k, n]].astype(np.float64)
+            graph.add(
+                gtsam.GenericProjectionFactorCal3_S2(pixels, pixel, pose(k), point(n), lens, False, False)
+            )
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    rotations, centres, points = structure.rotations.copy(), structure.centres.copy(), structure.points.copy()
+    for k in placed:
+        rotations[k], centres[k] = (
+            solved.atPose3(pose(k)).rotation().matrix(),
+            solved.atPose3(pose(k)).translation(),
+        )
+    for n in known:
+        points[n] = solved.atPoint3(point(n))
+    return replace(structure, rotations=rotations, centres=centres, points=points)

@@ -1,0 +1,92 @@
+"""Numbers that speak for or against a recognition, beside the number of inliers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.node import Landmarks
+from hybridmap.pose import Pose2
+from registration.gauss_newton import PlanarFix
+from registration.sightings import Sightings
+
+GRID = (6, 4)
+"""Columns and rows of cells in which the spread over an image is counted."""
+
+
+def gather(
+    a: Landmarks,
+    camera_a: Camera,
+    b: Landmarks,
+    camera_b: Camera,
+    inliers: NDArray[np.int64],
+    matches: int,
+    usable: int,
+    fix: PlanarFix,
+) -> dict[str, float]:
+    """The numbers that speak for a posture; all finite.
+
+    Args:
+        a: landmarks of the one side.
+        camera_a: its camera.
+        b: landmarks of the other side.
+        camera_b: its camera.
+        inliers: (K, 2) indices in a and b that agree.
+        matches: mutual matches.
+        usable: of these, with a depth on either side.
+        fix: the posture `a_from_b`.
+    """
+    seen_a, seen_b = a.take(inliers[:, 0]), b.take(inliers[:, 1])
+    depths = np.where(seen_a.has_depth, seen_a.depths, seen_b.depths)
+    sigmas = np.sqrt(np.linalg.eigvalsh(fix.node_from_robot.covariance[:2, :2]))
+    return {
+        "inliers": float(len(inliers)),
+        "inliers_a": float(seen_a.has_depth.sum()),
+        "inliers_b": float(seen_b.has_depth.sum()),
+        "inliers_3d": float((seen_a.has_depth & seen_b.has_depth).sum()),
+        "matches": float(matches),
+        "share": len(inliers) / usable,
+        "cells": float(min(cells(seen_a.pixels, camera_a), cells(seen_b.pixels, camera_b))),
+        "seen": max(
+            _seen(a, camera_a, camera_b, fix.node_from_robot.mean, inliers[:, 0]),
+            _seen(b, camera_b, camera_a, fix.node_from_robot.mean.inverse(), inliers[:, 1]),
+        ),
+        "log_evidence": fix.log_evidence,
+        "mean_square": fix.mean_square,
+        "rms_px": fix.rms_px,
+        "depth": float(np.median(depths)),
+        "sigma_xy": float(sigmas[-1]),
+        "sigma_heading": math.sqrt(float(fix.node_from_robot.covariance[2, 2])),
+    }
+
+
+def _seen(
+    known: Landmarks, camera: Camera, other: Camera, known_from_other: Pose2, inliers: NDArray[np.int64]
+) -> float:
+    """Share of the landmarks that should be in the other image, by their depth, that are inliers."""
+    points = known_from_other.inverse().apply(known.points_in_robot(camera))
+    expected = int(other.contains(other.project(points)).sum())
+    return min(float(known.has_depth[inliers].sum()) / max(expected, 1), 1.0)
+
+
+def depth_agreement(forward: Sightings, fix: PlanarFix) -> float:
+    """Share of the landmarks whose pixels fit the posture that fit in depth too; 1 if few have two depths."""
+    both = forward.depth_measured
+    nothing = np.full(len(forward), np.nan)
+    pixels_only = replace(forward, depths=nothing, depth_sigmas=nothing)
+    pose = fix.node_from_robot.mean.vector[None]
+    fits = (pixels_only.log_ratios(pose)[0] > 0) & both
+    if fits.sum() < 5:
+        return 1.0
+    return float((fits & fix.inliers[: len(forward)]).sum() / fits.sum())
+
+
+def cells(pixels: NDArray[np.float32], camera: Camera) -> int:
+    """How many cells of the grid over the image are occupied."""
+    column = np.clip(pixels[:, 0] * GRID[0] / camera.width, 0, GRID[0] - 1).astype(int)
+    row = np.clip(pixels[:, 1] * GRID[1] / camera.height, 0, GRID[1] - 1).astype(int)
+    return len(np.unique(column * GRID[1] + row))

@@ -1,0 +1,184 @@
+"""The best posture near a first one, by iterated Gauss-Newton, and how certain it is.
+
+The points may move within their own uncertainty. They are variables that are eliminated in closed form: each
+round linearises at the points' present estimates, the residual refers back to where they were given, and
+their covariance is part of the residual's (the iterated extended Kalman filter's form of a Schur complement).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from registration import projection
+from registration.projection import (
+    DEPTH_DECADES,
+    GATE,
+    Linear,
+    Stack,
+    determined,
+    linearise,
+    normal_equations,
+)
+from registration.sightings import Sightings
+
+DEPTH_GATE = 11.34
+"""Chi-square 99 % point for 3 degrees of freedom."""
+
+NO_DEPTH_SIGMA = 1e3
+"""Stands for "depth not measured", m."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarFix:
+    """A posture from sightings.
+
+    Attributes:
+        node_from_robot: posture of the robot in the points' frame.
+        inliers: (N,) which sightings agree with it.
+        mean_square: mean squared normalised residual of the inliers; 1 when the uncertainties are right.
+        rms_px: of the inliers' residuals, px, after the points moved within their uncertainty.
+        log_evidence: sum over the inliers of how much likelier they are than wrong matches, nats.
+        rival: what the mirrored posture explains (see mirror.py), as a share of what this one does; 0 if
+            there is no other.
+    """
+
+    node_from_robot: PoseGaussian
+    inliers: NDArray[np.bool_]
+    mean_square: float
+    rms_px: float
+    log_evidence: float
+    rival: float = 0.0
+
+
+def stack_sightings(parts: Sequence[Sightings]) -> Stack:
+    """Put the sightings of one problem one after the other."""
+    measured = np.concatenate([part.depth_measured for part in parts])
+    depths = np.where(measured, np.concatenate([part.depths for part in parts]), 0.0)
+    sigmas = np.where(measured, np.concatenate([part.depth_sigmas for part in parts]), NO_DEPTH_SIGMA)
+    counts = [len(part) for part in parts]
+    pixel = np.repeat([part.pixel_sigma**2 for part in parts], counts)
+    cameras = [part.camera for part in parts]
+    optics = [(c.fx, c.fy, c.cx, c.cy, c.mount_height, c.mount_forward) for c in cameras]
+    log_area = np.repeat([math.log(c.width * c.height / (2 * math.pi)) for c in cameras], counts)
+    log_depth = np.log(DEPTH_DECADES * np.where(measured, depths, 1.0)) - 0.5 * math.log(2 * math.pi)
+    return Stack(
+        np.concatenate([part.points for part in parts]),
+        np.concatenate([part.covariances for part in parts]),
+        np.column_stack([np.concatenate([part.pixels for part in parts]), depths]),
+        np.column_stack([pixel, pixel, sigmas**2]),
+        measured,
+        np.where(measured, DEPTH_GATE, GATE),
+        log_area + np.where(measured, log_depth, math.log(NO_DEPTH_SIGMA)),
+        np.repeat([part.inverted for part in parts], counts),
+        np.repeat(np.array(optics, np.float64), counts, axis=0),
+    )
+
+
+def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) -> tuple[Pose2, Array] | None:
+    """Bring a posture to its best.
+
+    Args:
+        stack: the sightings.
+        pose: where to start.
+        prior: what else is known of the posture.
+        rounds: of Gauss-Newton at most.
+
+    Returns:
+        The posture and the points (N, 3) m at their best for it; None if the inliers do not determine a
+        posture.
+    """
+    sure, posture, points = projection.improve(stack, pose.vector, *_mean_and_information(prior), rounds)
+    return (Pose2.from_vector(posture), points) if sure else None
+
+
+def refine(
+    stack: Stack,
+    pose: Pose2,
+    scale_sigma: float,
+    prior: PoseGaussian | None,
+    rounds: int,
+    shift_sigma: float = 0.0,
+) -> PlanarFix | None:
+    """Bring a posture to its best and say how certain it is.
+
+    The covariance is the inverse information, larger where the residuals are larger than they should be,
+    and larger by what does not average out: a common scale error of the points, or of the measured depths,
+    which come from one drive with one set of wheels, and a shift of all pixels.
+
+    Args:
+        stack: the sightings.
+        pose: where to start.
+        scale_sigma: share by which all points, or all measured depths, may be wrong together.
+        prior: what else is known of the posture.
+        rounds: of Gauss-Newton at most.
+        shift_sigma: px by which all pixels may be off together, to either side.
+
+    Returns:
+        The posture, or None if the inliers do not determine one.
+    """
+    improved = improve(stack, pose, prior, rounds)
+    if improved is None:
+        return None
+    pose, moved = improved
+    linear = linearise(stack, pose.vector, moved)
+    information = normal_equations(linear)[1:, 1:] + _mean_and_information(prior)[1]
+    inliers = linear.inliers
+    if not inliers.any() or not determined(information):
+        return None
+    covariance = np.linalg.inv(information)
+    freedom = max(int(np.where(stack.measured, 3, 2)[inliers].sum()) - 3, 1)
+    mean_square = float(linear.distance2[inliers].sum()) / freedom
+    alone = covariance = covariance * max(1.0, mean_square)
+    common = [scale_sigma * share for share in _common_scales(stack, linear, moved)]
+    if shift_sigma:
+        common += [shift_sigma * np.tile(side, (len(moved), 1)) for side in np.eye(3)[:2]]
+    for change in common:
+        drift = alone @ _gradient(linear, change)
+        covariance = covariance + np.outer(drift, drift)
+    return PlanarFix(
+        PoseGaussian(pose, 0.5 * (covariance + covariance.T)),
+        inliers,
+        mean_square,
+        float(np.sqrt((linear.reprojection_px[inliers] ** 2).sum(axis=1).mean())),
+        float(linear.log_ratios[inliers].sum()),
+    )
+
+
+def _common_scales(stack: Stack, linear: Linear, points: Array) -> list[Array]:
+    """How the residuals (N, 3) change when all points, or all depths, of one side grow together.
+
+    One side's points are the forward rows' points and the inverted rows' depths; the other's the reverse.
+    """
+    (u_x, u_y, v_x, v_z), (c, s) = linear.by_point.T, linear.axes.T
+    forward, left = c * points[:, 0] + s * points[:, 1], c * points[:, 1] - s * points[:, 0]
+    by_points = -np.stack([u_x * forward + u_y * left, v_x * forward + v_z * points[:, 2], forward], axis=1)
+    by_points[~stack.measured, 2] = 0.0
+    by_depths = np.zeros_like(by_points)
+    by_depths[:, 2] = stack.observed[:, 2]
+    inverted = stack.inverted[:, None]
+    return [np.where(inverted, by_depths, by_points), np.where(inverted, by_points, by_depths)]
+
+
+def _gradient(linear: Linear, residuals: Array) -> Array:
+    """(3,) gradient of the posture by other residuals (N, 3), with the same weights."""
+    f00, f10, f11, f20, f21, f22 = linear.factor.T
+    white = np.empty_like(residuals)
+    white[:, 0] = residuals[:, 0] / f00
+    white[:, 1] = (residuals[:, 1] - f10 * white[:, 0]) / f11
+    white[:, 2] = (residuals[:, 2] - f20 * white[:, 0] - f21 * white[:, 1]) / f22
+    white *= linear.weights[:, None]
+    return np.asarray(white.ravel() @ linear.white[:, :, 1:].reshape(-1, 3), np.float64)
+
+
+def _mean_and_information(prior: PoseGaussian | None) -> tuple[Array, Array]:
+    """(3,) mean and (3, 3) information of what else is known; no information without a prior."""
+    if prior is None:
+        return np.zeros(3), np.zeros((3, 3))
+    information = np.linalg.inv(prior.covariance + 1e-12 * np.eye(3)).astype(np.float64, copy=False)
+    return prior.mean.vector, information

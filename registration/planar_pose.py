@@ -1,0 +1,165 @@
+"""Where a planar robot stood when it saw known points: three degrees of freedom, robust.
+
+Static localization of the paper's section 6 (least squares on n >= 4 known points), made robust: many
+postures are solved at once from two or three sightings each, scored by likelihood, and the best refined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.pose import Array, Pose2, PoseGaussian
+from registration.gauss_newton import PlanarFix, improve, refine, stack_sightings
+from registration.minimal_poses import hypotheses
+from registration.planar_ambiguity import mirrored
+from registration.projection import Stack
+from registration.sightings import Sightings
+
+__all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
+
+PREVIEW = 20
+"""Sightings, about, on which all hypotheses are scored before the best fifth is scored on all."""
+
+
+@dataclass(frozen=True)
+class PlanarPoseSettings:
+    """How a posture is found.
+
+    Attributes:
+        hypotheses: postures tried from three bearings, and as many from two points with depth.
+        finalists: best hypotheses that are refined.
+        rounds: of Gauss-Newton at most.
+        pixel_sigma: standard deviation of a matched pixel, px. A SIFT feature found again at another scale
+            is off by about one pixel.
+        scale_sigma: share by which all points of one frame may be too near or too far together; they come
+            from one drive with one set of wheels, so their errors are not independent.
+        least_inliers: fewer give no posture.
+        apart: two postures nearer to each other than this are the same, m.
+    """
+
+    hypotheses: int = 100
+    finalists: int = 2
+    rounds: int = 8
+    pixel_sigma: float = 1.0
+    scale_sigma: float = 0.01
+    least_inliers: int = 4
+    apart: float = 0.3
+
+
+def solve_planar_pose(
+    points: NDArray[Any],
+    pixels: NDArray[Any],
+    camera: Camera,
+    *,
+    rng: np.random.Generator,
+    point_covariances: NDArray[Any] | None = None,
+    settings: PlanarPoseSettings | None = None,
+    prior: PoseGaussian | None = None,
+) -> PlanarFix | None:
+    """Find where the robot stood, from matches of which some may be wrong.
+
+    Args:
+        points: (N, 3) m, in the node's robot frame; rows that are not finite are never inliers.
+        pixels: (N, 2) px, where the robot sees them.
+        camera: the robot's.
+        rng: draws the hypotheses.
+        point_covariances: (N, 3, 3) m^2; exact points without.
+        settings: how.
+        prior: what is known of the posture already; counts as a measurement.
+
+    Returns:
+        The posture, or None if the sightings do not determine one.
+    """
+    s = settings or PlanarPoseSettings()
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+    usable = np.isfinite(points).all(axis=1) & np.isfinite(pixels).all(axis=1)
+    if point_covariances is not None:
+        usable &= np.isfinite(np.asarray(point_covariances)).all(axis=(1, 2))
+        point_covariances = np.asarray(point_covariances)[usable]
+    sightings = Sightings.build(
+        points[usable],
+        pixels[usable],
+        camera,
+        covariances=point_covariances,
+        pixel_sigma=s.pixel_sigma,
+    )
+    solved = solve_sightings([sightings], rng=rng, settings=s, prior=prior)
+    if solved is None:
+        return None
+    inliers = np.zeros(len(points), dtype=bool)
+    inliers[np.flatnonzero(usable)[solved.inliers]] = True
+    return replace(solved, inliers=inliers)
+
+
+def solve_sightings(
+    parts: Sequence[Sightings],
+    *,
+    rng: np.random.Generator,
+    settings: PlanarPoseSettings,
+    prior: PoseGaussian | None = None,
+) -> PlanarFix | None:
+    """The same for sightings in either direction; `inliers` is over all parts one after the other."""
+    parts = [part for part in parts if len(part)]
+    total = sum(len(part) for part in parts)
+    if total < settings.least_inliers:
+        return None
+    counts = [-(-settings.hypotheses * len(part) // total) for part in parts]
+    poses = np.concatenate([hypotheses(part, n, rng) for part, n in zip(parts, counts, strict=True)])
+    if prior is not None:
+        poses = np.concatenate([prior.mean.vector[None], poses])
+    if len(poses) == 0:
+        return None
+    stack = stack_sightings(parts)
+    if total > 2 * PREVIEW:
+        # Most hypotheses are wrong, which a part of the sightings shows as well as all of them.
+        few = [part.take(slice(None, None, total // PREVIEW)) for part in parts]
+        poses = poses[np.argsort(-_scores(few, poses), kind="stable")[: max(len(poses) // 5, 10)]]
+    finalists = np.argsort(-_scores(parts, poses), kind="stable")[: settings.finalists]
+    improved = [improve(stack, Pose2.from_vector(poses[k]), prior, rounds=2) for k in finalists]
+    kept = [one[0] for one in improved if one is not None]
+    if not kept:
+        return None
+    best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
+    fix = refine(stack, best, settings.scale_sigma, prior, rounds=settings.rounds)
+    if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
+        return None
+    return _weighed(fix, parts, stack, settings, prior)
+
+
+def _weighed(
+    fix: PlanarFix,
+    parts: Sequence[Sightings],
+    stack: Stack,
+    s: PlanarPoseSettings,
+    prior: PoseGaussian | None,
+) -> PlanarFix:
+    """The better of a posture and the one mirrored in what it sees, with how the other compares."""
+    seen = fix.inliers & ~stack.inverted
+    if int(seen.sum()) < s.least_inliers:
+        return fix
+    mean = fix.node_from_robot.mean
+    other = improve(stack, mirrored(mean, stack.points[seen, :2]), prior, rounds=s.rounds)
+    if other is None or other[0].distance(mean) < s.apart:
+        return fix
+    ours, theirs = _scores(parts, np.stack([mean.vector, other[0].vector])).tolist()
+    if theirs <= ours:
+        return replace(fix, rival=max(theirs, 0.0) / ours if ours > 0.0 else 1.0)
+    better = refine(stack, other[0], s.scale_sigma, prior, rounds=s.rounds)
+    if better is None or int(better.inliers.sum()) < s.least_inliers:
+        return replace(fix, rival=1.0)
+    return replace(better, rival=max(ours, 0.0) / theirs)
+
+
+def _scores(parts: Sequence[Sightings], poses: Array) -> Array:
+    """(H,) nats: how much better each of the (H, 3) postures explains the sightings than chance does."""
+    scores = np.zeros(len(poses))
+    for part in parts:
+        scores += part.log_ratios(poses).sum(axis=1)
+    return scores

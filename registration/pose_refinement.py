@@ -1,0 +1,79 @@
+"""A recognised view once more, with the noise that its pixels really have.
+
+A recognition takes a pixel to be off by one: features found again at another scale are. Seen from nearly
+where the node was made they are off by a tenth, and where the robot is follows so much more surely.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hybridmap.node import Node
+from hybridmap.pose import Array, PoseGaussian
+from hybridmap.query import View
+from registration.gauss_newton import refine, stack_sightings
+from registration.planar_pose import PlanarPoseSettings
+from registration.recognition import Recognition, of_unknown_scale
+from registration.sightings import Sightings
+
+LEAST_SIGMA, ROUNDS = 0.1, 3
+"""px, pixels are rounded in a node; and how often the noise is measured anew."""
+
+PRIOR_COUNT, PRIOR_SIGMA = 8, 0.5
+"""What is thought of a pixel's noise before, as if by so many pixels, px: few that happen to agree do not
+make a sharp image."""
+
+SHIFT_SIGMA = 0.1
+"""px, what is left of a lens and of where features settle in a pixel, the same for a whole image."""
+
+MAD_TO_SIGMA = 1.4826
+"""A Gaussian's standard deviation over the median of its absolute values."""
+
+
+def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSettings) -> PoseGaussian:
+    """Where the view was taken, by the landmarks that were recognised, weighted by what they are worth.
+
+    The noise of a pixel is the median of what is left of all, so that a few wrong ones do not count; its
+    upper limit is what the recognition took it to be.
+
+    Args:
+        node: the place.
+        view: the image's features.
+        found: that the view shows the node, by landmarks of the node that have a depth.
+        pose: how postures are found.
+
+    Returns:
+        `node_from_robot`; that of the recognition where there is nothing to add.
+    """
+    landmarks = node.landmarks.take(found.pairs[:, 0])
+    pixels = view.pixels[found.pairs[:, 1]].astype(np.float64)
+    known = landmarks.has_depth
+    if int(known.sum()) < pose.least_inliers:
+        return found.node_from_robot
+    landmarks, pixels = landmarks.take(known), pixels[known]
+    points = landmarks.points_in_robot(node.camera)
+    best, sigma = found.node_from_robot, pose.pixel_sigma
+    scale_share, tilt_sigma = node.landmarks.scale_share, node.landmarks.tilt_sigma
+    for _ in range(ROUNDS):
+        fresh = min(max(_noise(points, pixels, view, best), LEAST_SIGMA), pose.pixel_sigma)
+        if fresh > 0.95 * sigma:
+            break
+        sigma = fresh
+        covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share, tilt_sigma)
+        sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
+        fix = refine(
+            stack_sightings([sightings]), best.mean, pose.scale_sigma, None, pose.rounds, SHIFT_SIGMA
+        )
+        if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
+            break
+        best = of_unknown_scale(fix.node_from_robot, scale_share, node.camera, view.camera)
+    return best
+
+
+def _noise(points: Array, pixels: Array, view: View, best: PoseGaussian) -> float:
+    """px, standard deviation of a pixel around where its point should be."""
+    off = pixels - view.camera.project(best.mean.inverse().apply(points))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(off - np.median(off, axis=0))))
+    return math.sqrt((len(off) * spread**2 + PRIOR_COUNT * PRIOR_SIGMA**2) / (len(off) + PRIOR_COUNT))

@@ -1,0 +1,301 @@
+"""Is this image of that place, and where was it taken: matches, then geometry, then an honest verdict.
+
+What the geometry can rule out is chance: a wrong match hits the small gate around a point's projection about
+once in three hundred times, so a handful of inliers more than the posture needs is no accident. What it
+cannot rule out is another place with the same things in it. So a recognition also has to explain a good share
+of the features that matched at all, all over the image, and determine the posture; and its numbers are kept
+as evidence for those who can compare places (merge, mapserver.relocalizing.relocalization).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.node import Landmarks, Node
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import View
+from registration.evidence import GRID, depth_agreement, gather
+from registration.matching import MatchSettings, match
+from registration.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
+from registration.sightings import Sightings
+
+
+@dataclass(frozen=True)
+class RecognitionSettings:
+    """When an image counts as recognised.
+
+    Attributes:
+        matching: how features are matched.
+        pose: how the posture is found.
+        least_inliers: landmarks that agree.
+        least_share: of the matches that could have been inliers.
+        least_cells: cells of the 6 x 4 grid with an inlier, in either image.
+        least_seen: of the landmarks that should be in the image by the posture found, on the side where it
+            is more. A poster that hangs in two rooms explains few of what else should be there.
+        least_depths: of the landmarks that fit by their pixels and have a depth on both sides, how many
+            agree in depth too.
+        least_evidence: how much likelier the inliers are than wrong matches, nats.
+        most_mean_square: largest mean squared normalised residual; 1 is expected.
+        most_position_share: largest standard deviation of the position as a share of the median depth of
+            the inliers.
+        most_heading_sigma: rad.
+        most_rival: what the posture mirrored in what is seen may explain, as a share of what the best does:
+            a flat thing from afar looks almost the same from two sides.
+    """
+
+    matching: MatchSettings = field(default_factory=MatchSettings)
+    pose: PlanarPoseSettings = field(default_factory=PlanarPoseSettings)
+    least_inliers: int = 10
+    least_share: float = 0.35
+    least_cells: int = 5
+    least_seen: float = 0.12
+    least_depths: float = 0.5
+    least_evidence: float = 40.0
+    most_mean_square: float = 3.0
+    most_position_share: float = 0.06
+    most_heading_sigma: float = math.radians(4.0)
+    most_rival: float = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Recognition:
+    """A place was recognised.
+
+    Attributes:
+        node_from_robot: posture of the robot that took the view, in the node's robot frame. For two nodes
+            a and b this is `a_from_b`.
+        pairs: (K, 2) int64, inliers: landmark of the node (a), feature of the view (landmark of b).
+        matches: mutual matches, with or without depth.
+        usable: matches with a depth on either side, which could have been inliers.
+        fix: the posture with its residuals.
+        evidence: the numbers that support it, for an edge's `evidence`.
+    """
+
+    node_from_robot: PoseGaussian
+    pairs: NDArray[np.int64]
+    matches: int
+    usable: int
+    fix: PlanarFix
+    evidence: dict[str, float]
+
+    @property
+    def inliers(self) -> int:
+        """How many landmarks agree."""
+        return len(self.pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """A place was not recognised.
+
+    Attributes:
+        reason: in words.
+        matches: mutual matches.
+        pairs: (K, 2) int64, landmarks that agree on the best posture; none without one.
+        node_from_robot: the best posture, which was not good enough; None if nothing agrees on any.
+        evidence: the numbers by which it was refused; empty without a posture.
+    """
+
+    reason: str
+    matches: int
+    pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    node_from_robot: PoseGaussian | None = None
+    evidence: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def inliers(self) -> int:
+        """How many landmarks agree."""
+        return len(self.pairs)
+
+
+def recognise(
+    node: Node, view: View, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | None:
+    """Find where a view was taken near a node, or None; `examine_view` says why not."""
+    verdict = examine_view(node, view, settings, rng)
+    return verdict if isinstance(verdict, Recognition) else None
+
+
+def register(
+    a: Node, b: Node, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | None:
+    """Find `a_from_b` from what two nodes both see, or None; `examine_nodes` says why not."""
+    verdict = examine_nodes(a, b, settings, rng)
+    return verdict if isinstance(verdict, Recognition) else None
+
+
+def examine_view(
+    node: Node, view: View, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | Refusal:
+    """Compare a view with a node's landmarks that have a depth.
+
+    Args:
+        node: the place.
+        view: the image's features.
+        settings: when an image counts as recognised; None for the defaults.
+        rng: draws hypotheses.
+
+    Returns:
+        A recognition, or why there is none.
+    """
+    s = settings or RecognitionSettings()
+    return examine_matches(node, view, match(node.landmarks.codes, view.codes, s.matching), s, rng)
+
+
+def examine_matches(
+    node: Node,
+    view: View,
+    pairs: NDArray[np.int64],
+    settings: RecognitionSettings | None,
+    rng: np.random.Generator,
+) -> Recognition | Refusal:
+    """The same for features that are matched already.
+
+    Args:
+        node: the place.
+        view: the image's features.
+        pairs: (K, 2), landmark of the node and feature of the view; no index twice in a column.
+        settings: when an image counts as recognised; None for the defaults.
+        rng: draws hypotheses.
+
+    Returns:
+        A recognition, or why there is none.
+    """
+    unknown = np.full(len(view), np.nan, np.float32)
+    seen = Landmarks(view.pixels, view.codes, unknown, unknown)
+    s = settings or RecognitionSettings()
+    return _examine(node.landmarks, node.camera, seen, view.camera, pairs, s, rng)
+
+
+def examine_nodes(
+    a: Node, b: Node, settings: RecognitionSettings | None, rng: np.random.Generator
+) -> Recognition | Refusal:
+    """Compare two nodes, with the landmarks' depths on both sides, in one joint estimate.
+
+    Where a's landmark has a depth, its point must project on b's pixel and, if b has a depth too, lie at that
+    depth; where only b's has, its point must project on a's pixel.
+
+    Args:
+        a: one place.
+        b: the other.
+        settings: when two nodes count as the same place; None for the defaults.
+        rng: draws hypotheses.
+
+    Returns:
+        A recognition whose `node_from_robot` is `a_from_b`, or why there is none.
+    """
+    s = settings or RecognitionSettings()
+    pairs = match(a.landmarks.codes, b.landmarks.codes, s.matching)
+    return _examine(a.landmarks, a.camera, b.landmarks, b.camera, pairs, s, rng)
+
+
+def _examine(
+    a: Landmarks,
+    camera_a: Camera,
+    b: Landmarks,
+    camera_b: Camera,
+    pairs: NDArray[np.int64],
+    s: RecognitionSettings,
+    rng: np.random.Generator,
+) -> Recognition | Refusal:
+    forward = a.has_depth[pairs[:, 0]]
+    backward = ~forward & b.has_depth[pairs[:, 1]]
+    usable = np.concatenate([pairs[forward], pairs[backward]])
+    if len(usable) < s.least_inliers:
+        many = "1 feature matches" if len(pairs) == 1 else f"{len(pairs)} features match"
+        words = f"{many}, {len(usable)} with a depth; {s.least_inliers} are needed"
+        return Refusal(words, len(pairs))
+    # A view has no depths that could contradict the scale of the node's: then it is not part of each of them.
+    measured = bool(b.has_depth.any())
+    scale_share = 0.0 if measured else a.scale_share
+    sightings = [
+        _sightings(a, camera_a, b, camera_b, pairs[forward], s, False, scale_share),
+        _sightings(b, camera_b, a, camera_a, pairs[backward][:, ::-1], s, True, 0.0),
+    ]
+    fix = solve_sightings(sightings, rng=rng, settings=s.pose)
+    if fix is None:
+        return Refusal(f"{len(usable)} matches agree on no posture", len(pairs))
+    inliers = usable[fix.inliers]
+    evidence = gather(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
+    evidence["depths"] = depth_agreement(sightings[0], fix)
+    evidence["rival"] = fix.rival
+    reason = _objection(evidence, s)
+    if reason:
+        return Refusal(reason, len(pairs), inliers, fix.node_from_robot, evidence)
+    unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
+    posture = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
+    return Recognition(posture, inliers, len(pairs), len(usable), fix, evidence)
+
+
+def of_unknown_scale(posture: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:
+    """A posture that may be too far away, or too near, by a share of the way between the two cameras.
+
+    Args:
+        posture: node_from_robot.
+        share: Landmarks.scale_share.
+        of_node: camera that took the node.
+        of_view: the robot's.
+    """
+    if not share:
+        return posture
+    camera = (posture.mean @ Pose2(of_view.mount_forward)).vector[:2] - [of_node.mount_forward, 0.0]
+    change = np.append(share * (posture.mean.rotation.T @ camera), 0.0)
+    return PoseGaussian(posture.mean, posture.covariance + np.outer(change, change))
+
+
+def _sightings(
+    known: Landmarks,
+    known_camera: Camera,
+    seen: Landmarks,
+    seen_camera: Camera,
+    pairs: NDArray[Any],
+    s: RecognitionSettings,
+    inverted: bool,
+    scale_share: float,
+) -> Sightings:
+    """Points of the known side, pixels and depths of the seen side."""
+    tilt_sigma = known.tilt_sigma
+    known, seen = known.take(pairs[:, 0]), seen.take(pairs[:, 1])
+    return Sightings.build(
+        known.points_in_robot(known_camera),
+        seen.pixels,
+        seen_camera,
+        covariances=known.covariances_in_robot(known_camera, s.pose.pixel_sigma, scale_share, tilt_sigma),
+        pixel_sigma=s.pose.pixel_sigma,
+        depths=seen.depths,
+        depth_sigmas=seen.depth_sigmas,
+        inverted=inverted,
+    )
+
+
+def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
+    """Why a posture is not good enough, in words; empty if it is."""
+    e = evidence
+    inliers = int(e["inliers"])
+    if inliers < s.least_inliers:
+        return f"{inliers} landmarks agree on a posture; {s.least_inliers} are needed"
+    if e["share"] < s.least_share:
+        return f"only {e['share']:.0%} of the matches agree on one posture"
+    if e["cells"] < s.least_cells:
+        return f"the {inliers} landmarks that agree lie in {int(e['cells'])} of {math.prod(GRID)} image cells"
+    if e["seen"] < s.least_seen:
+        return f"only {e['seen']:.0%} of the landmarks that should be in the image are"
+    if e["depths"] < s.least_depths:
+        return f"only {e['depths']:.0%} of the landmarks that fit lie at the same depth"
+    if e["log_evidence"] < s.least_evidence:
+        return f"the {inliers} landmarks that agree are hardly better than chance"
+    if e["rival"] > s.most_rival:
+        return f"a posture on the other side of what is seen explains {e['rival']:.0%} as much"
+    if e["mean_square"] > s.most_mean_square:
+        return f"the residuals are {math.sqrt(e['mean_square']):.1f} times what they should be"
+    if e["sigma_xy"] > s.most_position_share * e["depth"]:
+        return f"the position is uncertain by {e['sigma_xy']:.2f} m at landmarks {e['depth']:.1f} m away"
+    if e["sigma_heading"] > s.most_heading_sigma:
+        return f"the heading is uncertain by {math.degrees(e['sigma_heading']):.1f} degrees"
+    return ""

@@ -1,0 +1,127 @@
+"""Which landmarks a node keeps: those that will be found again, all over the image, and unlike each other.
+
+A landmark's worth is given by who has followed it. What else is kept already lowers it: a second landmark
+at the same spot adds little, for a posture is determined by spread. So they are chosen one by one, always
+the one that is worth most then, until the node has cost what it may.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.descriptor import decode, rounding_noise
+from hybridmap.errors import InvalidValue
+from hybridmap.grid import FINE_BITS, PixelGrid, round_depths
+from hybridmap.landmark_tables import DIMENSIONS, TOTAL_BITS, landmark_tables
+from hybridmap.node import Landmarks
+from hybridmap.pose import Array
+from registration.matching import squared_distances
+
+FIXED_BYTES = 330
+"""A node without landmarks: names, posture, camera, 16 ranges, checksums and the transport's frame."""
+
+LANE_BITS = 3.25
+"""What a landmark costs at most beyond the logarithms of its numbers: whole bits, and the row it is in."""
+
+DOUBT = 0.3
+"""A landmark that was not seen again is not worthless: the robot may just have looked elsewhere."""
+
+
+@dataclass(frozen=True)
+class SelectionSettings:
+    """How many landmarks a node keeps, and which.
+
+    Attributes:
+        most_bytes: what a node may cost on the wire, all but its wake included.
+        crowd: landmarks nearer to each other than about this share of the image's width crowd each other.
+        alike: distance of two decoded descriptors beyond which they cannot be taken for each other.
+    """
+
+    most_bytes: int = 3000
+    crowd: float = 0.08
+    alike: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse what leaves no room for a node.
+
+        Raises:
+            InvalidValue: a number out of range.
+        """
+        if self.most_bytes < 2 * FIXED_BYTES:
+            raise InvalidValue(f"most_bytes: a node needs {2 * FIXED_BYTES} at least, not {self.most_bytes}")
+        if not (self.crowd > 0 and self.alike > 0):
+            raise InvalidValue("crowd and alike must be positive")
+
+
+def worth(seen: NDArray[Any], rank: NDArray[Any]) -> Array:
+    """How likely landmarks are found again, (N,), up to a factor.
+
+    Args:
+        seen: (N,) share of the images since the view in which each was followed or found, 0 to 1.
+        rank: (N,) how many of the view's features are stronger, as a share, 0 to 1.
+    """
+    likely: Array = (DOUBT + seen) * np.sqrt(1.5 - rank)
+    return likely
+
+
+def choose(
+    landmarks: Landmarks, likely: NDArray[Any], camera: Camera, settings: SelectionSettings | None = None
+) -> NDArray[np.int64]:
+    """Choose landmarks, the best first.
+
+    Args:
+        landmarks: N candidates.
+        likely: (N,) positive, how likely each is found again, see `worth`.
+        camera: that saw them.
+        settings: what they may cost.
+
+    Returns:
+        (K,) int64, indices; as many as fit.
+    """
+    s = settings or SelectionSettings()
+    order = _ranked(landmarks.pixels / camera.width, likely * distinctness(landmarks, s.alike), s.crowd)
+    fits = _bytes_of_first(landmarks.take(order), camera) <= s.most_bytes
+    return order[: int(fits.sum())]
+
+
+def distinctness(landmarks: Landmarks, alike: float) -> Array:
+    """(N,) distance of each descriptor to the nearest other as a share of what is far enough, 1 at most."""
+    vectors = decode(landmarks.codes)
+    squared = squared_distances(vectors, vectors).astype(np.float64) - rounding_noise()
+    np.fill_diagonal(squared, np.inf)
+    nearest = np.sqrt(np.maximum(squared.min(axis=1, initial=np.inf), 0.0))
+    distinct: Array = np.minimum(nearest / alike, 1.0)
+    return distinct
+
+
+def _ranked(places: Array, value: Array, crowd: float) -> NDArray[np.int64]:
+    """All indices, each time the one that is worth most by what is there before it."""
+    away = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+    nearness = np.exp(-away / (2 * crowd**2))
+    crowded, left = np.ones(len(places)), np.array(value, np.float64)
+    order = np.empty(len(places), np.int64)
+    for k in range(len(places)):
+        order[k] = best = int((left / crowded).argmax())
+        crowded += nearness[best]
+        left[best] = -1.0
+    return order
+
+
+def _bytes_of_first(landmarks: Landmarks, camera: Camera) -> Array:
+    """(N,) what a node with the first 1, 2 ... N landmarks costs at most."""
+    t, steps = landmark_tables(), 2.0 ** PixelGrid.of(camera).shift
+    share, depth = round_depths(landmarks.depths, landmarks.depth_sigmas)
+    fine, known = FINE_BITS[share], share > 0
+    codes = (TOTAL_BITS - np.log2(t.codes[np.arange(DIMENSIONS), landmarks.codes])).sum(axis=1)
+    cells = np.where(known, TOTAL_BITS - np.log2(np.maximum(t.cells[depth >> fine], 1)) + fine, 0.0)
+    shares = TOTAL_BITS - np.log2(t.shares[share])
+    count = np.arange(1, len(landmarks) + 1)
+    # By rows, a landmark's y costs its share of the image only.
+    pixel = np.log2(camera.width * steps) + np.log2(np.maximum(camera.height * steps / count, 1)) + LANE_BITS
+    bits: Array = np.cumsum(codes + cells + shares) + count * pixel
+    return FIXED_BYTES + np.ceil(bits / 8)

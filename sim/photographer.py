@@ -1,0 +1,111 @@
+"""Somebody walks through a world before the robots come, and takes photographs of the way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.errors import InvalidValue
+from hybridmap.pose import Array, Pose2
+from sim.camera import CameraSetup
+from sim.floorplan import FloorPlan
+from sim.imager import Imager
+from sim.scene import Scene
+from sim.texture import Image
+from sim.world import PanelSet, World
+
+CLEARANCE = 0.3
+"""m on either side of the way, so that a robot can follow."""
+VIEW = 1.2
+"""m of free floor ahead of the last photograph: from nearer a wall shows little."""
+CORNER = math.radians(35.0)
+"""By which the way bends half way, at most, to either side."""
+TRIES = 4000
+
+ASIDE, YAW, TILT, RISE, STEP = 0.03, math.radians(3.0), math.radians(1.5), 0.02, 0.2
+"""Standard deviations of a camera in the hand: m beside the way, rad to the side, rad of pitch and of roll, m
+above or below its height; and by which share of it a step is longer or shorter at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A picture, and where it was really taken: below the camera, which looked along the posture's x axis."""
+
+    image: Image
+    world_from_camera: Pose2
+
+
+def walk(world: World, camera: CameraSetup, count: int, spacing: float, seed: int) -> list[Photograph]:
+    """Take photographs along a free way that the seed chooses.
+
+    Args:
+        world: as it stands when no robot is there.
+        camera: that is carried, at its height.
+        count: of photographs.
+        spacing: m between two of them, about.
+        seed: of the way, and of the hand.
+
+    Raises:
+        InvalidValue: there is no such way.
+    """
+    rng = np.random.default_rng([seed, 0xF070])
+    way = _way(world.plan, (count - 1) * spacing, rng)
+    scene = Scene([PanelSet.of(world.panels)])
+    imager = Imager(camera, world.background, (seed, 0xF070))
+    steps = spacing * rng.uniform(1.0 - STEP, 1.0 + STEP, count - 1)
+    photographs = []
+    for gone in np.concatenate([[0.0], np.cumsum(steps)]).tolist():
+        held = way.at(gone) @ Pose2(0.0, rng.normal(0.0, ASIDE), rng.normal(0.0, YAW))
+        pitch, roll = rng.normal(0.0, TILT, 2)
+        rotation = _rotation(held.heading, pitch, roll)
+        height = camera.intrinsics.mount_height
+        centre = np.array([held.x, held.y, height + rng.normal(0.0, RISE)])
+        origin = centre - rotation @ [camera.intrinsics.mount_forward, 0.0, height]
+        image = imager.picture(scene, (origin, rotation), 1.0, 0.0, 1.0)
+        photographs.append(Photograph(image, held))
+    return photographs
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Two straight legs of a length in m."""
+
+    start: Pose2
+    leg: float
+    bend: float
+
+    def at(self, gone: float) -> Pose2:
+        """After so many m."""
+        if gone < self.leg:
+            return self.start @ Pose2(gone)
+        return self.start @ Pose2(self.leg, 0.0, self.bend) @ Pose2(gone - self.leg)
+
+
+def _way(plan: FloorPlan, length: float, rng: np.random.Generator) -> _Way:
+    points = plan.free_points(CLEARANCE)
+    longest = (1.0 + STEP) * length
+    for _ in range(TRIES if len(points) else 0):
+        x, y = points[rng.integers(len(points))].tolist()
+        start = Pose2(x, y, float(rng.uniform(-math.pi, math.pi)))
+        way = _Way(start, 0.5 * length, float(rng.uniform(-CORNER, CORNER)))
+        end = way.at(longest)
+        if not plan.is_free(end.x, end.y, CLEARANCE):
+            continue
+        along = [way.at(gone) for gone in np.arange(0.0, longest + VIEW, 0.05).tolist()]
+        clearances = plan.clearances(np.array([[place.x, place.y] for place in along]))
+        walked = round(longest / 0.05)
+        if clearances[:walked].min() >= CLEARANCE and clearances.min() > 0.0:
+            return way
+    raise InvalidValue(f"there is no free way of {length:.1f} m in this world")
+
+
+def _rotation(yaw: float, pitch: float, roll: float) -> Array:
+    """(3, 3) from the camera's body axes (x ahead, y left, z up) to world."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
+    turned = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    nodded = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    rolled = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    rotation: Array = turned @ nodded @ rolled
+    return rotation

@@ -1,0 +1,281 @@
+"""Fleets of which one robot has wrong geometry: a long or turning odometry, a slip, a carried robot."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, View
+from mapserver.answers import Answers
+from mapserver.merging.merger import Merger
+from synthetic.world import World, room, take_node, take_view
+
+SIGMA_XY, SIGMA_HEADING = 0.015, 0.008
+"""What a robot says of each step, and what a sound one is off by, m and rad."""
+RIGHT_M = 0.35
+"""A told position nearer to the truth than this is right."""
+MARGIN = 0.6
+"""m, robots keep away from walls."""
+
+
+class Fault(StrEnum):
+    """What is wrong with a robot's odometry."""
+
+    NONE = "none"
+    LONG = "long"
+    """Every distance is measured 30 % too long."""
+    TURNS = "turns"
+    """Every turn is measured 10 % too large."""
+    SLIP = "slip"
+    """Once it moves 2 m that it does not measure."""
+    CARRIED = "carried"
+    """Once it is carried to another place, and does not notice."""
+
+
+@dataclass(frozen=True, eq=False)
+class House:
+    """Rooms whose walls hide each other.
+
+    Attributes:
+        rooms: landmarks of each.
+        boxes: (x, y, width, depth) of each, m.
+    """
+
+    rooms: tuple[World, ...]
+    boxes: tuple[tuple[float, float, float, float], ...]
+
+    def seen_from(self, at: Pose2) -> World:
+        """What can be seen from a place."""
+        for world, (x, y, width, depth) in zip(self.rooms, self.boxes, strict=True):
+            if x < at.x < x + width and y < at.y < y + depth:
+                return world
+        raise ValueError(f"{at} is in no room")
+
+    def inside(self, number: int, rng: np.random.Generator) -> Pose2:
+        """A random posture in a room."""
+        x, y, width, depth = self.boxes[number]
+        low = [x + MARGIN, y + MARGIN, -math.pi]
+        return Pose2.from_vector(rng.uniform(low, [x + width - MARGIN, y + depth - MARGIN, math.pi]))
+
+
+def draw_house(rng: np.random.Generator, *, twins: bool = False, gap: float = 0.2, count: int = 2) -> House:
+    """Rooms in a row. With `twins` the last two look the same."""
+    rooms, boxes, x = list[World](), list[tuple[float, float, float, float]](), 0.0
+    for k in range(count):
+        width, depth = rng.uniform(4.0, 6.0), rng.uniform(3.5, 5.0)
+        if twins and k == count - 1:
+            _, _, width, depth = boxes[-1]
+            shift = Pose2(x - boxes[-1][0], 0.0, 0.0)
+            rooms.append(rooms[-1].moved(shift))
+        else:
+            rooms.append(room(x, 0.0, width, depth, round(40 * (width + depth) * 2), rng))
+        boxes.append((x, 0.0, width, depth))
+        x += width + gap
+    return House(tuple(rooms), tuple(boxes))
+
+
+def draw_tour(
+    house: House, visits: Sequence[int], stops: int, looks: int, rng: np.random.Generator
+) -> list[Pose2]:
+    """Postures of a robot that goes from room to room and looks around at each stop."""
+    tour: list[Pose2] = []
+    for number in visits:
+        for _ in range(stops):
+            choice = [house.inside(number, rng) for _ in range(4)]
+            # Robots go to what is near: long ways are rare.
+            stop = min(choice, key=tour[-1].distance) if tour else choice[0]
+            tour += [Pose2(stop.x, stop.y, stop.heading + k * math.tau / looks) for k in range(looks)]
+    return tour
+
+
+def draw_map(
+    house: House, map_id: MapId, tour: Sequence[Pose2], fault: Fault, rng: np.random.Generator
+) -> tuple[list[Node], list[Edge], dict[NodeId, Pose2]]:
+    """A robot's map of a tour, and where its nodes truly are."""
+    nodes: list[Node] = []
+    edges: list[Edge] = []
+    truth: dict[NodeId, Pose2] = {}
+    broken = round(len(tour) * rng.uniform(0.4, 0.6)) if fault in (Fault.SLIP, Fault.CARRIED) else -1
+    aside = rng.uniform(-math.pi, math.pi)
+    place = PoseGaussian(Pose2(), np.zeros((3, 3)))
+    for k, true in enumerate(tour):
+        node_id = NodeId(*map_id, 2 * k + 1)
+        if k:
+            before = tour[k - 1]
+            step = before.inverse() @ true
+            if fault is Fault.LONG:
+                step = Pose2(1.3 * step.x, 1.3 * step.y, step.heading)
+            elif fault is Fault.TURNS:
+                turn = math.remainder(step.heading, math.tau)
+                step = Pose2(step.x, step.y, 1.1 * turn)
+            elif k == broken and fault is Fault.SLIP:
+                step = Pose2(2.0 * math.cos(aside), 2.0 * math.sin(aside), 0.0) @ step
+            elif k == broken:
+                step = Pose2(0.5, 0.0, 0.3)
+            noise = Pose2.from_vector(rng.normal(0.0, [SIGMA_XY, SIGMA_XY, SIGMA_HEADING]))
+            measured = PoseGaussian.from_sigmas(step @ noise, SIGMA_XY, SIGMA_HEADING)
+            place = place @ measured
+            kind = EdgeKind.TURNED if before.distance(true) < 0.05 else EdgeKind.MAPPED
+            edges.append(Edge(NodeId(*map_id, 2 * k), nodes[-1].id, node_id, measured, kind))
+        nodes.append(take_node(house.seen_from(true), node_id, true, place, rng))
+        truth[node_id] = true
+    return nodes, edges, truth
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """Maps of one house, and the truth.
+
+    Attributes:
+        house: where.
+        maps: nodes and edges of each robot.
+        truth: `world_from_robot` of each node.
+    """
+
+    house: House
+    maps: dict[MapId, tuple[list[Node], list[Edge]]]
+    truth: dict[NodeId, Pose2]
+
+    def changes(self, left_out: frozenset[MapId] = frozenset()) -> list[Change]:
+        """All maps in turns, as robots that map at the same time tell of them."""
+        queues = []
+        for map_id, (nodes, edges) in self.maps.items():
+            if map_id not in left_out:
+                bodies: list[ChangeBody] = [NodePut(nodes[0])]
+                for node, edge in zip(nodes[1:], edges, strict=True):
+                    bodies += [NodePut(node), EdgePut(edge)]
+                queues.append([Change(map_id, n, 0, body) for n, body in enumerate(bodies, start=1)])
+        out = []
+        for k in range(max(map(len, queues))):
+            out += [queue[k] for queue in queues if k < len(queue)]
+        return out
+
+
+ODD = MapId("r3", 1)
+"""The robot with the fault."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Who maps what.
+
+    Attributes:
+        name: in the table.
+        twins: whether the last two of the rooms look the same.
+        sound: rooms that each sound robot visits, in order.
+        odd: rooms that the robot with the fault visits.
+        asked: rooms in which robots are lost.
+        rooms: how many.
+    """
+
+    name: str
+    twins: bool
+    sound: tuple[tuple[int, ...], ...]
+    odd: tuple[int, ...]
+    asked: tuple[int, ...]
+    rooms: int = 2
+
+
+SCENES = {
+    scene.name: scene
+    for scene in (
+        Scene("room", False, ((0,), (0,), (0,)), (0,), (0,), rooms=1),
+        Scene("house", False, ((0, 1), (1, 0), (0, 1)), (0, 1), (0, 1)),
+        # The sound robots know the first of the two alike rooms, the fourth one the second.
+        Scene("twins", True, ((0, 1), (1, 0), (0, 1)), (0, 2), (1, 2), rooms=3),
+        Scene("twins both", True, ((0, 1, 2), (2, 1, 0), (0, 2, 1)), (0, 2), (1, 2), rooms=3),
+        Scene("twins alone", True, ((1,), (1,), (1,)), (2,), (1, 2), rooms=3),
+    )
+}
+
+
+def draw_fleet(seed: int, scene: Scene, fault: Fault, stops: int = 3, looks: int = 5) -> Fleet:
+    """Three sound robots, and one with a fault."""
+    rng = np.random.default_rng([seed, 0x0DD])
+    house = draw_house(rng, twins=scene.twins, count=scene.rooms)
+    maps, truth = {}, dict[NodeId, Pose2]()
+    for k, visits in enumerate((*scene.sound, scene.odd)):
+        odd = k == len(scene.sound)
+        own = np.random.default_rng([seed, k])
+        count = round(stops * 2 / len(visits)) if not scene.twins else stops
+        tour = draw_tour(house, visits, count, looks, own)
+        map_id = ODD if odd else MapId(f"r{k}", 1)
+        nodes, edges, true = draw_map(house, map_id, tour, fault if odd else Fault.NONE, own)
+        maps[map_id] = nodes, edges
+        truth |= true
+    return Fleet(house, maps, truth)
+
+
+def merged_fleet(fleet: Fleet, left_out: frozenset[MapId] = frozenset()) -> Merger:
+    """All changes taken in, merged twice on the way."""
+    merger = Merger()
+    changes = fleet.changes(left_out)
+    for k, change in enumerate(changes):
+        merger.on_change(change)
+        if k in (len(changes) // 3, 2 * len(changes) // 3):
+            merger.merged()
+    merger.merged()
+    return merger
+
+
+def lost_views(fleet: Fleet, scene: Scene, count: int, seed: int) -> list[tuple[View, Pose2]]:
+    """What lost robots see, near where somebody has been, and where they are."""
+    rng = np.random.default_rng([seed, 0x105])
+    out = []
+    box = {number: fleet.house.boxes[number] for number in scene.asked}
+    near = [
+        pose for pose in fleet.truth.values()
+        if any(x < pose.x < x + w and y < pose.y < y + d for x, y, w, d in box.values())
+    ]  # fmt: skip
+    for _ in range(count):
+        pose = near[rng.integers(len(near))]
+        while True:
+            at = pose @ Pose2.from_vector(rng.normal(0.0, [0.2, 0.2, 0.15]))
+            try:
+                world = fleet.house.seen_from(at)
+                break
+            except ValueError:
+                continue
+        out.append((take_view(world, at, rng)[0], at))
+    return out
+
+
+class Told(StrEnum):
+    """What an answer is worth."""
+
+    RIGHT = "right"
+    WRONG = "wrong"
+    AMBIGUOUS = "ambiguous"
+    UNKNOWN = "unknown"
+
+
+def judged(answers: Answers, view: View, at: Pose2, truth: dict[NodeId, Pose2]) -> Told:
+    """Compare an answer with the truth."""
+    told = answers.relocalizer.answer(view)
+    if told.certainty is not Certainty.FOUND:
+        return Told.AMBIGUOUS if told.certainty is Certainty.AMBIGUOUS else Told.UNKNOWN
+    best = told.candidates[0]
+    off = (truth[best.node] @ best.node_from_robot.mean).distance(at)
+    return Told.RIGHT if off < RIGHT_M else Told.WRONG
+
+
+def outcome(
+    fleet: Fleet, views: Sequence[tuple[View, Pose2]], left_out: frozenset[MapId] = frozenset()
+) -> dict[str, Any]:
+    """Merge a fleet and ask: answers of each sort, parts of the sound maps, and maps that are found wrong."""
+    merger = merged_fleet(fleet, left_out)
+    merged = merger.merged()
+    answers = Answers.of(merger, merged, merger.node)
+    told = Counter(judged(answers, view, at, fleet.truth) for view, at in views)
+    parts = sum(any(node.map != ODD for node in part) for part in merged.components)
+    wrong = [one.reason for one in merged.wrong.values()]
+    return {str(one): told[one] for one in Told} | {"parts": parts, "found": wrong}

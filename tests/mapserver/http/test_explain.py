@@ -1,0 +1,175 @@
+"""Why maps are one, over HTTP and on the page in a real browser: the numbers are those of the merged map."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+
+from hybridmap.errors import Busy
+from hybridmap.history import Happening, Kind
+from hybridmap.node import NodeId
+from mapserver.http.explanation_json import route_values
+from mapserver.http.web import Web
+from mapserver.route_explaining import explain_route
+from mapserver.routes import Router
+from merge.explaining.explanation import explain_nodes
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.desks import Desk, two_maps
+from tests.waiting import eventually
+
+TOLD = "return document.getElementById('told').textContent"
+LINKS = "return [...document.querySelectorAll('#told a')].map(a => a.textContent)"
+
+
+def count(kind: str) -> str:
+    return f"return document.querySelectorAll('svg {kind}').length"
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+@pytest.fixture
+def served(desk: Desk) -> Iterator[Web]:
+    with Web(("127.0.0.1", 0), desk) as served:
+        yield served
+
+
+def ask(served: Web, query: str, of: str = "explain") -> tuple[int, dict]:
+    try:
+        with urlopen(f"http://127.0.0.1:{served.port}/{of}{query}", timeout=20) as reply:
+            return reply.status, json.load(reply)
+    except HTTPError as error:
+        return error.code, json.load(error)
+
+
+def test_maps_and_nodes_are_explained(served: Web) -> None:
+    status, told = ask(served, "")
+    (one,) = told["maps"]
+    assert status == 200 and one["joined"] and (one["first"], one["second"]) == ("r0.1", "r1.1")
+    assert ask(served, "?a=r1.1&b=r0.1") == (200, told)
+    weakest = one["nearest"][0]
+    status, pair = ask(served, f"?a={weakest['b']}&b={weakest['a']}")
+    merged = two_maps()
+    link = next(link for link in merged.links if str(link.a) == weakest["a"] and str(link.b) == weakest["b"])
+    assert status == 200 and pair["standing"] == "linked" and pair["shared"] == link.shared.tolist()
+    assert np.allclose(pair["a_from_b"]["covariance"], link.a_from_b.covariance)
+    for side, end in enumerate(link.pair):
+        node = merged.maps[end.map].nodes[end]
+        assert pair["images"][side] == [node.camera.width, node.camera.height]
+        assert np.allclose(pair["pixels"][side], node.landmarks.pixels, atol=0.051)
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("?a=r0.1", "write /explain"),
+        ("?a=r0.1&b=r1.1&c=1", "write /explain"),
+        ("?a=r0.1&b=", "neither a node nor a map"),
+        ("?a=r0.1&b=r1.1.1", "a node and a map"),
+        ("?a=r0.1&b=r0.1", "give two maps"),
+        ("?a=r0.1.1&b=r9.1.1", "there is no map r9.1; known are: r0.1, r1.1"),
+    ],
+)
+def test_what_cannot_be_explained_is_one_line(served: Web, query: str, words: str) -> None:
+    status, told = ask(served, query)
+    assert status == 400 and words in told["error"] and "\n" not in told["error"]
+
+
+def test_a_busy_server_says_when(served: Web, desk: Desk) -> None:
+    desk.refusal = Busy(0.5)
+    status, told = ask(served, "")
+    assert status == 503 and told["retry_after"] == 0.5
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: pytest.TempPathFactory) -> None:
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        a, b = (NodeId.parse(word) for word in page.run(LINKS)[0].split(" - "))
+        page.run("document.querySelector('#told a').click()")
+        eventually(lambda: f"{a} and {b}: linked: " in page.run(TOLD))
+        told = explain_nodes(two_maps(), a, b)
+        assert page.run(count(".agree")) == len(told.shared)
+        assert page.run(count(".alike")) == len(told.matches) - len(told.shared)
+        assert page.run(count("circle")) == len(told.a.landmarks) + len(told.b.landmarks)
+        assert f"{told.a_from_b.mean.x:.3f} m ahead" in page.run(TOLD)
+        # Whoever is given the address sees the same at once, and the way back leads back.
+        address = page.run("return location.href")
+        assert address.endswith(f"/why?a={a}&b={b}")
+        page.run("document.getElementById('all').click()")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        page.open(address)
+        eventually(lambda: f"{a} and {b}: linked: " in page.run(TOLD))
+        page.open(f"http://127.0.0.1:{served.port}/why?a=r1.1&b=%20r0.1%20")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        assert page.run("return [a, b].map(one => one.value)") == ["r1.1", "r0.1"]
+        page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=%3Cb%3Ex")
+        eventually(lambda: "neither a node nor a map" in page.run(TOLD))
+        assert page.run("return document.querySelector('#told b')") is None
+        assert page.run("return document.querySelectorAll('b').length") == 0
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_the_page_tells_the_way_from_its_form_and_from_its_address(
+    served: Web, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
+    told = explain_route(Router(two_maps()), start, goal)
+    assert told.found and ask(served, f"?a={start}&b={goal}", "route") == (200, route_values(told))
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        page.type("#a", str(start))
+        page.type("#b", str(goal))
+        page.run("document.querySelector('[name=route]').click()")
+        eventually(lambda: f"{start} to {goal}: the way leads so: {told.reason}" in page.run(TOLD))
+        assert page.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in told.hops]
+        address = page.run("return location.href")
+        assert address.endswith(f"/why?a={start}&b={goal}&route=1")
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        page.open(address)
+        eventually(lambda: f"{start} to {goal}: the way leads so" in page.run(TOLD))
+        page.run("document.querySelector('#told a').click()")
+        eventually(lambda: f"{told.hops[0].a} and {told.hops[0].b}: " in page.run(TOLD))
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_what_has_happened_is_told_newest_first(
+    served: Web, desk: Desk, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    shown = "return [...document.querySelectorAll('#past li')].map(one => one.textContent)"
+    hidden = "return document.getElementById('past').hidden"
+    with Browser(tmp_path_factory.mktemp("profile")) as page:
+        page.open(f"http://127.0.0.1:{served.port}/why")
+        eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
+        assert page.run(hidden) and page.run(shown) == []
+        desk.happenings = (
+            Happening(10**18, Kind.JOINED, "r0.1 and r1.1 are one map now"),
+            Happening(10**18 + 7 * 10**9, Kind.PARTED, "<b>x"),
+        )
+        page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=r1.1")
+        eventually(lambda: not page.run(hidden))
+        assert page.run(shown) == [
+            "2001-09-09 01:46:47 UTC: parted: <b>x",
+            "2001-09-09 01:46:40 UTC: joined: r0.1 and r1.1 are one map now",
+        ]
+
+
+def test_what_has_happened_is_told_with_its_time(served: Web, desk: Desk) -> None:
+    desk.happenings = (Happening(10**18, Kind.RULED, "no"),)
+    with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
+        (one,) = json.load(reply)["history"]
+    assert one == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "ruled", "words": "no"}
+
+
+def test_a_way_leads_from_node_to_node(served: Web) -> None:
+    for query, words in (("", "write /route?a="), ("?a=r0.1&b=r1.1", "from node to node")):
+        status, told = ask(served, query, "route")
+        assert status == 400 and words in told["error"]

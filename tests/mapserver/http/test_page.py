@@ -1,0 +1,84 @@
+"""The page for phones in a real browser: a picture is chosen, sent, and the answer shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hybridmap.errors import Busy, InvalidValue
+from mapserver.http.web import Web
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.desks import PLACE, Desk, picture
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+RESULT = "return document.getElementById('result').textContent"
+ROWS = "return [...document.querySelectorAll('tr')].map(r => [...r.children].map(c => c.textContent))"
+STATUS = "return document.getElementById('status').textContent"
+KIND = "return document.getElementById('result').className"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+@pytest.fixture
+def page(browser: Browser, desk: Desk) -> Iterator[Browser]:
+    with Web(("127.0.0.1", 0), desk) as served:
+        browser.open(f"http://127.0.0.1:{served.port}/")
+        yield browser
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(picture(kind=".jpg"))
+    return path
+
+
+def test_a_picture_is_answered_on_the_page(page: Browser, desk: Desk, image: Path) -> None:
+    eventually(lambda: page.run(STATUS) == "The map: 12 nodes")
+    page.type("#hfov", "90")
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "found")
+    assert page.run(RESULT).startswith("found: 31 landmarks of r0.1.7 agree")
+    rows = page.run(ROWS)
+    assert rows == [
+        ["place", "ahead", "left", "turned", "probability"],
+        ["r0.1.7", "0.50 m", "-0.25 m", "6°", "99 %"],
+    ]
+    assert page.run("return document.getElementById('shown').naturalWidth") == 160
+    assert desk.views[-1].camera.fx == pytest.approx(80.0)
+
+
+def test_no_distance_is_shown_that_nobody_knows(page: Browser, desk: Desk, image: Path) -> None:
+    desk.answer = PLACE
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "place")
+    assert page.run(ROWS)[1] == ["r0.1.7", "not known", "not known", "6°", "90 %"]
+
+
+def test_what_goes_wrong_is_said_on_the_page(page: Browser, desk: Desk, image: Path) -> None:
+    desk.refusal = InvalidValue("<b>this</b> is no place")
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "failed")
+    # As text, whatever it holds.
+    assert "<b>this</b> is no place" in page.run(RESULT)
+    assert page.run("return document.querySelector('#result b')") is None
+
+
+def test_a_busy_server_is_asked_again(page: Browser, desk: Desk, image: Path) -> None:
+    desk.refusal = Busy(0.2)
+    page.type("#image", str(image))
+    eventually(lambda: "waiting" in page.run(RESULT))
+    desk.refusal = None
+    eventually(lambda: page.run(KIND) == "found")

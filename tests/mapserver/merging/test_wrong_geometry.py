@@ -1,0 +1,62 @@
+"""A robot with wrong geometry and true views takes nobody's answers, and two rooms alike stay two."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from hybridmap.node import MapId
+from hybridmap.ruling import Ruling, Rulings
+from mapserver.answers import Answers
+from mapserver.chronicle import Chronicle
+from mapserver.merging.merger import Merger
+from synthetic.wrong_geometry import (
+    ODD,
+    SCENES,
+    Fault,
+    Fleet,
+    Told,
+    draw_fleet,
+    judged,
+    lost_views,
+    merged_fleet,
+)
+
+SEED, QUESTIONS = 21, 16
+
+
+def told(merger: Merger, fleet: Fleet, scene: str) -> Counter[Told]:
+    """Answers to robots that are lost in the house."""
+    answers = Answers.of(merger, merger.merged(), merger.node)
+    views = lost_views(fleet, SCENES[scene], QUESTIONS, SEED)
+    return Counter(judged(answers, view, at, fleet.truth) for view, at in views)
+
+
+def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
+    fleet = draw_fleet(SEED, SCENES["room"], Fault.SLIP, stops=2)
+    alone = told(merged_fleet(fleet, frozenset({ODD})), fleet, "room")
+    merger, chronicle = merged_fleet(fleet), Chronicle()
+    merged = merger.merged()
+    chronicle.follow(merged)
+    assert chronicle.newest.startswith(f"map {ODD} contradicts r0.1, r1.1 and r2.1")
+    sound = [{node.map for node in part} for part in merged.components if ODD not in {n.map for n in part}]
+    assert sound == [{MapId(f"r{k}", 1) for k in range(3)}]
+    with_it = told(merger, fleet, "room")
+    assert alone[Told.RIGHT] >= 0.7 * QUESTIONS
+    assert with_it[Told.RIGHT] >= 0.9 * alone[Told.RIGHT] and not with_it[Told.WRONG]
+    # Told once, and the map counts again when a person has retired those that it contradicts.
+    before = chronicle.happenings
+    chronicle.follow(merged)
+    assert chronicle.happenings == before
+    gone = [Ruling((one, one), True, "anna", 1, "moved") for one in (MapId("r0", 1), MapId("r1", 1))]
+    merger.rule(Rulings(gone))
+    assert not merger.merged().wrong
+    merger.rule(Rulings())
+    assert merger.merged().wrong.keys() == {ODD}
+
+
+def test_a_sound_map_of_a_room_that_looks_alike_is_not_wrong() -> None:
+    """The fourth robot knows the twin of a room that the others know, and it is sound."""
+    fleet = draw_fleet(SEED, SCENES["twins"], Fault.NONE, stops=2)
+    merger = merged_fleet(fleet)
+    assert not merger.merged().wrong
+    assert not told(merger, fleet, "twins")[Told.WRONG]

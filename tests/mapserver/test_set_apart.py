@@ -1,0 +1,395 @@
+"""Nobody's map ends the fleet: what a robot may legally send, and what it may not, also over restarts."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import faiss
+import msgpack
+import numpy as np
+import pytest
+
+import merge.belief.memory
+from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from hybridmap.hybrid_map import HybridMap
+from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from hybridmap.query import Certainty, RelocalizeAnswer, View
+from hybridmap.ruling import Ruling
+from mapserver.answers import Answers
+from mapserver.log.entry import Entry
+from mapserver.log.store import Store
+from mapserver.merging.findings import Findings
+from mapserver.merging.merger import Merger
+from mapserver.server import MapServer
+from mapserver.upkeep import Upkeep
+from merge.graph.merged import MergedMap
+from synthetic.world import World, room, take_map, take_view
+from tests.mapserver.contents import content
+from tests.waiting import eventually
+from wire.bus import Reply, Request
+from wire.codec import decode_change, encode_body, encode_change, wrap_body
+from wire.explanation_messages import encode_ruling
+from wire.keys import Keys
+from wire.log_messages import Ack, Head, LogAnswer, LogRequest, decode_record
+from wire.memory import MemoryBus, MemoryHub
+from wire.messages import decode_relocalize_answer, encode_view
+
+KEYS = Keys("fleet")
+SOUND = MapId("r0", 1), MapId("r1", 1)
+BAD = MapId("bad", 1)
+WORLD: World = room(0, 0, 5, 4, 600, np.random.default_rng(1))
+TOUR = [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)]
+
+
+@cache
+def views() -> list[View]:
+    """Of lost robots."""
+    beside = Pose2(0.1, 0.05, 0.05)
+    return [take_view(WORLD, TOUR[k] @ beside, np.random.default_rng(k))[0] for k in range(2)]
+
+
+def sound_logs() -> dict[MapId, list[bytes]]:
+    """Two robots that have mapped one room, as messages."""
+    rng, out = np.random.default_rng(2), {}
+    for map_id in SOUND:
+        nodes, edges = take_map(WORLD, map_id, TOUR, rng)
+        out[map_id] = messages(map_id, [*map(NodePut, nodes), *map(EdgePut, edges)])
+    return out
+
+
+def messages(map_id: MapId, bodies: list[ChangeBody]) -> list[bytes]:
+    return [encode_change(Change(map_id, k + 1, 0, body)) for k, body in enumerate(bodies)]
+
+
+def stored(path: Path, logs: dict[MapId, list[bytes]]) -> Store:
+    """A store that has taken them in, as far as it does."""
+    store = Store(path)
+    for map_id, log in logs.items():
+        entries = [Entry.read(map_id, k + 1, message) for k, message in enumerate(log)]
+        store.apply(map_id, 7, entries, len(entries))
+    return store
+
+
+def node(number: int, landmarks: int = 100) -> Node:
+    """Of a place that nobody else has seen, with at most so many landmarks."""
+    rng = np.random.default_rng(3)
+    (some,), _ = take_map(room(0, 0, 5, 4, 600, rng), BAD, TOUR[:1], rng)
+    return replace(some, id=NodeId(*BAD, number), landmarks=some.landmarks.take(np.arange(landmarks)))
+
+
+def edge(**new: object) -> bytes:
+    """An edge between the first two nodes as a message, with fields that no encoder writes."""
+    good = Edge(
+        NodeId(*BAD, 9), NodeId(*BAD, 1), NodeId(*BAD, 2),
+        PoseGaussian.from_sigmas(Pose2(1.0), 0.1, 0.1), EdgeKind.MAPPED,
+    )  # fmt: skip
+    body: bytes = msgpack.packb({**msgpack.unpackb(encode_body(EdgePut(good))), **new})
+    return wrap_body(3, 0, body)
+
+
+def attacks() -> dict[str, list[bytes]]:
+    """Less than a kilobyte each, and taken by servers until they had bounds."""
+    bare = [NodePut(node(k, 0)) for k in (1, 2)]
+    one = np.array([1e5, 0.0, 1.0])
+    rank_one = np.outer(one, one).astype("<f4")[np.triu_indices(3)].tobytes()
+    posture = np.array([1.0, 0.0, 0.0], "<f4").tobytes() + rank_one
+    seen = [NodePut(node(k)) for k in (1, 2)]
+    shared = EdgePut(
+        Edge(
+            NodeId(*BAD, 9), NodeId(*BAD, 1), NodeId(*BAD, 2),
+            PoseGaussian.from_sigmas(Pose2(0.3), 0.1, 0.1), EdgeKind.LOOP, np.repeat([[60, 60]], 9, axis=0),
+        )
+    )  # fmt: skip
+    fewer = NodePut(node(2, 5))
+    return {
+        "a covariance of rank one": [*messages(BAD, [*bare]), edge(p=posture)],
+        "evidence beyond all numbers": [*messages(BAD, [*seen]), edge(w=4, x={"inliers": 9e29})],
+        "fewer landmarks than are shared": messages(BAD, [*seen, shared, fewer]),
+    }
+
+
+class Fleet:
+    """A server, and somebody at the bus who plays all robots and people."""
+
+    def __init__(self, path: Path) -> None:
+        hub = MemoryHub()
+        self.server_bus, self.bus = MemoryBus(hub), MemoryBus(hub)
+        self.acks: list[Ack] = []
+        self.server = MapServer(self.server_bus, KEYS, path, "s0").__enter__()
+        self.bus.subscribe(KEYS.acks(BAD.agent), lambda sample: self.acks.append(Ack.decode(sample.payload)))
+
+    def ask(self, key: str, payload: bytes) -> Reply:
+        (reply,) = self.bus.ask(key, payload, 20.0)
+        return reply
+
+    def status(self) -> dict[str, object]:
+        return dict(decode_record(self.ask(KEYS.server_status("s0"), b"").payload))
+
+    def where(self) -> list[RelocalizeAnswer]:
+        """What lost robots are told."""
+        replies = [self.ask(KEYS.relocalize("s0"), encode_view(view)) for view in views()]
+        return [decode_relocalize_answer(reply.payload) for reply in replies]
+
+    def tell(self, map_id: MapId, log: list[bytes]) -> None:
+        """Have the server pull a log, and wait until it has."""
+
+        def answer(request: Request) -> None:
+            asked = LogRequest.decode(request.payload)
+            rows = [(k + 1, row) for k, row in enumerate(log) if asked.first <= k + 1 <= asked.last]
+            request.reply(LogAnswer(7, asked.first, min(asked.last, len(log)), tuple(rows)).encode())
+
+        served = self.bus.serve(KEYS.log(map_id), answer)
+        self.bus.publish(KEYS.head(map_id), Head(7, len(log)).encode())
+        eventually(lambda: any(ack.watermark == len(log) for ack in self.acks))
+        served.close()
+
+    def close(self) -> None:
+        self.server.__exit__(None, None, None)
+        self.bus.close()
+        self.server_bus.close()
+
+
+@contextmanager
+def serving(path: Path) -> Iterator[Fleet]:
+    fleet = Fleet(path)
+    try:
+        assert fleet.server.settle(30)
+        yield fleet
+    finally:
+        fleet.close()
+
+
+def told(answers: list[RelocalizeAnswer]) -> list[tuple[object, ...]]:
+    return [
+        (answer.certainty, answer.reason, [(c.node, round(c.probability, 9)) for c in answer.candidates])
+        for answer in answers
+    ]
+
+
+@pytest.mark.parametrize("name", list(attacks()))
+def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "s0.sqlite"
+    stored(path, sound_logs()).close()
+    with serving(path) as fleet:
+        before, places = fleet.status(), told(fleet.where())
+        assert before["links"] and places[0][0] is Certainty.FOUND
+        fleet.tell(BAD, attacks()[name])
+        eventually(lambda: fleet.status()["nodes"] == int(str(before["nodes"])) + 2)
+        assert fleet.server.settle(30)
+        during = fleet.status()
+        assert during["links"] == before["links"] and not during["set_apart"]
+        assert told(fleet.where()) == places
+        refused = [refusal.reason for ack in fleet.acks for refusal in ack.refusals]
+        assert bool(refused) is (name != "fewer landmarks than are shared")
+    with serving(path) as fleet:
+        after = fleet.status()
+        assert {k: after[k] for k in ("summary", "event", "set_apart")} == {
+            k: during[k] for k in ("summary", "event", "set_apart")
+        }
+        assert told(fleet.where()) == places
+
+
+def fails_with(monkeypatch: pytest.MonkeyPatch, bad: MapId) -> None:
+    """Let the merge fail with a map, by a defect that nobody knows yet."""
+    real = merge.belief.memory.fragments_of
+
+    def fails(maps: dict[MapId, HybridMap], *more: Any) -> Any:
+        if bad in maps:
+            raise ZeroDivisionError("a defect")
+        return real(maps, *more)
+
+    monkeypatch.setattr(merge.belief.memory, "fragments_of", fails)
+
+
+def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "s0.sqlite"
+    stored(path, sound_logs()).close()
+    fails_with(monkeypatch, BAD)
+    words = "map bad.1 is set apart: the merge fails with it (ZeroDivisionError: a defect)"
+    with serving(path) as fleet:
+        places, links = told(fleet.where()), fleet.status()["links"]
+        fleet.tell(BAD, messages(BAD, [NodePut(node(1)), NodePut(node(2))]))
+        eventually(lambda: fleet.status()["set_apart"])
+        assert fleet.server.settle(30)
+        status = fleet.status()
+        assert (status["set_apart"], status["links"], status["event"]) == (1, links, words)
+        assert told(fleet.where()) == places
+        assert [one.words for one in fleet.server.history()].count(words) == 1
+    caplog.clear()
+    with serving(path) as fleet:
+        status = fleet.status()
+        assert (status["set_apart"], status["links"], status["event"]) == (1, links, words)
+        assert told(fleet.where()) == places
+        # It was said before.
+        assert [one.words for one in fleet.server.history()].count(words) == 1
+        retire = Ruling((BAD, BAD), True, "anna", 10**18, "it is mad")
+        reply = fleet.ask(KEYS.rule("s0"), encode_ruling(retire))
+        assert not reply.error
+        assert fleet.server.settle(30)
+        status = fleet.status()
+        assert (status["set_apart"], status["links"], status["rulings"]) == (0, links, 1)
+        assert status["event"] == "map bad.1 is no longer set apart"
+        assert told(fleet.where()) == places
+        never = fleet.ask(KEYS.rule("s0"), encode_ruling(Ruling((MapId("x", 9),) * 2, True, "anna", 1)))
+        assert "there is no map x.9" in never.error
+
+
+def test_a_map_can_be_retired_when_nothing_can_be_merged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "s0.sqlite"
+    stored(path, {BAD: messages(BAD, [NodePut(node(1))])}).close()
+
+    def fails(*_: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Merger, "merged", fails)
+        patch.setattr(Merger, "apart", fails)
+        with serving(path) as fleet:
+            assert not fleet.status()["nodes"]
+            reply = fleet.ask(KEYS.rule("s0"), encode_ruling(Ruling((BAD, BAD), True, "anna", 10**18)))
+            assert not reply.error, reply.error
+    with serving(path) as fleet:
+        assert fleet.status()["rulings"] == 1
+
+
+class Beside:
+    """Two sound robots, merged anew with the content of a third one, which a store has taken in."""
+
+    def __init__(self, folder: Path) -> None:
+        self.store = stored(folder / "s0.sqlite", sound_logs())
+        self.sound = [(one, change.body) for one in SOUND for change in self.store.replay(one)]
+        self.findings = Findings()
+        alone, self.merger = self.merged([])
+        self.findings = self.merger.findings()
+        self.nodes = sorted(alone.postures)
+        self.poses = {one: alone.pose(one) for one in self.nodes}
+        self.links = [link.pair for link in alone.links]
+        self.places = [told([self.answers.relocalizer.answer(view)]) for view in views()]
+
+    def merged(self, more: list[tuple[MapId, ChangeBody]]) -> tuple[MergedMap, Merger]:
+        merger = Merger()
+        merger.recollect(self.findings)
+        merger.read([*self.sound, *more])
+
+        def use(merged: MergedMap) -> None:
+            self.answers = Answers.of(merger, merged, merger.node)
+
+        return merger.merged(use), merger
+
+    def check(self, seed: int) -> None:
+        """One content: it raises nothing, is not set apart, and the sound robots are as without it."""
+        rng = np.random.default_rng([16, seed])
+        # Maps are sorted by name.
+        map_id = MapId(str(rng.choice(["a", "r00", "x"])), seed)
+        entries = [
+            Entry.read(map_id, k + 1, message)
+            for k, message in enumerate(messages(map_id, content(rng, map_id, self.nodes)))
+        ]
+        self.store.apply(map_id, 7, entries)
+        merged, _ = self.merged([(map_id, change.body) for change in self.store.replay(map_id)])
+        assert not merged.set_apart, (seed, merged.set_apart)
+        between = [p for p in (link.pair for link in merged.links) if map_id not in (p[0].map, p[1].map)]
+        assert between == self.links, seed
+        for one, pose in self.poses.items():
+            assert np.abs(merged.pose(one).vector - pose.vector).max() < 1e-6, (seed, one)
+        # Which takes as long as the merge.
+        if seed % 4 < len(self.places):
+            view = views()[seed % 4]
+            assert told([self.answers.relocalizer.answer(view)]) == self.places[seed % 4], seed
+
+
+@pytest.fixture
+def beside(tmp_path: Path) -> Iterator[Beside]:
+    """With a search for like landmarks by one thread: so little is done sooner by one than shared out."""
+    threads = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    beside = Beside(tmp_path)
+    yield beside
+    beside.store.close()
+    faiss.omp_set_num_threads(threads)
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_300_random_legal_contents_change_nothing_for_sound_robots(part: int, beside: Beside) -> None:
+    for seed in range(75 * part, 75 * (part + 1)):
+        beside.check(seed)
+
+
+def test_contents_that_show_what_others_show_end_nothing(beside: Beside) -> None:
+    """They are linked with sound maps, and may move these; nothing fails by them, and nobody is unheard."""
+    seen = [body.node for _, body in beside.sound if isinstance(body, NodePut)]
+    linked = 0
+    for seed in range(30):
+        rng, map_id = np.random.default_rng([17, seed]), MapId("x", seed)
+        log: list[tuple[MapId, ChangeBody]] = []
+        for body in content(rng, map_id, beside.nodes):
+            if isinstance(body, NodePut) and rng.random() < 0.8:
+                like = seen[rng.integers(len(seen))]
+                some = like.landmarks.take(np.arange(rng.integers(30, len(like.landmarks))))
+                body = NodePut(replace(body.node, landmarks=some, camera=like.camera))
+            log.append((map_id, body))
+        merged, _ = beside.merged(log)
+        linked += any(map_id in (link.a.map, link.b.map) for link in merged.links)
+        assert not merged.set_apart, (seed, merged.set_apart)
+        assert set(beside.nodes) <= set(merged.postures)
+        for view in views():
+            beside.answers.relocalizer.answer(view)
+    assert linked > 5
+
+
+@pytest.mark.slow
+def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Beside) -> None:
+    for seed in range(300, 3300):
+        beside.check(seed)
+
+
+def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
+    """It puts one of its nodes 200 times a second."""
+    upkeep = Upkeep(1.0)
+    upkeep.start()
+    stop = threading.Event()
+    logs = {one: [decode_change(message) for message in log] for one, log in sound_logs().items()}
+
+    def hurry() -> None:
+        puts = [change for change in logs[SOUND[0]] if isinstance(change.body, NodePut)]
+        while not stop.wait(0.005):
+            upkeep.take(puts[0])
+
+    for change in logs[SOUND[0]]:
+        upkeep.take(change)
+    hurrying = threading.Thread(target=hurry)
+    hurrying.start()
+    try:
+        time.sleep(0.5)
+        for change in logs[SOUND[1]]:
+            upkeep.take(change)
+        eventually(lambda: len(upkeep.answers.merged.links) > 1, 20.0)
+        assert len(upkeep.answers.merged.maps) == 2
+    finally:
+        stop.set()
+        hurrying.join()
+        upkeep.close()
+
+
+def test_of_the_puts_of_one_node_that_wait_the_last_counts() -> None:
+    upkeep = Upkeep(1.0)
+    nodes = [replace(node(1), stamp_ns=k) for k in range(50)]
+    for k, one in enumerate(nodes):
+        upkeep.take(Change(BAD, k + 1, 0, NodePut(one)))
+    upkeep.start()
+    assert upkeep.settle(30) and upkeep.settled
+    assert upkeep.answers.merged.maps[BAD].nodes[NodeId(*BAD, 1)] is nodes[-1]
+    assert upkeep._merger.counters.changes == 1
+    upkeep.close()

@@ -1,0 +1,98 @@
+"""Structure from motion, against a walk whose truth is known, by a camera that is not level."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hybridmap.camera import Camera
+from hybridmap.descriptor import quantise
+from hybridmap.errors import InvalidValue
+from hybridmap.query import View
+from mapweave.structure_from_motion import CAMERA_FROM_LEVEL, Structure, reconstruct
+from synthetic.world import random_vectors
+
+CAMERA = Camera(640, 480, 520.0, 522.0, 318.0, 243.0, mount_height=1.3)
+
+
+class Walk:
+    """Photographs of random points on the walls of a room, taken along its middle."""
+
+    def __init__(self, seed: int, count: int = 7, spacing: float = 0.6, wrong: float = 0.1) -> None:
+        rng = np.random.default_rng(seed)
+        along, aside = rng.uniform(0.5, 9.0, 500), rng.choice([-1.6, 1.7], 500)
+        wall = np.column_stack([along, aside, rng.uniform(0.1, 2.6, 500)])
+        end = np.column_stack([np.full(150, 9.0), rng.uniform(-1.6, 1.7, 150), rng.uniform(0.1, 2.6, 150)])
+        self.points = np.concatenate([wall, end])
+        vectors = random_vectors(len(self.points), rng)
+        self.rotations, self.centres, self.views = [], [], []
+        for k in range(count):
+            yaw, pitch, roll = rng.normal(0.0, [0.1, 0.02, 0.02])
+            turn = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix() @ CAMERA_FROM_LEVEL.T
+            centre = np.array([k * spacing, rng.normal(0.0, 0.05), 1.3 + rng.normal(0.0, 0.02)])
+            local = (self.points - centre) @ turn
+            with np.errstate(divide="ignore", invalid="ignore"):
+                pixels = local[:, :2] / local[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+            pixels = pixels + rng.normal(0.0, 0.4, pixels.shape)
+            seen = np.flatnonzero((local[:, 2] > 0.5) & CAMERA.contains(pixels))
+            seen = rng.permutation(seen)[:150]
+            looks = vectors[seen] + rng.normal(0.0, 0.03, (len(seen), vectors.shape[1]))
+            # Some look like what is elsewhere.
+            swapped = rng.permutation(len(seen))[: int(wrong * len(seen))]
+            looks[swapped] = looks[rng.permutation(swapped)]
+            self.views.append(View(pixels[seen].astype(np.float32), quantise(looks), CAMERA))
+            self.rotations.append(turn)
+            self.centres.append(centre)
+
+    def off(self, found: Structure) -> tuple[np.ndarray, np.ndarray, float]:
+        """Position errors (K,) m and orientation errors (K,) rad after the best similarity; the scale."""
+        true, got = np.array(self.centres), found.centres
+        a, b = true - true.mean(axis=0), got - got.mean(axis=0)
+        turn, _ = Rotation.align_vectors(a, b)
+        scale = float((a * turn.apply(b)).sum() / (b**2).sum())
+        errors = np.linalg.norm(a - scale * turn.apply(b), axis=1)
+        relative = [
+            (Rotation.from_matrix(found.rotations[0].T @ one) * Rotation.from_matrix(known).inv()).magnitude()
+            for one, known in zip(
+                found.rotations, [self.rotations[0].T @ r for r in self.rotations], strict=True
+            )
+        ]
+        return errors, np.array(relative), scale
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_walk_is_found_again_up_to_its_scale(seed: int) -> None:
+    walk = Walk(seed)
+    errors, turns, scale = walk.off(reconstruct(walk.views, 0.6))
+    assert errors.max() < 0.05
+    assert turns.max() < math.radians(0.6)
+    assert scale == pytest.approx(1.0, abs=0.15)
+    # The scale is what the photographer says, and nothing else changes with it.
+    errors, turns, again = walk.off(reconstruct(walk.views, 0.9))
+    assert errors.max() < 0.05
+    assert again == pytest.approx(scale / 1.5, rel=0.05)
+
+
+def test_points_lie_where_their_features_are_seen() -> None:
+    walk = Walk(3)
+    found = reconstruct(walk.views, 0.6)
+    assert len(found.points) > 150
+    for k, view in enumerate(walk.views):
+        seen = np.flatnonzero(found.features[k] >= 0)
+        local = (found.points[seen] - found.centres[k]) @ found.rotations[k]
+        pixels = local[:, :2] / local[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+        misses = np.linalg.norm(pixels - view.pixels[found.features[k, seen]], axis=1)
+        assert np.median(misses) < 1.0
+        assert (found.features[k, seen] < len(view)).all()
+    assert ((found.features >= 0).sum(axis=0) >= 1).all()
+
+
+def test_what_is_no_walk_is_refused() -> None:
+    walk, other = Walk(1), Walk(2)
+    with pytest.raises(InvalidValue, match="two photographs"):
+        reconstruct(walk.views[:1], 0.6)
+    with pytest.raises(InvalidValue, match="photographs 3 and 4 do not show the same"):
+        reconstruct([*walk.views[:3], *other.views[3:]], 0.6)

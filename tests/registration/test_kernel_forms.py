@@ -1,0 +1,56 @@
+"""The compiled kernels of recognition beside the same in NumPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap.jit import KERNELS
+from registration.gauss_newton import stack_sightings
+from registration.projection import improve, linearise, normal_equations
+from tests.hybridmap.kernel_forms import in_numpy
+from tests.registration.test_projection import scene
+
+pytest.importorskip("numba")
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 40))
+def test_both_forms_are_the_same_to_rounding(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    (forward, true), (backward, _) = scene(n, rng, False), scene(max(n // 2, 1), rng, True)
+    stack = stack_sightings([forward, backward])
+    near = true.vector + rng.normal(0, 0.02, 3)
+    poses = true.vector + rng.normal(0, 0.2, (20, 3))
+    prior = near, 4.0 * np.eye(3)
+
+    def everything() -> list[np.ndarray]:
+        linear = linearise(stack, near, stack.points)
+        improved = improve(stack, near, *prior, 3)
+        assert improved[0]
+        ratios = [forward.log_ratios(poses), backward.log_ratios(poses)]
+        return [*ratios, *linear, normal_equations(linear), *improved]
+
+    compiled = everything()
+    with in_numpy():
+        plain = everything()
+    for one, other in zip(compiled, plain, strict=True):
+        scale = max(1.0, float(np.abs(one).max()))
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7 * scale)
+
+
+def test_nothing_is_compiled_while_a_robot_drives() -> None:
+    """Every array comes in the type that the kernels are compiled for beforehand."""
+    rng = np.random.default_rng(1)
+    (forward, true), (backward, _) = scene(20, rng, False), scene(10, rng, True)
+    part = forward.take(slice(None, None, 2))
+    for sightings in (forward, backward, part):
+        sightings.log_ratios(true.vector[None])
+        sightings.log_ratios(np.stack([true.vector, true.vector])[::2])
+    improve(stack_sightings([part, backward]), true.vector, np.zeros(3), np.zeros((3, 3)), 2)
+    counts = {
+        kernel.__name__: len(kernel.machine.signatures)
+        for kernel in KERNELS
+        if kernel.__name__ in ("log_ratios", "linearise", "normal_equations", "determined", "improve")
+    }
+    assert counts == dict.fromkeys(counts, 1) and len(counts) == 5

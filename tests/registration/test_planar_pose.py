@@ -1,0 +1,236 @@
+"""Postures from sightings: Jacobians, likelihood, optimum and covariance against independent computations."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap.camera import Camera
+from hybridmap.pose import Pose2, PoseGaussian
+from registration.minimal_poses import hypotheses
+from registration.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
+from registration.sightings import Sightings
+from tests.hybridmap.kernel_forms import form
+
+__all__ = ["form"]
+
+pytestmark = pytest.mark.usefixtures("form")
+
+CAMERA = Camera(320, 240, 277.0, 270.0, 159.5, 121.0, mount_height=0.25, mount_forward=0.12)
+HONEST = PlanarPoseSettings(pixel_sigma=0.7, scale_sigma=0.0)
+
+
+def seen_points(pose: Pose2, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) points in node and (n, 2) exact pixels, all in the image."""
+    pixels = rng.uniform([4, 4], [316, 236], (n, 2))
+    points = pose.apply(CAMERA.back_project(pixels, rng.uniform(1.0, 5.0, n)))
+    return points, pixels
+
+
+def random_pose(rng: np.random.Generator) -> Pose2:
+    return Pose2(*rng.uniform([-2, -2, -math.pi], [2, 2, math.pi]))
+
+
+def error(found: Pose2, true: Pose2) -> float:
+    return float(np.abs((true.inverse() @ found).vector).max())
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6))
+def test_exact_points_give_the_exact_posture(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = random_pose(rng)
+    points, pixels = seen_points(true, 12, rng)
+    fix = solve_planar_pose(points, pixels, CAMERA, rng=rng)
+    assert fix is not None and fix.inliers.all()
+    assert error(fix.node_from_robot.mean, true) < 1e-6
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_minimal_solutions_are_exact(inverted: bool) -> None:
+    rng = np.random.default_rng(3)
+    true = random_pose(rng)
+    points, pixels = seen_points(true.inverse() if inverted else true, 30, rng)
+    sightings = Sightings.build(points, pixels, CAMERA, inverted=inverted)
+    poses = hypotheses(sightings, 50, rng)
+    errors = np.array([error(Pose2.from_vector(pose), true) for pose in poses])
+    assert (errors[:50] < 1e-6).mean() > 0.8  # three bearings; a draw may repeat a point
+    assert (errors[50:] < 1e-6).mean() > 0.8  # two depths
+
+
+def noisy_problem(
+    rng: np.random.Generator, n: int = 40, depth_share: float = 0.04
+) -> tuple[Pose2, np.ndarray, np.ndarray, np.ndarray]:
+    """A posture near a node; points as a node has them (uncertain along their ray), noisy pixels."""
+    true = Pose2(*rng.normal([0, 0, 0], [0.5, 0.4, 0.2]))
+    pixels = rng.uniform([4, 4], [316, 236], (n, 2))
+    points = true.apply(CAMERA.back_project(pixels, rng.uniform(1.0, 5.0, n)))
+    depths = points[:, 0] - CAMERA.mount_forward
+    keep = depths > 0.3
+    points, pixels, depths = points[keep], pixels[keep], depths[keep]
+    rays = np.column_stack([np.ones(len(depths)), points[:, 1] / depths, (points[:, 2] - 0.25) / depths])
+    sigmas = depth_share * depths
+    covariances = np.einsum("ni,nj,n->nij", rays, rays, sigmas**2)
+    lateral = 0.7 * depths / 277.0
+    covariances[:, 1, 1] += lateral**2
+    covariances[:, 2, 2] += lateral**2
+    known = points + rays * (sigmas * rng.normal(0, 1, len(depths)))[:, None]
+    known[:, 1:] += rng.normal(0, 1, (len(depths), 2)) * lateral[:, None]
+    return true, known, covariances, pixels + rng.normal(0, 0.7, pixels.shape)
+
+
+def test_covariance_is_calibrated() -> None:
+    rng = np.random.default_rng(6)
+    distances = []
+    for _ in range(250):
+        true, points, covariances, pixels = noisy_problem(rng)
+        fix = solve_planar_pose(
+            points, pixels, CAMERA, rng=rng, point_covariances=covariances, settings=HONEST
+        )
+        assert fix is not None
+        distances.append(fix.node_from_robot.mahalanobis2(true))
+    # 3 degrees of freedom; the mean of 250 has a standard deviation of 0.155.
+    assert 2.3 < np.mean(distances) < 3.6
+    assert 0.90 < np.mean(np.array(distances) < 7.81) <= 1.0
+
+
+def test_common_scale_error_is_covered() -> None:
+    """All depths 2 % too long together, as after a drive with a wrong wheel radius."""
+    rng = np.random.default_rng(7)
+    covered = {}
+    for scale_sigma in (0.0, 0.02):
+        distances = []
+        for _ in range(120):
+            true, points, covariances, pixels = noisy_problem(rng, n=120, depth_share=0.01)
+            origin = np.array([CAMERA.mount_forward, 0.0, CAMERA.mount_height])
+            points = origin + (points - origin) * rng.normal(1.0, 0.02)
+            fix = solve_planar_pose(
+                points,
+                pixels,
+                CAMERA,
+                rng=rng,
+                point_covariances=covariances,
+                settings=PlanarPoseSettings(pixel_sigma=0.7, scale_sigma=scale_sigma),
+            )
+            assert fix is not None
+            distances.append(fix.node_from_robot.mahalanobis2(true))
+        covered[scale_sigma] = np.mean(distances)
+    assert covered[0.02] < 4.0 < covered[0.0]
+
+
+def test_optimum_against_scipy_with_points_as_variables() -> None:
+    """The eliminated points must give the same posture as a full least squares over posture and points."""
+    rng = np.random.default_rng(8)
+    true, points, covariances, pixels = noisy_problem(rng, n=18, depth_share=0.08)
+    fix = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances, settings=HONEST)
+    assert fix is not None and fix.inliers.all()
+    roots = np.linalg.inv(np.linalg.cholesky(covariances))
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        moved = x[3:].reshape(-1, 3)
+        projected = CAMERA.project(Pose2.from_vector(x[:3]).inverse().apply(moved))
+        prior = np.einsum("nij,nj->ni", roots, moved - points)
+        return np.concatenate([((pixels - projected) / 0.7).ravel(), prior.ravel()])
+
+    start = np.concatenate([true.vector, points.ravel()])
+    optimum = scipy.optimize.least_squares(residuals, start, x_scale="jac")
+    # The estimator also weighs each sighting by its probability, hence not to the last digit.
+    assert error(fix.node_from_robot.mean, Pose2.from_vector(optimum.x[:3])) < 2e-3
+    full = np.linalg.inv(optimum.jac.T @ optimum.jac)[:3, :3]
+    rotation = np.eye(3)
+    rotation[:2, :2] = Pose2.from_vector(optimum.x[:3]).rotation
+    sigmas = np.sqrt(np.diag(rotation.T @ full @ rotation)) * max(1.0, fix.mean_square) ** 0.5
+    assert np.allclose(np.sqrt(np.diag(fix.node_from_robot.covariance)), sigmas, rtol=0.05)
+
+
+@pytest.mark.parametrize("wrong_share", [0.3, 0.6])
+def test_wrong_matches_are_found_out(wrong_share: float) -> None:
+    rng = np.random.default_rng(9)
+    good = 0
+    for _ in range(40):
+        true, points, covariances, pixels = noisy_problem(rng, n=60)
+        wrong = rng.random(len(points)) < wrong_share
+        pixels[wrong] = rng.uniform(0, [320, 240], (wrong.sum(), 2))
+        fix = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances)
+        assert fix is not None
+        good += fix.node_from_robot.mahalanobis2(true) < 16.3
+        assert (fix.inliers & wrong).sum() <= 0.12 * wrong.sum() + 2
+    assert good >= 39
+
+
+def test_pure_chance_gives_few_inliers() -> None:
+    rng = np.random.default_rng(10)
+    for _ in range(30):
+        points, _ = seen_points(Pose2(), 40, rng)
+        fix = solve_planar_pose(points, rng.uniform(0, [320, 240], (40, 2)), CAMERA, rng=rng)
+        assert fix is None or fix.inliers.sum() < 10
+
+
+def test_a_prior_counts_as_a_measurement() -> None:
+    rng = np.random.default_rng(11)
+    true, points, covariances, pixels = noisy_problem(rng, n=10)
+    free = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances)
+    assert free is not None
+    sure = PoseGaussian.from_sigmas(true, 1e-4, 1e-4)
+    held = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances, prior=sure)
+    vague = PoseGaussian.from_sigmas(true @ Pose2(0.3, 0.3, 0.2), 1.0, 1.0)
+    same = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances, prior=vague)
+    assert held is not None and same is not None
+    assert error(held.node_from_robot.mean, true) < 1e-3
+    assert error(same.node_from_robot.mean, free.node_from_robot.mean) < 0.3 * np.sqrt(
+        free.node_from_robot.covariance.trace()
+    )
+
+
+def test_measured_depths_make_a_posture_more_certain() -> None:
+    rng = np.random.default_rng(12)
+    true, points, covariances, pixels = noisy_problem(rng, n=15, depth_share=0.1)
+    in_robot = true.inverse().apply(points)
+    depths = in_robot[:, 0] - CAMERA.mount_forward
+    without = Sightings.build(points, pixels, CAMERA, covariances=covariances)
+    with_depth = Sightings.build(
+        points,
+        pixels,
+        CAMERA,
+        covariances=covariances,
+        depths=depths,
+        depth_sigmas=np.full(len(points), 0.05),
+    )
+    fixes = [solve_sightings([one], rng=rng, settings=PlanarPoseSettings()) for one in (without, with_depth)]
+    assert fixes[0] is not None and fixes[1] is not None
+    assert fixes[1].node_from_robot.covariance.trace() < fixes[0].node_from_robot.covariance.trace()
+
+
+@pytest.mark.parametrize("n", [0, 1, 3, 4, 10])
+@pytest.mark.parametrize("kind", ["nan", "same point", "behind", "zero", "huge"])
+def test_degenerate_input_gives_none_or_a_posture_but_never_raises(n: int, kind: str) -> None:
+    rng = np.random.default_rng(13)
+    points, pixels = seen_points(Pose2(), n, rng)
+    if kind == "nan":
+        points[:] = np.nan
+    elif kind == "same point":
+        points[:], pixels[:] = [2.0, 0.1, 0.6], [150.0, 80.0]
+    elif kind == "behind":
+        points[:, 0] *= -1
+    elif kind == "zero":
+        points[:] = 0.0
+    else:
+        points *= 1e8
+    fix = solve_planar_pose(points, pixels, CAMERA, rng=rng)
+    if fix is not None:
+        assert np.isfinite(fix.node_from_robot.covariance).all()
+    if n < 4 or kind in ("nan", "same point"):
+        assert fix is None
+
+
+def test_same_seed_same_posture() -> None:
+    _, points, covariances, pixels = noisy_problem(np.random.default_rng(14), n=60)
+    fixes = [
+        solve_planar_pose(points, pixels, CAMERA, rng=np.random.default_rng(1), point_covariances=covariances)
+        for _ in range(2)
+    ]
+    assert fixes[0] is not None and fixes[1] is not None
+    assert np.array_equal(fixes[0].node_from_robot.mean.vector, fixes[1].node_from_robot.mean.vector)

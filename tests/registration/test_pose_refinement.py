@@ -1,0 +1,79 @@
+"""Looking closer, against the truth of a synthetic world; averages against an optimum found by search."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from hybridmap.node import NodeId
+from hybridmap.pose import Pose2, PoseGaussian, averaged
+from registration.planar_pose import PlanarPoseSettings
+from registration.pose_refinement import look_closer
+from registration.recognition import recognise
+from synthetic.world import (
+    Sensing,
+    room,
+    take_node,
+    take_view,
+)
+
+HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+WORLD = room(0, 0, 5, 4, 700, np.random.default_rng(1))
+
+
+def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances of recognitions and of closer looks from the truth, m, and the latter's squared norm."""
+    rng = np.random.default_rng(7)
+    first, closer, squared = [], [], []
+    node_sensing = Sensing(pixel_sigma=min(pixel_sigma, 0.1))
+    for number in range(count):
+        a = Pose2(*rng.uniform([1.5, 1.2, -3.1], [3.5, 2.8, 3.1]))
+        b = a @ Pose2(*rng.uniform(-0.05, 0.05, 3))
+        node = take_node(WORLD, NodeId("r0", 1, number), a, HERE, rng, node_sensing)
+        view, _ = take_view(WORLD, b, rng, Sensing(pixel_sigma=pixel_sigma))
+        found = recognise(node, view, None, rng)
+        if found is None:
+            continue
+        best, true = look_closer(node, view, found, PlanarPoseSettings()), a.inverse() @ b
+        first.append(found.node_from_robot.mean.distance(true))
+        closer.append(best.mean.distance(true))
+        squared.append(best.mahalanobis2(true))
+    assert len(first) > 0.7 * count
+    return np.array(first), np.array(closer), np.array(squared)
+
+
+def test_sharp_pixels_tell_more_and_the_covariance_knows() -> None:
+    first, closer, squared = looks(0.12)
+    assert np.median(closer) < 0.9 * np.median(first)
+    assert np.median(closer) < 0.003
+    assert 0.5 < np.mean(squared) < 4.5, "3 is expected"
+
+
+def test_blunt_pixels_are_taken_for_what_they_are() -> None:
+    first, closer, squared = looks(1.0)
+    assert np.median(closer) < 1.15 * np.median(first)
+    assert np.mean(squared) < 4.5
+
+
+def test_an_average_is_where_the_likelihood_is_highest() -> None:
+    rng = np.random.default_rng(3)
+    middle = Pose2(0.4, -0.2, 3.1)
+    poses = []
+    for _ in range(4):
+        root = rng.normal(0, 0.01, (3, 3))
+        poses.append(PoseGaussian(middle @ Pose2(*rng.normal(0, 0.01, 3)), root @ root.T + 1e-6 * np.eye(3)))
+    whole = averaged(poses)
+    found = minimize(
+        lambda v: sum(pose.mahalanobis2(middle @ Pose2.from_vector(v)) for pose in poses),
+        np.zeros(3),
+        method="Nelder-Mead",
+        options={"xatol": 1e-9, "fatol": 1e-12, "maxiter": 5000},
+    )
+    best = middle @ Pose2.from_vector(found.x)
+    assert whole.mean.distance(best) < 2e-4
+    assert abs(math.remainder(whole.mean.heading - best.heading, math.tau)) < 2e-4
+    assert np.allclose(whole.covariance, np.mean([pose.covariance for pose in poses], axis=0))
+    assert averaged(poses[:1]).mean.vector == pytest.approx(poses[0].mean.vector)

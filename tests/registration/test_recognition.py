@@ -1,0 +1,176 @@
+"""Recognising places in a synthetic world with known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridmap.node import Landmarks, Node, NodeId
+from hybridmap.pose import Pose2, PoseGaussian
+from registration.recognition import (
+    Recognition,
+    RecognitionSettings,
+    Refusal,
+    examine_nodes,
+    examine_view,
+    recognise,
+    register,
+)
+from synthetic.world import (
+    Sensing,
+    World,
+    room,
+    take_node,
+    take_view,
+)
+from tests.hybridmap.kernel_forms import form
+
+__all__ = ["form"]
+
+pytestmark = pytest.mark.usefixtures("form")
+
+HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+
+
+def world(seed: int = 1) -> World:
+    return room(0, 0, 5, 4, 700, np.random.default_rng(seed))
+
+
+def node_at(where: Pose2, rng: np.random.Generator, number: int = 1, sensing: Sensing | None = None) -> Node:
+    return take_node(world(), NodeId("r0", 1, number), where, HERE, rng, sensing)
+
+
+def near(where: Pose2, rng: np.random.Generator) -> Pose2:
+    return where @ Pose2(*rng.uniform([-0.5, -0.4, -0.25], [0.5, 0.4, 0.25]))
+
+
+def somewhere(rng: np.random.Generator) -> Pose2:
+    return Pose2(*rng.uniform([1.5, 1.2, -3.1], [3.5, 2.8, 3.1]))
+
+
+def test_views_nearby_are_recognised_with_an_honest_posture() -> None:
+    rng = np.random.default_rng(2)
+    distances, found = [], 0
+    for _ in range(60):
+        a = somewhere(rng)
+        b = near(a, rng)
+        view, _ = take_view(world(), b, rng)
+        recognition = recognise(node_at(a, rng), view, None, rng)
+        if recognition is not None:
+            found += 1
+            distances.append(recognition.node_from_robot.mahalanobis2(a.inverse() @ b))
+    assert found >= 50
+    assert max(distances) < 20 and np.mean(distances) < 3.5
+
+
+def test_pairs_are_the_same_landmarks() -> None:
+    rng = np.random.default_rng(3)
+    where = Pose2(2.5, 2.0, 0.3)
+    seed = int(rng.integers(1000))
+    node = node_at(where, np.random.default_rng(seed))
+    _, behind_node = take_view(world(), where, np.random.default_rng(seed))
+    view, behind_view = take_view(world(), near(where, rng), rng)
+    recognition = recognise(node, view, None, rng)
+    assert recognition is not None
+    a, b = behind_node[recognition.pairs[:, 0]], behind_view[recognition.pairs[:, 1]]
+    assert (a == b).mean() > 0.97
+    assert recognition.inliers == len(recognition.pairs) == recognition.evidence["inliers"]
+
+
+def test_views_of_elsewhere_are_not_recognised() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(40):
+        a = somewhere(rng)
+        view, _ = take_view(world(99), near(a, rng), rng)
+        verdict = examine_view(node_at(a, rng), view, None, rng)
+        assert isinstance(verdict, Refusal) and verdict.reason
+
+
+def test_two_nodes_register_the_same_in_both_directions() -> None:
+    rng = np.random.default_rng(5)
+    distances, sure = [], []
+    for _ in range(30):
+        a, b = (where := somewhere(rng)), near(where, rng)
+        first, second = node_at(a, rng), node_at(b, rng, 2)
+        there, back = register(first, second, None, rng), register(second, first, None, rng)
+        if there is None or back is None:
+            continue
+        true = a.inverse() @ b
+        distances.append(there.node_from_robot.mahalanobis2(true))
+        # The same information is used either way, up to which side's depths stand for shared landmarks.
+        difference = back.node_from_robot.inverse()
+        assert there.node_from_robot.mahalanobis2(difference.mean) < 3.0
+        sure.append(there.evidence["inliers_3d"])
+    assert len(distances) > 20 and np.mean(distances) < 3.5
+    assert np.mean(sure) > 10
+
+
+def test_depths_of_only_one_side_suffice_whichever_it_is() -> None:
+    rng = np.random.default_rng(6)
+    a = Pose2(2.5, 2.0, 0.3)
+    b = a @ Pose2(0.2, -0.1, 0.1)
+    first, second = node_at(a, rng), node_at(b, rng, 2)
+    unknown = np.full(len(second.landmarks), np.nan, np.float32)
+    flat = replace(second, landmarks=replace(second.landmarks, depths=unknown, depth_sigmas=unknown))
+    for verdict, true in (
+        (examine_nodes(first, flat, None, rng), a.inverse() @ b),
+        (examine_nodes(flat, first, None, rng), b.inverse() @ a),
+    ):
+        assert isinstance(verdict, Recognition)
+        assert verdict.node_from_robot.mahalanobis2(true) < 16.3
+
+
+def test_depths_that_do_not_agree_are_refused() -> None:
+    """A poster twice as large, twice as far away: every pixel fits, the depths do not."""
+    rng = np.random.default_rng(7)
+    a = Pose2(2.5, 2.0, 0.3)
+    first, second = node_at(a, rng), node_at(a, rng, 2)
+    landmarks = second.landmarks
+    double = replace(landmarks, depths=landmarks.depths * 2, depth_sigmas=landmarks.depth_sigmas * 2)
+    assert register(first, second, None, rng) is not None
+    assert register(first, replace(second, landmarks=double), None, rng) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"least_inliers": 200}, "are needed"),
+        ({"least_cells": 24}, "image cells"),
+        ({"least_seen": 1.01}, "should be in the image"),
+        ({"least_evidence": 1e6}, "chance"),
+        ({"most_position_share": 1e-6}, "position is uncertain"),
+        ({"most_heading_sigma": 1e-9}, "heading is uncertain"),
+        ({"most_mean_square": 0.01}, "residuals"),
+        ({"least_share": 1.01}, "of the matches agree"),
+    ],
+)
+def test_each_rule_refuses_with_its_own_reason(change: dict[str, float], word: str) -> None:
+    rng = np.random.default_rng(8)
+    a = Pose2(2.5, 2.0, 0.3)
+    view, _ = take_view(world(), near(a, rng), rng)
+    verdict = examine_view(node_at(a, rng), view, RecognitionSettings(**change), rng)  # type: ignore[arg-type]
+    assert isinstance(verdict, Refusal) and word in verdict.reason
+
+
+def test_a_patch_in_a_corner_does_not_make_a_place() -> None:
+    """The same small poster in another room: many inliers, all in one corner of the image."""
+    rng = np.random.default_rng(9)
+    a = Pose2(2.5, 2.0, 0.0)
+    node, (view, _) = node_at(a, rng), take_view(world(), a, rng, Sensing(most=300))
+    corner = (view.pixels[:, 0] < 80) & (view.pixels[:, 1] < 120)
+    foreign, _ = take_view(world(99), a, rng)
+    mixed = replace(
+        foreign,
+        pixels=np.concatenate([view.pixels[corner], foreign.pixels]),
+        codes=np.concatenate([view.codes[corner], foreign.codes]),
+    )
+    assert isinstance(examine_view(node, mixed, None, rng), Refusal)
+
+
+def test_empty_nodes_and_views_are_refused_in_words() -> None:
+    rng = np.random.default_rng(10)
+    a = Pose2(2.5, 2.0, 0.0)
+    empty = replace(node_at(a, rng), landmarks=Landmarks.empty())
+    view, _ = take_view(world(), a, rng)
+    verdict = examine_view(empty, view, None, rng)
+    assert isinstance(verdict, Refusal) and "0 features match" in verdict.reason

@@ -1,0 +1,93 @@
+"""Images from disk: as they were written, or one line that says what is wrong."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridmap.camera import Camera
+from hybridmap.errors import DeviceError
+from storage.image_file import decode_grey, image_size, read_grey
+
+CAMERA = Camera(64, 48, 60, 60, 32, 24, 0.3)
+
+
+def test_what_was_written_is_read(tmp_path):
+    grey = np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8)
+    path = tmp_path / "grün 1.png"
+    cv2.imwrite(str(path), grey)
+    for camera in (None, CAMERA):
+        read = read_grey(path, camera)
+        assert read.dtype == np.uint8
+        assert np.array_equal(read, grey)
+    cv2.imwrite(str(path), np.dstack([grey] * 3))
+    assert np.array_equal(read_grey(path, CAMERA), grey)
+
+
+@pytest.mark.parametrize("how", ["missing", "a folder", "empty", "text", "torn"])
+def test_what_is_no_image_is_one_line(tmp_path, how, capfd):
+    path = tmp_path / "1.png"
+    match how:
+        case "a folder":
+            path.mkdir()
+        case "empty":
+            path.write_bytes(b"")
+        case "text":
+            path.write_text("no image")
+        case "torn":
+            path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
+    words = "no such file" if how == "missing" else "not an image that can be read"
+    with pytest.raises(DeviceError, match=re.escape(f"{path}: {words}")):
+        read_grey(path)
+    # OpenCV has something to say of a torn file, and nothing of the others.
+    assert how == "torn" or capfd.readouterr().err == ""
+
+
+def test_an_image_of_another_camera_is_refused(tmp_path):
+    path = tmp_path / "1.png"
+    cv2.imwrite(str(path), np.zeros((48, 60), np.uint8))
+    assert read_grey(path).shape == (48, 60)
+    with pytest.raises(DeviceError, match=re.escape(f"{path}: 60x48 px, but camera.toml says 64x48")):
+        read_grey(path, CAMERA, "camera.toml")
+
+
+def png(width: int, height: int) -> bytes:
+    """A whole and valid PNG of zeros, which compress a thousandfold."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    packer, row = zlib.compressobj(9), bytes(width + 1)
+    packed = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+
+
+def test_a_bomb_in_a_recording_is_not_decoded(tmp_path, monkeypatch):
+    path = tmp_path / "1.png"
+    path.write_bytes(png(20_000, 2_600))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(
+        DeviceError, match="an image of 20000x2600 px is too large, at most 50000000 are taken"
+    ):
+        read_grey(path, CAMERA)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".pgm", ".bmp"])
+@pytest.mark.parametrize("size", [(48, 64), (5, 3)])
+def test_the_size_is_read_from_the_head(size, suffix):
+    grey = np.random.default_rng(0).integers(0, 255, size).astype(np.uint8)
+    data = cv2.imencode(suffix, grey)[1].tobytes()
+    assert image_size(data) == size[::-1]
+    assert decode_grey(data).shape == size
+
+
+def test_a_device_is_no_image():
+    with pytest.raises(DeviceError, match="/dev/zero: not an image"):
+        read_grey(Path("/dev/zero"))

@@ -1,0 +1,13 @@
+"""Images whose motion is known."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.vision.photographs import Pictures
+
+
+@pytest.fixture(scope="session")
+def pictures() -> Pictures:
+    """Images whose motion is known."""
+    return Pictures()

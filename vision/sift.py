@@ -1,0 +1,137 @@
+"""SIFT features of one image, evenly spread and compactly coded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.camera import Camera
+from hybridmap.descriptor import encode
+from hybridmap.node import CODE_BYTES
+from hybridmap.pose import Array
+from hybridmap.query import View
+from vision.lens import Lens
+
+TEXTURE_BLOCK_PX = 11
+"""Side of the square in which texture is measured, about that of a tracked patch."""
+
+
+@dataclass(frozen=True)
+class SiftSettings:
+    """How features are chosen.
+
+    Attributes:
+        most: features kept of one image.
+        contrast: SIFT's contrast threshold; lower finds more and weaker features.
+        cells: the image is cut into cells x cells; each may give at most `crowding` times its even share.
+        crowding: see cells.
+        border_px: features nearer to the image's border are left out, they cannot be tracked.
+        least_texture: the image's mean squared gradient around a feature, in its weakest direction,
+            (grey/px)^2. On an edge it is that of noise alone: such a feature slides along the edge when it
+            is tracked (aperture problem), unnoticed by a forward-backward check.
+        least_roundness: the same in the weakest direction as a share of that in the strongest.
+    """
+
+    most: int = 150
+    contrast: float = 0.02
+    cells: int = 4
+    crowding: float = 2.5
+    border_px: float = 6.0
+    least_texture: float = 1.5
+    least_roundness: float = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """The features of one image, strongest first, in columns.
+
+    Attributes:
+        raw: (N, 2) px as in the real image.
+        pixels: (N, 2) px in the ideal image.
+        codes: (N, 32) uint8 compact descriptors.
+        responses: (N,) SIFT's response.
+    """
+
+    raw: Array
+    pixels: Array
+    codes: NDArray[np.uint8]
+    responses: Array
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.raw)
+
+    def view(self, camera: Camera) -> View:
+        """The same as a question to the map."""
+        return View(self.pixels.astype(np.float32), self.codes, camera)
+
+
+class Sift:
+    """Extracts features; holds OpenCV's detector."""
+
+    def __init__(self, lens: Lens, settings: SiftSettings | None = None) -> None:
+        """Take the lens that pixels are freed of."""
+        self._lens = lens
+        self._settings = settings or SiftSettings()
+        # More are asked for than kept, so that the spread has something to choose from.
+        self._detector = cv2.SIFT.create(
+            nfeatures=2 * self._settings.most, contrastThreshold=self._settings.contrast
+        )
+
+    def extract(self, image: NDArray[np.uint8]) -> Features:
+        """Find the features of a grey image (H, W)."""
+        keypoints, descriptors = self.describe(image)
+        if not keypoints:
+            return Features(
+                np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, CODE_BYTES), np.uint8), np.zeros(0)
+            )
+        raw = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
+        responses = np.array([k.response for k in keypoints], dtype=np.float64)
+        return Features(raw, self._lens.undistort(raw), encode(descriptors), responses)
+
+    def describe(self, image: NDArray[np.uint8]) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
+        """The same before they are coded: keypoints, strongest first, and (N, 128) SIFT."""
+        keypoints = self._detector.detect(image, None)
+        keypoints = self._spread(self._trackable(list(keypoints), image), image.shape[1], image.shape[0])
+        if not keypoints:
+            return [], np.zeros((0, 128), np.float32)
+        keypoints, descriptors = self._detector.compute(image, keypoints)
+        return keypoints, np.asarray(descriptors, np.float32)
+
+    def _trackable(self, keypoints: list[cv2.KeyPoint], image: NDArray[np.uint8]) -> list[cv2.KeyPoint]:
+        """Those that are held in both directions by the image around them (Shi and Tomasi 1994)."""
+        if not keypoints:
+            return []
+        smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
+        # OpenCV sums (2 * gradient / block)^2 over the block: four times the mean.
+        strengths = cv2.cornerEigenValsAndVecs(smooth, TEXTURE_BLOCK_PX, ksize=3)[..., :2] / 4.0
+        at = np.array([k.pt for k in keypoints]).round().astype(int)
+        strong, weak = strengths[at[:, 1], at[:, 0]].T
+        enough = (weak >= self._settings.least_texture) & (weak >= self._settings.least_roundness * strong)
+        return [k for k, good in zip(keypoints, enough.tolist(), strict=True) if good]
+
+    def _spread(self, keypoints: list[cv2.KeyPoint], width: int, height: int) -> list[cv2.KeyPoint]:
+        """Strongest first, one a place (SIFT repeats a place for each orientation), no cell crowded."""
+        s = self._settings
+        quota = int(np.ceil(s.crowding * s.most / s.cells**2))
+        taken: dict[tuple[int, int], int] = {}
+        places: set[tuple[int, int]] = set()
+        kept: list[cv2.KeyPoint] = []
+        for k in sorted(keypoints, key=lambda k: (-k.response, k.pt)):
+            x, y = k.pt
+            if not (s.border_px <= x < width - s.border_px and s.border_px <= y < height - s.border_px):
+                continue
+            place = (round(x), round(y))
+            cell = (int(x * s.cells / width), int(y * s.cells / height))
+            if place in places or taken.get(cell, 0) >= quota:
+                continue
+            places.add(place)
+            taken[cell] = taken.get(cell, 0) + 1
+            kept.append(k)
+            if len(kept) == s.most:
+                break
+        return kept
