@@ -118,6 +118,7 @@ class Desk:
         by = now + latest if wait > 0.0 else math.inf
         return self._pool.submit(self._unless_late, work, ticket, by, usual)
 
+    def counters(self) -> dict[str, int | float]:
         """Questions answered and refused so far, those open now, and how long one takes, ms."""
         with self._lock:
             return {
