@@ -93,8 +93,8 @@ def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) 
         The posture and the points (N, 3) m at their best for it; None if the inliers do not determine a
         posture.
     """
-    sure, posture, points = projection.improve(stack, pose.vector, *_mean_and_information(prior), rounds)
-    return (Pose2.from_vector(posture), points) if sure else None
+    sure, pose_vector, points = projection.improve(stack, pose.vector, *_mean_and_information(prior), rounds)
+    return (Pose2.from_vector(pose_vector), points) if sure else None
 
 
 def refine(

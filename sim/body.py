@@ -206,7 +206,7 @@ class Body:
         contacts = self._physics.getContactPoints(bodyA=self.number)
         return any(c[2] != self._floor and c[1] != c[2] and c[8] <= 0.0 for c in contacts)
 
-    def posture(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def position_and_rotation(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(3,) m of the robot's origin on the floor, and (3, 3) rotation of its axes, in world."""
         position, orientation = self._physics.getBasePositionAndOrientation(self.number)
         rotation = np.array(self._physics.getMatrixFromQuaternion(orientation)).reshape(3, 3)
@@ -215,7 +215,7 @@ class Body:
     @property
     def pose(self) -> Pose2:
         """world_from_robot, true."""
-        position, rotation = self.posture()
+        position, rotation = self.position_and_rotation()
         return Pose2(float(position[0]), float(position[1]), math.atan2(rotation[1, 0], rotation[0, 0]))
 
     def put(self, pose: Pose2) -> None:

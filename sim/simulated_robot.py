@@ -15,7 +15,7 @@ from sim.faults import Faults
 from sim.imager import Imager
 from sim.rangers import Rangers
 from sim.robots import RobotSetup
-from sim.stage import Posture, Stage
+from sim.stage import RigidPose, Stage
 from sim.texture import Image
 
 
@@ -54,23 +54,23 @@ class SimulatedRobot:
         self.image: Image | None = None
         self.render_seconds = 0.0
         self._imager = Imager(setup.camera, stage.world.background, (base, 0x701E, number))
-        self._posture: Posture = self.body.posture()
+        self._placement: RigidPose = self.body.position_and_rotation()
         self._turn_rate = 0.0
         self._looked_tick = 0
         self._frame_tick = -1
         self._frame: Image | None = None
         self._dropped = (-1, False)
 
-    def look(self, tick: int) -> Posture:
+    def look(self, tick: int) -> RigidPose:
         """Read the true posture out of the physics; call after whatever may have moved the robot."""
-        self._posture = posture = self.body.posture()
-        position, rotation = posture
+        self._placement = placement = self.body.position_and_rotation()
+        position, rotation = placement
         pose = Pose2(float(position[0]), float(position[1]), math.atan2(rotation[1, 0], rotation[0, 0]))
         if tick > self._looked_tick:
             turned = wrap_angle(pose.heading - self.pose.heading)
             self._turn_rate = turned / ((tick - self._looked_tick) * self.description.tick)
         self.pose, self._looked_tick = pose, tick
-        return posture
+        return placement
 
     def put(self, pose: Pose2) -> None:
         """Pick the robot up and put it down elsewhere (`world_from_robot`)."""
@@ -101,7 +101,7 @@ class SimulatedRobot:
             return self._frame
         since = (tick - self._frame_tick) * self.description.tick if self._frame_tick >= 0 else 0.0
         self._frame = self._imager.picture(
-            stage.scene, self._posture, stage.lamps, self._turn_rate, since, self.faults.covered(tick)
+            stage.scene, self._placement, stage.lamps, self._turn_rate, since, self.faults.covered(tick)
         )
         self._frame_tick = tick
         return self._frame

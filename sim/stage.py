@@ -20,7 +20,7 @@ SOLVER_ITERATIONS = 20
 """Of PyBullet's contact solver. Together with SUBSTEPS: over a drive of 9 m and three turns, wheels without
 slip then lose 4 mm to the solver, as against 2 mm with twice the iterations and half as many steps more."""
 
-Posture = tuple[NDArray[np.float64], NDArray[np.float64]]
+RigidPose = tuple[NDArray[np.float64], NDArray[np.float64]]
 """(3,) m of an origin, and (3, 3) rotation of its axes, in world."""
 
 
@@ -68,7 +68,7 @@ class Stage:
         self._cast: list[_Cast] = []
         self._light = (1.0, 1.0, 0, 0)
         self.lamps = 1.0
-        self._postures: tuple[Posture, ...] = ()
+        self._postures: tuple[RigidPose, ...] = ()
         self.scene = self._assemble()
 
     @property
@@ -76,7 +76,7 @@ class Stage:
         """Who is there now."""
         return tuple(one.actor for one in self._cast)
 
-    def place_robots(self, postures: Sequence[Posture]) -> None:
+    def place_robots(self, postures: Sequence[RigidPose]) -> None:
         """Show the robots where they are now."""
         self._postures = tuple(postures)
         for number, (position, rotation) in enumerate(postures):

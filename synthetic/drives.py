@@ -77,7 +77,7 @@ def drives(rng: np.random.Generator, settings: DriveSettings | None = None) -> I
     past: set[NodeId] = set()
     for epoch in count(1):
         walk = walk_of(s.floor, rng)
-        truth = {NodeId(ROBOT, epoch, k): posture for k, posture in enumerate(walk)}
+        truth = {NodeId(ROBOT, epoch, k): pose_vector for k, pose_vector in enumerate(walk)}
         where, pairs = living | truth, _same_places(truth, living, s, rng)
         links = [link_between(a, b, where[a].inverse() @ where[b], rng) for a, b in pairs]
         true = frozenset(pairs)

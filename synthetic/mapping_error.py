@@ -22,10 +22,10 @@ def follow(run: MappingRun, settings: FilterSettings | None = None) -> MappingFi
     return filter_
 
 
-def error(run: MappingRun, ids: NDArray[np.int64], posture: Array, points: Array) -> float:
+def error(run: MappingRun, ids: NDArray[np.int64], pose_vector: Array, points: Array) -> float:
     """RMS distance to the truth of landmarks (N, 3) m in the first robot frame, and of the robot, m."""
     landmarks = np.square(points - run.points[ids]).sum(axis=1)
-    robot = np.square(posture[:2] - run.poses[-1].vector[:2]).sum()
+    robot = np.square(pose_vector[:2] - run.poses[-1].vector[:2]).sum()
     return float(np.sqrt(np.append(landmarks, robot).mean()))
 
 

@@ -42,8 +42,8 @@ def batch_optimum(run: MappingRun, prior_depth: float, prior_spread: float) -> t
     best = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
     last = best.atPose3(_x(len(run.odometry))) * _camera_pose(run, Pose2()).inverse()
     world = last.matrix()
-    posture = np.array([world[0, 3], world[1, 3], np.arctan2(world[1, 0], world[0, 0])])
-    return posture, np.array([best.atPoint3(_l(i)) for i in range(len(run.points))])
+    pose_vector = np.array([world[0, 3], world[1, 3], np.arctan2(world[1, 0], world[0, 0])])
+    return pose_vector, np.array([best.atPoint3(_l(i)) for i in range(len(run.points))])
 
 
 def _x(k: int) -> int:

@@ -33,17 +33,17 @@ class Sight:
     scale: Array
 
 
-def see(posture: Array, rays: Array, mount_forward: float) -> Sight:
+def see(pose_vector: Array, rays: Array, mount_forward: float) -> Sight:
     """See a node's landmarks from a posture in the node's robot frame.
 
     Args:
-        posture: (3,) [x m, y m, heading rad], node_from_robot.
+        pose_vector: (3,) [x m, y m, heading rad], node_from_robot.
         rays: (N, 3) [a, b, w 1/m] at the node.
         mount_forward: of both optical centres ahead of their axles, m.
     """
-    c, s = np.cos(posture[2]), np.sin(posture[2])
-    x = posture[0] + mount_forward * (c - 1.0)
-    y = posture[1] + mount_forward * s
+    c, s = np.cos(pose_vector[2]), np.sin(pose_vector[2])
+    x = pose_vector[0] + mount_forward * (c - 1.0)
+    y = pose_vector[1] + mount_forward * s
     a, b, w = rays.T
     ahead, right = 1.0 - w * x, a + w * y
     scale = c * ahead - s * right

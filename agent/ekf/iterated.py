@@ -66,12 +66,12 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
     """
     n, slots = len(seen.slots), seen.slots
     index = (3 + 3 * slots[:, None] + np.arange(3)).ravel()
-    posture, rays = start, state.rays
+    pose_vector, rays = start, state.rays
     first: Array | None = None
     accepted: NDArray[np.bool_] = np.ones(n, np.bool_)
     for _ in range(seen.most):
-        sight = see(posture, rays[slots], mount_forward)
-        first_sight = see(posture, state.first[slots], mount_forward)
+        sight = see(pose_vector, rays[slots], mount_forward)
+        first_sight = see(pose_vector, state.first[slots], mount_forward)
         if (np.minimum(sight.scale, first_sight.scale) <= NEAREST_SCALE).any():
             return None
         by_posture = first_sight.by_posture[:, :2].reshape(2 * n, 3)
@@ -82,7 +82,7 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         spread = by_posture @ columns[:3] + (by_ray @ columns[index].reshape(n, 3, -1)).reshape(2 * n, 2 * n)
         spread[np.arange(2 * n), np.arange(2 * n)] += np.tile(seen.variances, n)
         # The prior mean as seen from this linearisation point.
-        back = _linear(by_posture, by_ray, state.posture - posture, (state.rays - rays)[slots])
+        back = _linear(by_posture, by_ray, state.pose_vector - pose_vector, (state.rays - rays)[slots])
         innovations = seen.slopes - sight.rays[:, :2] - back
         if first is None:
             first = innovations
@@ -96,10 +96,10 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         white = whitening @ innovations[accepted].ravel()
         step = root @ white
         new_posture, new_rays = state.stepped(step)
-        change = _linear(by_posture, by_ray, new_posture - posture, (new_rays - rays)[slots])
+        change = _linear(by_posture, by_ray, new_posture - pose_vector, (new_rays - rays)[slots])
         promised = sight.rays[:, :2] + change
-        posture, rays = new_posture, new_rays
-        kept = see(posture, rays[slots], mount_forward).rays[:, :2]
+        pose_vector, rays = new_posture, new_rays
+        kept = see(pose_vector, rays[slots], mount_forward).rays[:, :2]
         if np.abs(kept - promised)[accepted].max() < seen.linear:
             break
     corrected = state.corrected(step, root)
@@ -108,6 +108,6 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
     return Fit(corrected, accepted, first, nis)
 
 
-def _linear(by_posture: Array, by_ray: Array, posture: Array, rays: Array) -> Array:
+def _linear(by_posture: Array, by_ray: Array, pose_vector: Array, rays: Array) -> Array:
     """(N, 2) change of the slopes to first order, for changes of posture (3,) and rays (N, 3)."""
-    return (by_posture @ posture).reshape(-1, 2) + (by_ray @ rays[:, :, None])[:, :, 0]
+    return (by_posture @ pose_vector).reshape(-1, 2) + (by_ray @ rays[:, :, None])[:, :, 0]

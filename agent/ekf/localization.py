@@ -79,7 +79,7 @@ class LocalizationFilter:
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels. The landmarks stand still in the node's frame."""
-        posture, by_posture, by_input = move_posture(self._state.posture, odometry)
+        pose_vector, by_posture, by_input = move_posture(self._state.pose_vector, odometry)
         aside = self.settings.side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
         noise = np.column_stack([by_input[:, :2] @ self._wheels.root(odometry), aside * by_input[:, 2]])
         p = self._state.covariance.copy()
@@ -87,7 +87,7 @@ class LocalizationFilter:
         p[3:, :3] = p[:3, 3:].T
         own = by_posture @ p[:3, :3] @ by_posture.T + noise @ noise.T
         p[:3, :3] = 0.5 * (own + own.T)
-        self._state = replace(self._state, posture=posture, covariance=p)
+        self._state = replace(self._state, pose_vector=pose_vector, covariance=p)
 
     def update(self, ids: Ids, pixels: Array) -> UpdateReport:
         """Correct posture and landmarks by the pixels of one image.
@@ -142,7 +142,7 @@ class LocalizationFilter:
         Raises:
             InvalidValue: shapes that do not belong together, or an id twice.
         """
-        pose = Pose2.from_vector(self._state.posture)
+        pose = Pose2.from_vector(self._state.pose_vector)
         points, turn = pose.apply(points_in_robot), turning(pose)
         by_posture = np.zeros((len(points), 3, 3))
         by_posture[:, 0, 0] = by_posture[:, 1, 1] = 1.0
@@ -188,7 +188,7 @@ class LocalizationFilter:
 
     def predict_pixels(self, ids: Ids | None = None) -> Array:
         """(N, 2) px where landmarks are expected now; NaN if behind the camera or not held."""
-        sight = see(self._state.posture, self._state.rays, self._camera.mount_forward)
+        sight = see(self._state.pose_vector, self._state.rays, self._camera.mount_forward)
         ahead = (sight.scale > NEAREST_SCALE)[:, None]
         pixels = np.where(ahead, self._centre + self._focal * sight.rays[:, :2], np.nan)
         if ids is None:
@@ -216,7 +216,7 @@ class LocalizationFilter:
         s, state = self.settings, self._state
         refuted = self._bad >= s.patience
         if not (refuted or state.covariance[2, 2] > s.loose_heading**2):
-            return state.posture
+            return state.pose_vector
         least = s.least_refound if refuted else s.least_fixed
         points, covariances = state.points(self._camera)
         fix = solve_planar_pose(
@@ -228,15 +228,15 @@ class LocalizationFilter:
             settings=PlanarPoseSettings(pixel_sigma=s.pixel_sigma, least_inliers=least),
         )
         if fix is None:
-            return state.posture
+            return state.pose_vector
         start = fix.node_from_robot.mean.vector
         if refuted:
             p = state.covariance.copy()
             p[:3, :] = p[:, :3] = 0.0
             p[[0, 1, 2], [0, 1, 2]] = s.lost_position**2, s.lost_position**2, s.lost_heading**2
-            self._state = replace(state, posture=start.copy(), covariance=p)
+            self._state = replace(state, pose_vector=start.copy(), covariance=p)
         # The same turn of the circle as the prior's heading.
-        start[2] += 2 * math.pi * round((self._state.posture[2] - start[2]) / (2 * math.pi))
+        start[2] += 2 * math.pi * round((self._state.pose_vector[2] - start[2]) / (2 * math.pi))
         return start
 
     def _judge(self, report: UpdateReport) -> UpdateReport:

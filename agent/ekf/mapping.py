@@ -73,17 +73,19 @@ class MappingFilter:
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are let go."""
         state, mount, s = self.state, self._camera.mount_forward, self.settings
-        posture, _, _ = move_posture(state.posture, odometry)
+        pose_vector, _, _ = move_posture(state.pose_vector, odometry)
         rays, scale = transform_rays(state.rays, odometry, mount)
         stays = (scale > 1e-3) & (rays[:, 2] * s.nearest <= 1.0) & (np.abs(rays[:, 0]) <= s.widest_slope)
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
-        taken = Step(state, odometry, root, aside, self._posture_variances, mount, odometry, posture, rays)
+        taken = Step(
+            state, odometry, root, aside, self._posture_variances, mount, odometry, pose_vector, rays
+        )
         if not stays.all():
             self.lost += int(np.count_nonzero(~stays))
             self.ids = self.ids[stays]
             taken = taken.kept(stays)
         self._step = taken
-        self._watch.moved(taken.posture)
+        self._watch.moved(taken.pose_vector)
 
     def add(
         self,
@@ -119,7 +121,7 @@ class MappingFilter:
             rays[:, 2] = inverse_depths
             variances[:, 2] = np.square(sigmas)
         self._settle(self.state.grown(rays, variances))
-        self._watch.took_up(self.state.posture)
+        self._watch.took_up(self.state.pose_vector)
         self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)])
 
     def update(self, ids: Ids, pixels: Array) -> UpdateReport:

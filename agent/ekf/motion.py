@@ -70,11 +70,11 @@ class WheelNoise:
         return np.array([[0.5 * right, 0.5 * left], [right / self.axle, -left / self.axle]])
 
 
-def move_posture(posture: Array, odometry: Odometry, aside: float = 0.0) -> tuple[Array, Array, Array]:
+def move_posture(pose_vector: Array, odometry: Odometry, aside: float = 0.0) -> tuple[Array, Array, Array]:
     """Move a posture by one step of the wheels.
 
     Args:
-        posture: (3,) [x m, y m, heading rad] in any fixed frame.
+        pose_vector: (3,) [x m, y m, heading rad] in any fixed frame.
         odometry: the step.
         aside: u3, how far the robot slips to the left of its way, m.
 
@@ -82,9 +82,9 @@ def move_posture(posture: Array, odometry: Odometry, aside: float = 0.0) -> tupl
         The posture after, (3,); its Jacobians by the posture before, (3, 3), and by (u1, u2, u3), (3, 3).
     """
     u1, u2 = odometry.forward, odometry.turn
-    c, s = math.cos(posture[2] + 0.5 * u2), math.sin(posture[2] + 0.5 * u2)
+    c, s = math.cos(pose_vector[2] + 0.5 * u2), math.sin(pose_vector[2] + 0.5 * u2)
     x, y = u1 * c - aside * s, u1 * s + aside * c
-    after = posture + np.array([x, y, u2])
+    after = pose_vector + np.array([x, y, u2])
     by_posture = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     by_input = np.array([[c, -0.5 * y, -s], [s, 0.5 * x, c], [0.0, 1.0, 0.0]])
     return after, by_posture, by_input

@@ -18,12 +18,12 @@ class MovingState:
     """Posture since the anchor and landmarks in the moving camera, with their joint covariance.
 
     Attributes:
-        posture: (3,) [x m, y m, heading rad], anchor_from_robot.
+        pose_vector: (3,) [x m, y m, heading rad], anchor_from_robot.
         rays: (n, 3) [a, b, w 1/m] in the camera as it stands now.
         covariance: (3 + 3n, 3 + 3n) of [posture, rays], additive errors.
     """
 
-    posture: Array
+    pose_vector: Array
     rays: Array
     covariance: Array
 
@@ -35,10 +35,10 @@ class MovingState:
     @property
     def pose(self) -> PoseGaussian:
         """`anchor_from_robot`, perturbed on the right as everywhere outside the filter."""
-        posture = Pose2.from_vector(self.posture)
+        pose_vector = Pose2.from_vector(self.pose_vector)
         turn = np.eye(3)
-        turn[:2, :2] = posture.rotation.T
-        return PoseGaussian(posture, turn @ self.covariance[:3, :3] @ turn.T)
+        turn[:2, :2] = pose_vector.rotation.T
+        return PoseGaussian(pose_vector, turn @ self.covariance[:3, :3] @ turn.T)
 
     @property
     def blocks(self) -> Array:
@@ -55,12 +55,12 @@ class MovingState:
         covariance[:size, :size] = self.covariance
         index = np.arange(size, size + more)
         covariance[index, index] = variances.ravel()
-        return MovingState(self.posture, np.concatenate([self.rays, rays]), covariance)
+        return MovingState(self.pose_vector, np.concatenate([self.rays, rays]), covariance)
 
     def kept(self, mask: NDArray[np.bool_]) -> MovingState:
         """The state with only some of its landmarks."""
         index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])
-        return MovingState(self.posture, self.rays[mask], self.covariance[np.ix_(index, index)])
+        return MovingState(self.pose_vector, self.rays[mask], self.covariance[np.ix_(index, index)])
 
     def reanchored(self) -> MovingState:
         """The state with the present posture as anchor: exact, as landmarks are in the robot's frame."""
@@ -89,7 +89,7 @@ class MovingState:
         step = white @ root
         # A product with its own transpose is symmetric to the last bit.
         covariance = self.covariance - root.T @ root
-        state = MovingState(self.posture + step[:3], self.rays + step[3:].reshape(-1, 3), covariance)
+        state = MovingState(self.pose_vector + step[:3], self.rays + step[3:].reshape(-1, 3), covariance)
         return state, float(white @ white)
 
 
@@ -105,7 +105,7 @@ class Step:
         posture_variances: (3,) process noise of the posture, the diagonal of Q.
         mount_forward: of the optical centre ahead of the axle, m.
         at: where the step is linearised: as measured, or a better guess.
-        posture: (3,) expected after the step.
+        pose_vector: (3,) expected after the step.
         rays: (n, 3) expected after the step.
     """
 
@@ -116,7 +116,7 @@ class Step:
     posture_variances: Array
     mount_forward: float
     at: Odometry
-    posture: Array
+    pose_vector: Array
     rays: Array
     _after: tuple[MovingState, Array] | None = None
 
@@ -130,7 +130,7 @@ class Step:
         step = Step(
             self.before, self.measured, self.wheel_root if wheel_root is None else wheel_root,
             self.side_slip, self.posture_variances, self.mount_forward, at or self.at,
-            self.posture, self.rays,
+            self.pose_vector, self.rays,
         )  # fmt: skip
         # What is expected is another now as well.
         _ = step.state
@@ -184,7 +184,7 @@ class Step:
         if self._after is not None:
             return self._after
         before, at = self.before, self.at
-        posture, by_posture, posture_by_input = move_posture(before.posture, at)
+        pose_vector, by_posture, posture_by_input = move_posture(before.pose_vector, at)
         moved = move_rays(before.rays, at, self.mount_forward)
         by_state = np.concatenate([by_posture[None], moved.by_ray])
         by_input = np.concatenate([posture_by_input, moved.by_input.reshape(-1, 3)])
@@ -193,6 +193,6 @@ class Step:
         covariance = propagate(before.covariance, by_state, by_input, input_root, self.posture_variances)
         further = np.array([self.measured.forward - at.forward, self.measured.turn - at.turn])
         shift = by_input[:, :2] @ further
-        self.posture, self.rays = posture + shift[:3], moved.rays + shift[3:].reshape(-1, 3)
-        self._after = MovingState(self.posture, self.rays, covariance), by_input
+        self.pose_vector, self.rays = pose_vector + shift[:3], moved.rays + shift[3:].reshape(-1, 3)
+        self._after = MovingState(self.pose_vector, self.rays, covariance), by_input
         return self._after

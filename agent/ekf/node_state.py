@@ -20,7 +20,7 @@ class NodeState:
     """Posture in a node and the node's landmarks, with their joint covariance.
 
     Attributes:
-        posture: (3,) [x m, y m, heading rad], node_from_robot.
+        pose_vector: (3,) [x m, y m, heading rad], node_from_robot.
         rays: (n, 3) [a, b, w 1/m] at the node. The paper's two numbers a landmark, here a and w, are
             estimated; b is known as the map gives it, and only its uncertainty is considered.
         first: (n, 3) the rays as they were first known. All Jacobians are taken there: at estimates that
@@ -29,7 +29,7 @@ class NodeState:
         covariance: (3 + 3n, 3 + 3n) of [posture, (a, b, w) of each landmark], additive errors.
     """
 
-    posture: Array
+    pose_vector: Array
     rays: Array
     first: Array
     covariance: Array
@@ -44,7 +44,7 @@ class NodeState:
     @property
     def pose(self) -> PoseGaussian:
         """`node_from_robot`, perturbed on the right as everywhere outside the filter."""
-        mean = Pose2.from_vector(self.posture)
+        mean = Pose2.from_vector(self.pose_vector)
         turn = turning(mean).T
         return PoseGaussian(mean, turn @ self.covariance[:3, :3] @ turn.T)
 
@@ -79,7 +79,7 @@ class NodeState:
         rays = self.rays.copy()
         rays[:, 0] += step[3::3]
         rays[:, 2] += step[5::3]
-        return self.posture + step[:3], rays
+        return self.pose_vector + step[:3], rays
 
     def corrected(self, step: Array, root: Array) -> NodeState:
         """The state after an update by a step, whose gain takes `root root^T` off the covariance.
@@ -87,10 +87,10 @@ class NodeState:
         The slopes b do not follow, so the covariance among them stays as it is (Schmidt's consider filter);
         all else is as in the full filter.
         """
-        posture, rays = self.stepped(step)
+        pose_vector, rays = self.stepped(step)
         covariance = self.covariance - root @ root.T
         covariance[4::3, 4::3] = self.covariance[4::3, 4::3]
-        return NodeState(posture, rays, self.first, covariance)
+        return NodeState(pose_vector, rays, self.first, covariance)
 
     def grown(self, rays: Array, covariances: Array, by_posture: Array) -> NodeState:
         """The state with further landmarks.
@@ -112,21 +112,21 @@ class NodeState:
         index = np.arange(n)
         own[index, :, index, :] += covariances
         return NodeState(
-            self.posture, np.concatenate([self.rays, rays]), np.concatenate([self.first, rays]), grown
+            self.pose_vector, np.concatenate([self.rays, rays]), np.concatenate([self.first, rays]), grown
         )
 
     def of_unknown_scale(self, share: float) -> NodeState:
         """The state where all lengths may be off together by a share of them."""
         change = np.zeros(len(self.covariance))
-        change[:2] = share * self.posture[:2]
+        change[:2] = share * self.pose_vector[:2]
         change[5::3] = -share * self.rays[:, 2]
-        return NodeState(self.posture, self.rays, self.first, self.covariance + np.outer(change, change))
+        return NodeState(self.pose_vector, self.rays, self.first, self.covariance + np.outer(change, change))
 
     def kept(self, mask: NDArray[np.bool_]) -> NodeState:
         """The state with only some of its landmarks."""
         index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])
         return NodeState(
-            self.posture, self.rays[mask], self.first[mask], self.covariance[np.ix_(index, index)]
+            self.pose_vector, self.rays[mask], self.first[mask], self.covariance[np.ix_(index, index)]
         )
 
     def rebased(
@@ -148,7 +148,7 @@ class NodeState:
         edge = turn @ node_from_new.covariance @ turn.T
         seen = see(at, self.rays, mount_forward)
         by_edge = np.empty((3 + 3 * n, 3))
-        away = turn[:2, :2].T @ (self.posture[:2] - at[:2])
+        away = turn[:2, :2].T @ (self.pose_vector[:2] - at[:2])
         by_edge[:3] = -turn.T
         by_edge[:2, 2] = away[1], -away[0]
         by_edge[3:] = seen.by_posture.reshape(3 * n, 3)
@@ -160,7 +160,7 @@ class NodeState:
         half = (seen.by_ray @ p[3:, 3:].reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
         moved[3:, 3:] = (seen.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
         moved += by_edge @ edge @ by_edge.T
-        mean = new_from_node.mean @ Pose2.from_vector(self.posture)
+        mean = new_from_node.mean @ Pose2.from_vector(self.pose_vector)
         # What was linearised in the old frame and what will be in the new agree only at one estimate.
         state = NodeState(mean.vector, seen.rays, seen.rays, 0.5 * (moved + moved.T))
         return state, seen.scale > NEAREST_SCALE

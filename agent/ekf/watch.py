@@ -27,14 +27,14 @@ class Watch:
         self._base = (0.0, 0.0)
         self._baseline = 0.0
 
-    def took_up(self, posture: Array) -> None:
+    def took_up(self, pose_vector: Array) -> None:
         """Landmarks were taken up at a posture (3,): their parallax is counted from there."""
-        self._base, self._baseline = _position(posture), 0.0
+        self._base, self._baseline = _position(pose_vector), 0.0
 
-    def moved(self, posture: Array) -> None:
+    def moved(self, pose_vector: Array) -> None:
         """The robot has moved to a posture (3,), and no image has told of it yet."""
         self._steps_unseen += 1
-        self._baseline = max(self._baseline, math.dist(_position(posture), self._base))
+        self._baseline = max(self._baseline, math.dist(_position(pose_vector), self._base))
 
     def saw(self, health: Health, reason: str) -> None:
         """An image has come and told this."""
@@ -67,6 +67,6 @@ class Watch:
         return self._last
 
 
-def _position(posture: Array) -> tuple[float, float]:
-    x, y, _ = posture.tolist()
+def _position(pose_vector: Array) -> tuple[float, float]:
+    x, y, _ = pose_vector.tolist()
     return x, y

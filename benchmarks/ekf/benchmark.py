@@ -83,8 +83,8 @@ def try_run(seed: int, trial: int) -> Trial:
     filter_ = follow(run)
     everything = np.ones(len(run.points), np.bool_)
     settings = filter_.settings
-    posture, points = batch_optimum(run, settings.prior_depth, settings.prior_spread)
-    best = error(run, filter_.ids, posture, points[filter_.ids])
+    pose_vector, points = batch_optimum(run, settings.prior_depth, settings.prior_spread)
+    best = error(run, filter_.ids, pose_vector, points[filter_.ids])
     spoiled_run, spoiled = spoil(run, 0.3, rng)
     spoiled_filter = follow(spoiled_run)
     return Trial(

@@ -91,7 +91,7 @@ class Ours:
     def belief(self) -> Belief:
         """See Racer."""
         state = self._filter.state
-        return np.concatenate([state.posture, state.rays.ravel()]), state.covariance
+        return np.concatenate([state.pose_vector, state.rays.ravel()]), state.covariance
 
 
 class Theirs:

@@ -76,8 +76,10 @@ class FilterPyMapping(ExtendedKalmanFilter):  # type: ignore[misc]
         depth = c * (1 - tx * w) - s * (a + ty * w)
         right = s * (1 - tx * w) + c * (a + ty * w)
         middle = self.x[2] + u2 / 2
-        posture = self.x[:3] + np.array([u1 * np.cos(middle), u1 * np.sin(middle), u2])
-        self.x = np.concatenate([posture, np.stack([right / depth, b / depth, w / depth], axis=1).ravel()])
+        pose_vector = self.x[:3] + np.array([u1 * np.cos(middle), u1 * np.sin(middle), u2])
+        self.x = np.concatenate(
+            [pose_vector, np.stack([right / depth, b / depth, w / depth], axis=1).ravel()]
+        )
 
     def see(self, pixels: Array) -> None:
         """Correct by an image, pixels (n, 2) px with NaN for landmarks that are not seen."""

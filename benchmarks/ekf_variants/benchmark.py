@@ -84,7 +84,7 @@ def try_textbook(run: MappingRun, choice: Choice, best: float) -> Outcome:
             filter_ = TextbookFilter(run, choice)
             for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
                 filter_.step(odometry, pixels)
-            off = error(run, np.arange(len(run.points)), filter_.posture, filter_.points_in_anchor())
+            off = error(run, np.arange(len(run.points)), filter_.pose_vector, filter_.points_in_anchor())
             last = run.poses[-1]
             nees = filter_.posture_nees(last), filter_.landmark_nees(run.points, last)
         except np.linalg.LinAlgError:
@@ -104,8 +104,8 @@ def try_run(seed: int, trial: int, steps: int) -> dict[str, Outcome]:
     """All filters on one run."""
     run = draw_run(np.random.default_rng([seed, trial]), SHAPES[trial % len(SHAPES)], steps)
     prior = FilterSettings()
-    posture, points = batch_optimum(run, prior.prior_depth, prior.prior_spread)
-    best = error(run, np.arange(len(run.points)), posture, points)
+    pose_vector, points = batch_optimum(run, prior.prior_depth, prior.prior_spread)
+    best = error(run, np.arange(len(run.points)), pose_vector, points)
     outcomes = {name: try_textbook(run, choice, best) for name, choice in TEXTBOOK.items()}
     return outcomes | {name: try_ours(run, again, best) for name, again in OURS.items()}
 

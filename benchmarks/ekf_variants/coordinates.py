@@ -58,9 +58,9 @@ class Rays:
         return vectors[:, [0, 1, 3]] / vectors[:, 2:3]
 
 
-def from_posture(vectors: Numbers, posture: Numbers, mount_forward: float) -> Numbers:
+def from_posture(vectors: Numbers, pose_vector: Numbers, mount_forward: float) -> Numbers:
     """Homogeneous vectors (N, 4) as the camera sees them after the robot has moved to a posture (3,)."""
-    x, y, heading = posture
+    x, y, heading = pose_vector
     c, s = np.cos(heading), np.sin(heading)
     right, down, ahead, scale = vectors.T
     ahead = ahead - (x + mount_forward * (c - 1.0)) * scale

@@ -63,7 +63,7 @@ class TextbookFilter:
     """EKF over [posture (3), landmarks (n x 3)].
 
     Attributes:
-        posture: (3,) [x m, y m, heading rad] since the anchor.
+        pose_vector: (3,) [x m, y m, heading rad] since the anchor.
         landmarks: (n, 3) in the choice's coordinates and frame.
         covariance: (3 + 3n, 3 + 3n), additive errors.
         transition: (3 + 3n, 3 + 3n) Jacobian of the last step by the state before it.
@@ -79,7 +79,7 @@ class TextbookFilter:
         self._variances = (run.pixel_sigma / self._focal) ** 2
         slopes = (run.pixels[0] - self._centre) / self._focal
         n = len(slopes)
-        self.posture: Array = np.zeros(3)
+        self.pose_vector: Array = np.zeros(3)
         self.covariance: Array = np.zeros((3 + 3 * n, 3 + 3 * n))
         rays = np.column_stack([slopes, np.full(n, 1.0 / choice.depth)])
         self.landmarks: Array = choice.coordinates.drop(Rays().lift(rays))
@@ -88,7 +88,7 @@ class TextbookFilter:
         self.transition: Array = np.eye(3 + 3 * n)
         self.measurement: Array = np.zeros((0, 3 + 3 * n))
         self._first = self.landmarks
-        self._predicted = self.posture
+        self._predicted = self.pose_vector
         self._by_input: Array = np.zeros((3 + 3 * n, 2))
         if choice.aside_sigma:
             self._update(np.ones(n, np.bool_), run.pixels[0])
@@ -100,28 +100,28 @@ class TextbookFilter:
             odometry: the step.
             pixels: (n, 2) px; NaN for landmarks that are not seen.
         """
-        before = self.posture, self.landmarks, self.covariance
-        reference = self._predicted if self.choice.first_estimates else self.posture
+        before = self.pose_vector, self.landmarks, self.covariance
+        reference = self._predicted if self.choice.first_estimates else self.pose_vector
         measured = np.array([odometry.forward, odometry.turn])
         self._move(measured, measured, reference)
-        self._predicted = self.posture
+        self._predicted = self.pose_vector
         seen = np.isfinite(pixels[:, 0])
         for _ in range(self.choice.relinearisations):
             innovation, spread = self._innovate(seen, pixels)
             pull = np.linalg.solve(spread, innovation)
             likely = measured + wheel_covariance(measured) @ (self.measurement @ self._by_input).T @ pull
-            self.posture, self.landmarks, self.covariance = before
-            self._move(measured, likely, self.posture)
+            self.pose_vector, self.landmarks, self.covariance = before
+            self._move(measured, likely, self.pose_vector)
         self._update(seen, pixels)
 
     def points_in_anchor(self) -> Array:
         """(n, 3) m, landmarks in the first robot frame."""
         points = in_robot(self.choice.coordinates.lift(self.landmarks), self._camera)
-        return Pose2.from_vector(self.posture).apply(points) if self.choice.moving else points
+        return Pose2.from_vector(self.pose_vector).apply(points) if self.choice.moving else points
 
     def posture_nees(self, true: Pose2) -> float:
         """Squared Mahalanobis distance of the true posture, 3 degrees of freedom."""
-        off = self.posture - true.vector
+        off = self.pose_vector - true.vector
         return float(off @ np.linalg.solve(self.covariance[:3, :3], off))
 
     def landmark_nees(self, points: Array, true: Pose2) -> float:
@@ -139,11 +139,11 @@ class TextbookFilter:
 
     @property
     def _vector(self) -> Array:
-        return np.concatenate([self.posture, self.landmarks.ravel()])
+        return np.concatenate([self.pose_vector, self.landmarks.ravel()])
 
     @_vector.setter
     def _vector(self, vector: Array) -> None:
-        self.posture, self.landmarks = vector[:3], vector[3:].reshape(-1, 3)
+        self.pose_vector, self.landmarks = vector[:3], vector[3:].reshape(-1, 3)
 
     def _start(self, rays: Array) -> Array:
         """(n, 3, 3) covariance of landmarks at the start."""
@@ -163,9 +163,11 @@ class TextbookFilter:
         landmarks = (self._first if self.choice.first_estimates else self.landmarks)[seen]
         n, rows = len(landmarks), np.arange(2 * len(landmarks)).reshape(-1, 2)
         h = np.zeros((2 * n, len(self.covariance)))
-        h[:, :3] = jacobian(lambda p: self._slopes(p, landmarks), self.posture).reshape(2 * n, 3)
+        h[:, :3] = jacobian(lambda p: self._slopes(p, landmarks), self.pose_vector).reshape(2 * n, 3)
         index = 3 + 3 * np.flatnonzero(seen)[:, None] + np.arange(3)
-        h[rows[:, :, None], index[:, None, :]] = jacobian(lambda z: self._slopes(self.posture, z), landmarks)
+        h[rows[:, :, None], index[:, None, :]] = jacobian(
+            lambda z: self._slopes(self.pose_vector, z), landmarks
+        )
         return h
 
     def _innovate(self, seen: Mask, pixels: Array) -> tuple[Array, Array]:
@@ -173,7 +175,7 @@ class TextbookFilter:
         slopes = (pixels[seen] - self._centre) / self._focal
         h = self.measurement = self._measurement_jacobian(seen)
         spread = h @ self.covariance @ h.T + np.diag(np.tile(self._variances, len(slopes)))
-        return (slopes - self._slopes(self.posture, self.landmarks[seen])).ravel(), spread
+        return (slopes - self._slopes(self.pose_vector, self.landmarks[seen])).ravel(), spread
 
     def _update(self, seen: Mask, pixels: Array) -> None:
         """Correct by an image (Gauss-Newton on the posterior if iterated)."""
@@ -191,10 +193,10 @@ class TextbookFilter:
 
         The derivative of the position by the heading is the way from the reference turned by 90 degrees.
         """
-        posture = _moved(self.posture, at)
+        pose_vector = _moved(self.pose_vector, at)
         by_posture = np.eye(3)
-        by_posture[0, 2], by_posture[1, 2] = -(posture - reference)[1], (posture - reference)[0]
-        posture_by_input = jacobian(lambda u: _moved(self.posture, u), at)
+        by_posture[0, 2], by_posture[1, 2] = -(pose_vector - reference)[1], (pose_vector - reference)[0]
+        posture_by_input = jacobian(lambda u: _moved(self.pose_vector, u), at)
         landmarks, n = self._carried(self.landmarks, at), len(self.landmarks)
         by_landmark = jacobian(lambda z: self._carried(z, at), self.landmarks)
         landmarks_by_input = jacobian(lambda u: self._carried(self.landmarks, u), at)
@@ -206,7 +208,7 @@ class TextbookFilter:
         rest = self._by_input @ (measured - at)
         noise = self._by_input @ wheel_covariance(measured) @ self._by_input.T
         self.covariance = self.transition @ self.covariance @ self.transition.T + noise
-        self._vector = np.concatenate([posture, landmarks.ravel()]) + rest
+        self._vector = np.concatenate([pose_vector, landmarks.ravel()]) + rest
 
     def _carried(self, landmarks: Numbers, u: Numbers) -> Numbers:
         """Landmarks after a step."""
@@ -215,11 +217,11 @@ class TextbookFilter:
         vectors, there = self.choice.coordinates.lift(landmarks), _moved(np.zeros(3), u)
         return self.choice.coordinates.drop(from_posture(vectors, there, self._camera.mount_forward))
 
-    def _slopes(self, posture: Numbers, landmarks: Numbers) -> Numbers:
+    def _slopes(self, pose_vector: Numbers, landmarks: Numbers) -> Numbers:
         """(N, 2) where landmarks are expected, (pixel - principal point) / focal length."""
         vectors = self.choice.coordinates.lift(landmarks)
         if not self.choice.moving:
-            vectors = from_posture(vectors, posture, self._camera.mount_forward)
+            vectors = from_posture(vectors, pose_vector, self._camera.mount_forward)
         return np.asarray(vectors[:, :2] / vectors[:, 2:3])
 
 
@@ -230,7 +232,7 @@ def wheel_covariance(u: Array) -> Array:
     return np.asarray(by_wheels @ np.diag((WHEEL_NOISE * ways) ** 2 + _FLOOR**2) @ by_wheels.T)
 
 
-def _moved(posture: Numbers, u: Numbers) -> Numbers:
+def _moved(pose_vector: Numbers, u: Numbers) -> Numbers:
     """A posture after a step (u1, u2) of the wheels."""
-    middle = posture[2] + 0.5 * u[1]
-    return np.asarray(posture + np.stack([u[0] * np.cos(middle), u[0] * np.sin(middle), u[1]]))
+    middle = pose_vector[2] + 0.5 * u[1]
+    return np.asarray(pose_vector + np.stack([u[0] * np.cos(middle), u[0] * np.sin(middle), u[1]]))

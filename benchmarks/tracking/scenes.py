@@ -162,8 +162,8 @@ def room_drive(rng: np.random.Generator, frames: int) -> Drive:
     for before, pose in zip([start, *poses], poses, strict=False):
         rotation = np.eye(3)
         rotation[:2, :2] = pose.rotation
-        posture = np.array([pose.x, pose.y, 0.0]), rotation
-        images.append(imager.picture(scene, posture, 1.0, (pose.heading - before.heading) / TICK, TICK))
+        pose_vector = np.array([pose.x, pose.y, 0.0]), rotation
+        images.append(imager.picture(scene, pose_vector, 1.0, (pose.heading - before.heading) / TICK, TICK))
 
     def truth(pixels: Array) -> Array:
         points = surfaces.see(start, camera, pixels).points

@@ -74,7 +74,7 @@ class Postures(Mapping[NodeId, Placement]):
         number = self.number(node)
         if number is None:
             raise KeyError(node)
-        return Placement(number, self._graphs[number].posture(node))
+        return Placement(number, self._graphs[number].pose_gaussian(node))
 
     def __contains__(self, node: object) -> bool:
         """Whether a node is there."""

@@ -82,7 +82,7 @@ class PoseGraph:
         """Postures that were asked for: all at once where they are few, else one by one."""
         return self.postures() if len(self.nodes) <= FEW else {}
 
-    def posture(self, node: NodeId) -> PoseGaussian:
+    def pose_gaussian(self, node: NodeId) -> PoseGaussian:
         """A node's posture with its marginal covariance."""
         known = self._known
         if node not in known:

@@ -79,7 +79,7 @@ def test_the_textbook_filter_is_ours_where_it_chooses_the_same() -> None:
     for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
         ours.step(odometry, pixels)
     textbook = followed(run, Choice(Rays(), moving=True))
-    x = np.concatenate([textbook.posture, textbook.landmarks.ravel()])
+    x = np.concatenate([textbook.pose_vector, textbook.landmarks.ravel()])
     assert max(gap((x, textbook.covariance), ours.belief)) < 1e-7
 
 
@@ -94,10 +94,10 @@ def test_a_step_linearised_again_is_ours() -> None:
         ours.step(odometry, pixels)
         once.step(odometry, pixels)
     textbook = followed(run, Choice(Rays(), moving=True, relinearisations=1))
-    posture = ours.belief[0][:3]
-    off = np.abs(textbook.posture - posture).max()
+    pose_vector = ours.belief[0][:3]
+    off = np.abs(textbook.pose_vector - pose_vector).max()
     assert off < 5e-5
-    assert off < 0.2 * np.abs(once.belief[0][:3] - posture).max()
+    assert off < 0.2 * np.abs(once.belief[0][:3] - pose_vector).max()
 
 
 def test_first_estimates_learn_nothing_of_where_the_world_is() -> None:
@@ -131,7 +131,7 @@ def test_an_iterated_update_ends_where_the_posterior_does_not_slope() -> None:
     step = np.array([0.3, 0.1])
     prior, filter_ = (TextbookFilter(run, Choice(Rays(), moving=False, iterations=k)) for k in (1, 20))
     for each in (prior, filter_):
-        each._move(step, step, each.posture)
+        each._move(step, step, each.pose_vector)
         # Two wheels leave a third direction certain; a cost needs a prior that has an inverse.
         each.covariance[[0, 1, 2], [0, 1, 2]] += 1e-4
     seen = np.isfinite(run.pixels[1][:, 0])
@@ -142,7 +142,7 @@ def test_an_iterated_update_ends_where_the_posterior_does_not_slope() -> None:
         probe = TextbookFilter(run, prior.choice)
         probe._vector = x
         off = x - prior._vector
-        expected = probe._slopes(probe.posture, probe.landmarks[seen]) * 277.0 + (160.0, 120.0)
+        expected = probe._slopes(probe.pose_vector, probe.landmarks[seen]) * 277.0 + (160.0, 120.0)
         misfit = (run.pixels[1][seen] - expected) / run.pixel_sigma
         return float(0.5 * off @ information @ off + 0.5 * np.square(misfit).sum())
 

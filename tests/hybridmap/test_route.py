@@ -15,8 +15,8 @@ from synthetic.world import CAMERA
 
 
 def node(number: int, pose: Pose2, agent: str = "r0") -> Node:
-    posture = PoseGaussian.from_sigmas(pose, 0.01, 0.01)
-    return Node(NodeId(agent, 1, number), 0, posture, CAMERA, Landmarks.empty())
+    pose_vector = PoseGaussian.from_sigmas(pose, 0.01, 0.01)
+    return Node(NodeId(agent, 1, number), 0, pose_vector, CAMERA, Landmarks.empty())
 
 
 def edge(number: int, a: Node, b: Node, kind: EdgeKind = EdgeKind.MAPPED) -> Edge:

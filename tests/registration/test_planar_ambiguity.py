@@ -30,13 +30,13 @@ def poster(rng: np.random.Generator, size: float, depth: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("posture", [Pose2(0.2, 1.0, -0.4), Pose2(-1.0, -0.7, 0.1), Pose2(1.0, 0.0, 0.3)])
-def test_twice_mirrored_is_where_it_was(posture):
+def test_twice_mirrored_is_where_it_was(pose_vector):
     points = np.array([[3.0, -1.0], [3.1, 0.2], [3.3, 1.5]])
-    there = mirrored(posture, points)
+    there = mirrored(pose_vector, points)
     back = mirrored(there, points)
-    assert back.distance(posture) < 1e-12
-    assert back.heading == pytest.approx(posture.heading)
-    middle = [pose.inverse().apply(points.mean(axis=0)) for pose in (posture, there)]
+    assert back.distance(pose_vector) < 1e-12
+    assert back.heading == pytest.approx(pose_vector.heading)
+    middle = [pose.inverse().apply(points.mean(axis=0)) for pose in (pose_vector, there)]
     assert math.atan2(*middle[0][::-1]) == pytest.approx(math.atan2(*middle[1][::-1]))
     assert np.linalg.norm(middle[0]) == pytest.approx(np.linalg.norm(middle[1]))
 

@@ -46,9 +46,9 @@ def scene(n: int, rng: np.random.Generator, inverted: bool) -> tuple[Sightings, 
     return sightings, true
 
 
-def predict(stack: Stack, posture: np.ndarray, points: np.ndarray) -> np.ndarray:
+def predict(stack: Stack, pose_vector: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N, 3) u px, v px, depth m, as the camera's own projection has it."""
-    pose = Pose2.from_vector(posture)
+    pose = Pose2.from_vector(pose_vector)
     rows = []
     for inverted, point in zip(stack.inverted, points, strict=True):
         in_robot = (pose if inverted else pose.inverse()).apply(point[None])
@@ -70,11 +70,11 @@ def factors(linear: Linear) -> np.ndarray:
     return out
 
 
-def expected_ratios(sightings: Sightings, posture: np.ndarray) -> list[float]:
+def expected_ratios(sightings: Sightings, pose_vector: np.ndarray) -> list[float]:
     """By the densities of scipy, with derivatives by differences."""
     stack, ratios = stack_sightings([sightings]), []
-    mean = predict(stack, posture, stack.points)
-    by_point = derivative(lambda d: predict(stack, posture, stack.points + d), list(np.eye(3)))
+    mean = predict(stack, pose_vector, stack.points)
+    by_point = derivative(lambda d: predict(stack, pose_vector, stack.points + d), list(np.eye(3)))
     for k, pixel in enumerate(sightings.pixels):
         if mean[k, 2] <= 0.05:
             ratios.append(0.0)
@@ -103,8 +103,8 @@ def test_likelihoods_are_those_of_a_gaussian(seed: int, n: int) -> None:
         sightings, true = scene(n, rng, inverted)
         poses = true.vector + rng.normal(0, 0.05, (4, 3))
         found = sightings.log_ratios(poses)
-        for h, posture in enumerate(poses):
-            np.testing.assert_allclose(found[h], expected_ratios(sightings, posture), atol=1e-3)
+        for h, pose_vector in enumerate(poses):
+            np.testing.assert_allclose(found[h], expected_ratios(sightings, pose_vector), atol=1e-3)
 
 
 @settings(max_examples=15, deadline=None)
@@ -113,16 +113,16 @@ def test_linearised_against_finite_differences(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     (forward, true), (backward, _) = scene(n, rng, False), scene(n, rng, True)
     stack = stack_sightings([forward, backward])
-    posture = true.vector + rng.normal(0, 0.02, 3)
+    pose_vector = true.vector + rng.normal(0, 0.02, 3)
     points = stack.points + rng.normal(0, 0.01, stack.points.shape)
-    linear = linearise(stack, posture, points)
-    mean = predict(stack, posture, points)
+    linear = linearise(stack, pose_vector, points)
+    mean = predict(stack, pose_vector, points)
     seen = mean[:, 2] > 0.4
-    pose = Pose2.from_vector(posture)
+    pose = Pose2.from_vector(pose_vector)
     by_pose = derivative(
         lambda d: predict(stack, (pose @ Pose2.from_vector(d)).vector, points), list(np.eye(3))
     )
-    by_point = derivative(lambda d: predict(stack, posture, points + d), list(np.eye(3)))
+    by_point = derivative(lambda d: predict(stack, pose_vector, points + d), list(np.eye(3)))
     residuals = stack.observed - mean
     for part in (residuals, by_pose, by_point):
         part[~seen] = 0.0  # behind the camera there is nothing to compare, and too near it differences err

@@ -190,7 +190,7 @@ def test_robot_stays_level(bare: World) -> None:
         for command in [Command(0.3), Command(-0.3), Command(0.0, 0.8), Command(0.3, -0.8), Command()]:
             for _ in range(15):
                 simulation.advance({"r0": command})
-                position, rotation = body.posture()
+                position, rotation = body.position_and_rotation()
                 worst = max(worst, math.acos(min(1.0, rotation[2, 2])))
                 assert abs(position[2]) < 1e-3
         assert math.degrees(worst) < 0.15

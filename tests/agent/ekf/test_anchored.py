@@ -27,12 +27,12 @@ def derivative(function, at: np.ndarray, h: float = 1e-6) -> np.ndarray:  # type
 
 
 @given(postures, mounts, seeds)
-def test_sees_what_the_camera_projects(posture: np.ndarray, mount: float, seed: int) -> None:
+def test_sees_what_the_camera_projects(pose_vector: np.ndarray, mount: float, seed: int) -> None:
     camera = Camera(320, 240, 277.0, 250.0, 160.0, 120.0, 0.3, mount)
     points = some_points(seed)
     rays, _ = rays_of_points(points, mount, 0.3)
-    sight = see(posture, rays, mount)
-    in_robot = Pose2.from_vector(posture).inverse().apply(points)
+    sight = see(pose_vector, rays, mount)
+    in_robot = Pose2.from_vector(pose_vector).inverse().apply(points)
     depth = in_robot[:, 0] - mount
     pixels = np.array([160.0, 120.0]) + np.array([277.0, 250.0]) * sight.rays[:, :2]
     ahead = depth > 0.05
@@ -42,14 +42,14 @@ def test_sees_what_the_camera_projects(posture: np.ndarray, mount: float, seed: 
 
 
 @given(postures, mounts, seeds)
-def test_jacobians_of_sight(posture: np.ndarray, mount: float, seed: int) -> None:
+def test_jacobians_of_sight(pose_vector: np.ndarray, mount: float, seed: int) -> None:
     rays, _ = rays_of_points(some_points(seed), mount, 0.3)
-    sight = see(posture, rays, mount)
+    sight = see(pose_vector, rays, mount)
     clear = sight.scale > 0.1
-    by_posture = derivative(lambda p: see(p, rays, mount).rays, posture)
+    by_posture = derivative(lambda p: see(p, rays, mount).rays, pose_vector)
     np.testing.assert_allclose(sight.by_posture[clear], by_posture[clear], rtol=1e-4, atol=1e-6)
     for i in np.flatnonzero(clear):
-        by_ray = derivative(lambda r: see(posture, r[None], mount).rays[0], rays[i])
+        by_ray = derivative(lambda r: see(pose_vector, r[None], mount).rays[0], rays[i])
         np.testing.assert_allclose(sight.by_ray[i], by_ray, rtol=1e-4, atol=1e-6)
 
 

@@ -80,8 +80,8 @@ def test_a_step_is_linearised_where_it_is_asked(
     at = Odometry(forward, turn)
     measured = Odometry(forward + rng.normal(0, 0.02), turn + rng.normal(0, 0.05)) if elsewhere else at
     wheel_root, side_slip, variances = rng.normal(size=(2, 2)) * 0.01, 0.003, rng.random(3)
-    taken = Step(state, measured, wheel_root, side_slip, variances, mount, at, state.posture, state.rays)
-    posture, by_posture, posture_by_input = move_posture(state.posture, at)
+    taken = Step(state, measured, wheel_root, side_slip, variances, mount, at, state.pose_vector, state.rays)
+    pose_vector, by_posture, posture_by_input = move_posture(state.pose_vector, at)
     moved = move_rays(state.rays, at, mount)
     if moved.scale.min() < 0.05:
         return
@@ -94,9 +94,9 @@ def test_a_step_is_linearised_where_it_is_asked(
     covariance += by_input @ dense_inputs(wheel_root, side_slip) @ by_input.T
     covariance[:3, :3] += np.diag(variances)
     further = np.array([measured.forward - forward, measured.turn - turn])
-    mean = np.concatenate([posture, moved.rays.ravel()]) + by_input[:, :2] @ further
+    mean = np.concatenate([pose_vector, moved.rays.ravel()]) + by_input[:, :2] @ further
     after = taken.state
-    np.testing.assert_allclose(np.concatenate([after.posture, after.rays.ravel()]), mean, atol=1e-9)
+    np.testing.assert_allclose(np.concatenate([after.pose_vector, after.rays.ravel()]), mean, atol=1e-9)
     close(after.covariance, covariance, covariance)
 
 
@@ -128,7 +128,7 @@ def test_update_is_the_textbook_one(size: tuple[int, int]) -> None:
     np.testing.assert_allclose(whitening.T @ whitening, information, atol=1e-9)
     got, squares = state.corrected(slots, residual, whitening)
     assert np.array_equal(got.covariance, got.covariance.T)
-    np.testing.assert_allclose(got.posture, state.posture + (gain @ r)[:3], atol=1e-9)
+    np.testing.assert_allclose(got.pose_vector, state.pose_vector + (gain @ r)[:3], atol=1e-9)
     np.testing.assert_allclose(got.rays.ravel(), state.rays.ravel() + (gain @ r)[3:], atol=1e-9)
     close(got.covariance, after, covariance)
     assert squares == pytest.approx(r @ information @ r)
@@ -245,7 +245,7 @@ def test_a_first_look_turns_the_step_as_the_image_votes(size: tuple[int, int]) -
     slots, root = some_slots(rng, n), rng.normal(size=(2, 2)) * 0.01
     measured, variances = Odometry(0.05, 0.02), rng.uniform(0.2, 2.0, 2)
     expected = move_rays(state.rays, measured, 0.1).rays
-    step = Step(state, measured, root, 0.003, rng.random(3), 0.1, measured, state.posture, expected)
+    step = Step(state, measured, root, 0.003, rng.random(3), 0.1, measured, state.pose_vector, expected)
     slopes = expected[slots, :2] + rng.normal(0, 0.01, (len(slots), 2))
     vote = turn_by_image(expected, slots, slopes, root, 4.0)
     after, examined = step.glanced(slots, slopes, variances, 4.0)

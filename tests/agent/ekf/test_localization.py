@@ -149,7 +149,7 @@ def test_handing_over_to_another_node_is_the_unscented_truth() -> None:
     world.drive(filter_, 40)
     edge = PoseGaussian(Pose2(-0.4, 0.2, 0.3), np.diag([0.02, 0.01, 0.02]) ** 2)
     state = filter_.state
-    mean = np.concatenate([state.posture, state.rays.ravel()])
+    mean = np.concatenate([state.pose_vector, state.rays.ravel()])
     rng = np.random.default_rng(0)
     samples = rng.multivariate_normal(mean, state.covariance, 6000)
     edges = rng.multivariate_normal(np.zeros(3), edge.covariance, 6000)
@@ -169,7 +169,7 @@ def test_handing_over_to_another_node_is_the_unscented_truth() -> None:
     np.testing.assert_allclose(
         got.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.08
     )
-    centre = np.concatenate([got.posture, got.rays.ravel()])
+    centre = np.concatenate([got.pose_vector, got.rays.ravel()])
     np.testing.assert_allclose((centre - np.mean(moved, axis=0)) / scale, 0.0, atol=0.1)
 
 
@@ -182,7 +182,7 @@ def test_handing_over_there_and_back() -> None:
     filter_.rebase(edge.inverse())
     np.testing.assert_allclose(filter_.state.covariance, before.covariance, atol=1e-10)
     np.testing.assert_allclose(filter_.state.rays, before.rays, atol=1e-10)
-    np.testing.assert_allclose(filter_.state.posture, before.posture, atol=1e-10)
+    np.testing.assert_allclose(filter_.state.pose_vector, before.pose_vector, atol=1e-10)
 
 
 def test_seeing_nothing_grows_the_covariance_and_ends_health() -> None:

@@ -47,7 +47,7 @@ def test_prediction_is_the_dense_form(camera: Camera) -> None:
     before, step = filter_.state, Odometry(0.03, -0.05)
     filter_.predict(step)
     n = len(before.rays)
-    posture, by_posture, posture_by = move_posture(before.posture, step)
+    pose_vector, by_posture, posture_by = move_posture(before.pose_vector, step)
     moved = move_rays(before.rays, step, camera.mount_forward)
     a = np.zeros((3 + 3 * n, 3 + 3 * n))
     a[:3, :3] = by_posture
@@ -57,7 +57,7 @@ def test_prediction_is_the_dense_form(camera: Camera) -> None:
     root = WheelNoise(AXLE, WHEEL_NOISE).root(step)
     dense = a @ before.covariance @ a.T + b @ root @ root.T @ b.T
     np.testing.assert_allclose(filter_.state.covariance, dense, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(filter_.state.posture, posture)
+    np.testing.assert_allclose(filter_.state.pose_vector, pose_vector)
 
 
 def test_slip_aside_moves_robot_and_landmarks_alike() -> None:
@@ -73,9 +73,9 @@ def test_slip_aside_moves_robot_and_landmarks_alike() -> None:
     rng = np.random.default_rng(0)
     samples = []
     for aside in sigma * rng.normal(size=4000):
-        posture, _, _ = move_posture(before.posture, step, aside)
+        pose_vector, _, _ = move_posture(before.pose_vector, step, aside)
         rays = move_rays(before.rays, step, CAMERA.mount_forward, aside).rays
-        samples.append(np.concatenate([posture, rays.ravel()]))
+        samples.append(np.concatenate([pose_vector, rays.ravel()]))
     np.testing.assert_allclose(more, np.cov(np.array(samples).T), atol=0.06 * np.abs(more).max())
 
 
@@ -98,8 +98,8 @@ def test_update_is_the_textbook_kalman_update() -> None:
     gain = before.covariance @ h.T @ np.linalg.inv(s)
     joseph = np.eye(len(gain)) - gain @ h
     covariance = joseph @ before.covariance @ joseph.T + run.pixel_sigma**2 * gain @ gain.T
-    mean = np.concatenate([before.posture, before.rays.ravel()]) + gain @ z
-    got = np.concatenate([filter_.state.posture, filter_.state.rays.ravel()])
+    mean = np.concatenate([before.pose_vector, before.rays.ravel()]) + gain @ z
+    got = np.concatenate([filter_.state.pose_vector, filter_.state.rays.ravel()])
     np.testing.assert_allclose(got, mean, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(filter_.state.covariance, covariance, rtol=1e-6, atol=1e-12)
     assert report.mean_nis == pytest.approx(z @ np.linalg.solve(s, z) / 60)
@@ -114,7 +114,7 @@ def test_there_and_back_is_where_it_was(camera: Camera) -> None:
     before = filter_.state
     for step in (Odometry(0.2, 0.3), Odometry(-0.2, -0.3)):
         filter_.predict(step)
-    np.testing.assert_allclose(filter_.state.posture, before.posture, atol=1e-12)
+    np.testing.assert_allclose(filter_.state.pose_vector, before.pose_vector, atol=1e-12)
     np.testing.assert_allclose(filter_.state.rays, before.rays, atol=1e-12)
     np.testing.assert_allclose(filter_.state.covariance, before.covariance, atol=1e-10)
 
@@ -145,7 +145,7 @@ def test_pose_covariance_is_perturbed_on_the_right() -> None:
     drive(filter_, run)
     additive = filter_.state.covariance[:3, :3]
     rng = np.random.default_rng(0)
-    samples = rng.multivariate_normal(filter_.state.posture, additive, 4000)
+    samples = rng.multivariate_normal(filter_.state.pose_vector, additive, 4000)
     mean = filter_.pose.mean.inverse()
     right = np.array([(mean @ Pose2.from_vector(s)).vector for s in samples])
     expected = filter_.pose.covariance

@@ -70,14 +70,16 @@ def test_jacobians_of_rays(step: Odometry, mount: float, seed: int) -> None:
 
 @given(steps, st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3))
 def test_posture_moves_by_composition_and_its_jacobians(step: Odometry, x: float, y: float, h: float) -> None:
-    posture = np.array([x, y, h])
-    after, by_posture, by_input = move_posture(posture, step)
-    expected = Pose2.from_vector(posture) @ step.motion()
+    pose_vector = np.array([x, y, h])
+    after, by_posture, by_input = move_posture(pose_vector, step)
+    expected = Pose2.from_vector(pose_vector) @ step.motion()
     np.testing.assert_allclose(after[:2], expected.vector[:2], atol=1e-12)
     assert abs(np.sin(after[2] - expected.heading)) < 1e-12
-    np.testing.assert_allclose(by_posture, derivative(lambda p: move_posture(p, step)[0], posture), atol=1e-8)
+    np.testing.assert_allclose(
+        by_posture, derivative(lambda p: move_posture(p, step)[0], pose_vector), atol=1e-8
+    )
     u = np.array([step.forward, step.turn, 0.0])
-    numeric = derivative(lambda v: move_posture(posture, Odometry(v[0], v[1]), v[2])[0], u)
+    numeric = derivative(lambda v: move_posture(pose_vector, Odometry(v[0], v[1]), v[2])[0], u)
     np.testing.assert_allclose(by_input, numeric, atol=1e-8)
 
 

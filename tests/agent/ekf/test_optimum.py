@@ -43,8 +43,8 @@ def everything(run: MappingRun) -> np.ndarray:
 def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     ratios = []
     for run, filter_ in runs[:6]:
-        posture, points = batch_optimum(run, filter_.settings.prior_depth, filter_.settings.prior_spread)
-        best = error(run, filter_.ids, posture, points[filter_.ids])
+        pose_vector, points = batch_optimum(run, filter_.settings.prior_depth, filter_.settings.prior_spread)
+        best = error(run, filter_.ids, pose_vector, points[filter_.ids])
         ratios.append(filter_error(run, filter_, everything(run)) / best)
     assert np.median(ratios) < 1.06
     assert max(ratios) < 1.25

@@ -23,14 +23,14 @@ postures = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3.1, 3.1))
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(posture=postures, seed=st.integers(0, 10_000), forward=st.sampled_from([0.0, 0.1]))
+@given(pose_vector=postures, seed=st.integers(0, 10_000), forward=st.sampled_from([0.0, 0.1]))
 def test_slack_says_how_many_landmarks_the_camera_sees(
-    posture: tuple[float, float, float], seed: int, forward: float, robot: RobotDescription, seen: Seen
+    pose_vector: tuple[float, float, float], seed: int, forward: float, robot: RobotDescription, seen: Seen
 ) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform([-1, -2, -0.5], [4, 2, 1.5], (10, 3))
     camera = replace(robot.camera, mount_forward=forward)
-    pose = Pose2(*posture)
+    pose = Pose2(*pose_vector)
     count = int(seen(camera, pose, points).sum())
     for least in (1, 4, 7):
         slack = float(Field(points, camera, least).slack(pose.vector))
@@ -39,15 +39,15 @@ def test_slack_says_how_many_landmarks_the_camera_sees(
     assert abs(Field(points, camera).visible(pose) - count) == 0
 
 
-@given(posture=postures, turn=st.floats(-0.3, 0.3))
+@given(pose_vector=postures, turn=st.floats(-0.3, 0.3))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_slack_changes_no_faster_than_the_heading(
-    posture: tuple[float, float, float], turn: float, robot: RobotDescription
+    pose_vector: tuple[float, float, float], turn: float, robot: RobotDescription
 ) -> None:
     points = np.random.default_rng(1).uniform([1, -2, 0], [5, 2, 0.5], (8, 3))
     field = Field(points, robot.camera)
-    turned = np.array([posture[0], posture[1], posture[2] + turn])
-    difference = field.slack(turned) - field.slack(np.array(posture))
+    turned = np.array([pose_vector[0], pose_vector[1], pose_vector[2] + turn])
+    difference = field.slack(turned) - field.slack(np.array(pose_vector))
     assert abs(float(difference)) <= abs(turn) + 1e-9
 
 

@@ -89,8 +89,8 @@ class Staged:
             NodePut(Node(n, stamp, PoseGaussian.from_sigmas(p, 0.1, 0.1), CAMERA, Landmarks.empty()))
             for n, (_, p, stamp) in self.nodes.items()
         ] + [EdgePut(edge) for edge in self.edges]
-        postures = {n: (c, PoseGaussian.from_sigmas(p, 0.1, 0.1)) for n, (c, p, _) in self.nodes.items()}
-        merged = MapFile("merged", "a merged map", tuple(changes), postures)
+        placements = {n: (c, PoseGaussian.from_sigmas(p, 0.1, 0.1)) for n, (c, p, _) in self.nodes.items()}
+        merged = MapFile("merged", "a merged map", tuple(changes), placements)
         return Recording(
             "staged", seed, robots, PLAN, merged, tuple(self.lost), tuple(self.moments), (), sim_s, wall_s,
             {"render": 4.0, "physics": 2.0},
