@@ -23,7 +23,7 @@ ifeq ($(EXTRA),dev)
 	  "or more; with python3.11 on x86-64 it takes seconds, and make EXTRA=test does without the simulator"
 endif
 	@$(PIP) -e '.[$(EXTRA)]'
-	@$(BIN)/python -c 'import agent.runner; from hybridmap import jit; jit.load()'  # compiles once, not while a robot waits
+	@$(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridmap import jit; jit.load()'  # compiles once, not while a robot waits
 	@touch $(STAMP)
 
 demo: setup

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer, View
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer, View
 
 
 @dataclass(frozen=True)

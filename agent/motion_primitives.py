@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
-from agent.mission import Answer, Question
-from agent.observation import Command, Observation, RobotDescription
-from agent.room import room
-from hybridmap.pose import Pose2
+from mapweave.agent.clearance import clearance
+from mapweave.agent.mission import Answer, Question
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.hybridmap.pose import Pose2
 
 Behaviour = Generator[Command, None, None]
 NO_ANSWER = "nobody answered: is the map server up?"
@@ -122,7 +122,7 @@ class MotionPrimitives:
 
     def room(self, direction: float) -> float:
         """How far the robot may move in a direction (rad, 0 ahead), m; 0 where no ranger looks."""
-        return room(self._description, self.observation.proximity, direction, 0.0)
+        return clearance(self._description, self.observation.proximity, direction, 0.0)
 
     def freest(self, most: float = math.inf) -> tuple[float, float]:
         """Room and direction (m, rad) where there is most; from `most` m on, one is as good as another."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2
-from hybridmap.ranges import Ranges
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.ranges import Ranges
 
 
 @dataclass(frozen=True, slots=True)

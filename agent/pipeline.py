@@ -14,30 +14,30 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from agent.exploring.exploration import ExplorerSettings
-from agent.exploring.explorer import Explorer
-from agent.exploring.passenger import Passenger, PassengerSettings
-from agent.exploring.wanderer import Wanderer
-from agent.floor import Floor, FloorSettings
-from agent.global_localization.resumption import Resumption
-from agent.global_localization.settings import ResumptionSettings
-from agent.mapping.mapper import Mapper, MapperSettings
-from agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
-from agent.navigating.navigator import Navigator, NavigatorSettings
-from agent.observation import Command, Observation, RobotDescription
-from agent.ranger_monitor import RangerMonitor
-from agent.servo.proximity import guard
-from agent.tally import Tally
-from hybridmap import jit
-from hybridmap.change import ChangeBody
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.agent.drive_statistics import DriveStatistics
+from mapweave.agent.exploration.carried_mapping import CarriedMapping, CarriedMappingSettings
+from mapweave.agent.exploration.explorer import Explorer
+from mapweave.agent.exploration.random_exploration import RandomExploration
+from mapweave.agent.exploration.settings import ExplorerSettings
+from mapweave.agent.global_localization.resumption import Resumption
+from mapweave.agent.global_localization.settings import ResumptionSettings
+from mapweave.agent.mapping.mapper import Mapper, MapperSettings
+from mapweave.agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
+from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.occupancy_grid import OccupancyGrid, OccupancyGridSettings
+from mapweave.agent.ranger_monitor import RangerMonitor
+from mapweave.agent.servo.proximity import guard
+from mapweave.hybridmap import jit
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 IDENTITY = Pose2()
-NOTHING_DRIVEN = Tally()
+NOTHING_DRIVEN = DriveStatistics()
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class PipelineSettings:
 
     mapper: MapperSettings = field(default_factory=MapperSettings)
     explorer: ExplorerSettings = field(default_factory=ExplorerSettings)
-    passenger: PassengerSettings = field(default_factory=PassengerSettings)
+    passenger: CarriedMappingSettings = field(default_factory=CarriedMappingSettings)
     navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
     resumption: ResumptionSettings = field(default_factory=ResumptionSettings)
-    floor: FloorSettings = field(default_factory=FloorSettings)
+    floor: OccupancyGridSettings = field(default_factory=OccupancyGridSettings)
     seed: int = 0
 
 
@@ -66,7 +66,7 @@ class Status:
         finished: whether the mission is complete.
         mission: its name.
         fix_node: the node that the robot knows itself by while navigating.
-        node_from_robot: posture in that node's frame.
+        node_from_robot: pose in that node's frame.
         legs: nodes on the first route of the drive, beginning and goal included.
         lost: whether it has given up to find itself on its own map: a fresh map must be begun.
         astray: whether it looks for a place of its own map; `map_from_robot` then means nothing.
@@ -85,7 +85,7 @@ class Status:
     legs: int = 0
     lost: bool = False
     astray: bool = False
-    tally: Tally = NOTHING_DRIVEN
+    tally: DriveStatistics = NOTHING_DRIVEN
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,11 @@ class Pipeline:
         self._lens = lens
         self._sift = Sift(lens, self._settings.mapper.sift)
         self._mapper = Mapper(map_id, description, self._settings.mapper, contents, next_number)
-        self._floor = Floor(description, self._settings.floor)
+        self._floor = OccupancyGrid(description, self._settings.floor)
         self._rangers = RangerMonitor(description)
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
-        self._passenger: Passenger | None = None
+        self._passenger: CarriedMapping | None = None
         self._navigator: Navigator | None = None
         self._resumption: Resumption | None = None
         self._direction = 1.0
@@ -175,7 +175,7 @@ class Pipeline:
             case Explore() if self._explorer is None:
                 self._explorer = self._new_explorer()
             case Carried() if self._passenger is None:
-                self._passenger = Passenger(self._mapper, self._settings.passenger)
+                self._passenger = CarriedMapping(self._mapper, self._settings.passenger)
             case GoTo(goal):
                 self._mapper.lose()
                 self._restart()
@@ -218,7 +218,7 @@ class Pipeline:
 
     def _new_explorer(self) -> Explorer:
         settings, parts = self._settings, (self._map_id, self._description, self._mapper, self._floor)
-        kind = Wanderer if settings.explorer.wander else Explorer
+        kind = RandomExploration if settings.explorer.wander else Explorer
         return kind(*parts, settings.explorer, settings.seed)
 
     def _keep_up(self, observation: Observation) -> None:
@@ -265,7 +265,7 @@ class Pipeline:
                 self._explorer.restart()
             return
         # The map may begin anywhere, and all that was found out on the way to it is void.
-        self._floor = Floor(self._description, self._settings.floor)
+        self._floor = OccupancyGrid(self._description, self._settings.floor)
         if self._explorer is not None:
             self._explorer = self._new_explorer()
 

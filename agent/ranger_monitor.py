@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.observation import RobotDescription
-from hybridmap.pose import Array
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.pose import Array
 
 
 class RangerMonitor:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from agent.drivers.robot import Robot
-from agent.fleet import FleetLink
-from agent.mission import Answer, Question
-from agent.observation import Observation
-from agent.pipeline import Pipeline, Step
-from agent.sharing.replication import Replicator
-from agent.synchronization import FreeRunning, Synchronization
+from mapweave.agent.drivers.robot import Robot
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission import Answer, Question
+from mapweave.agent.observation import Observation
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.agent.synchronization import FreeRunning, Synchronization
 
 REPORT_EVERY = 5
 """Ticks between two status reports."""
@@ -23,7 +23,7 @@ class Runner:
     def __init__(
         self,
         pipeline: Pipeline,
-        fleet: FleetLink,
+        fleet: FleetClient,
         replicator: Replicator,
         synchronization: Synchronization | None = None,
         on_step: Callable[[Step], None] = lambda step: None,

@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable
 from typing import Protocol
 
-from agent.fleet import FleetLink
-from agent.mission import Answer
-from agent.sharing.replication import Replicator
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission import Answer
+from mapweave.agent.replication.replicator import Replicator
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ class Synchronization(Protocol):
         """After which a question counts as unanswered, s."""
         ...
 
-    def changes_submitted(self, replicator: Replicator, fleet: FleetLink) -> None:
+    def changes_submitted(self, replicator: Replicator, fleet: FleetClient) -> None:
         """Called when a tick has handed over changes of the map."""
         ...
 
@@ -38,7 +38,7 @@ class Synchronization(Protocol):
         """Called before questions are sent."""
         ...
 
-    def answers(self, fleet: FleetLink) -> tuple[Answer, ...]:
+    def answers(self, fleet: FleetClient) -> tuple[Answer, ...]:
         """Answers to the questions that were just sent, as far as the loop waits for them."""
         ...
 
@@ -48,13 +48,13 @@ class FreeRunning:
 
     answer_timeout = ANSWER_TIMEOUT
 
-    def changes_submitted(self, replicator: Replicator, fleet: FleetLink) -> None:
+    def changes_submitted(self, replicator: Replicator, fleet: FleetClient) -> None:
         """Nothing: the replicator works beside the loop."""
 
     def before_questions(self) -> None:
         """Nothing."""
 
-    def answers(self, fleet: FleetLink) -> tuple[Answer, ...]:
+    def answers(self, fleet: FleetClient) -> tuple[Answer, ...]:
         """None: they come with a later tick."""
         return ()
 
@@ -72,7 +72,7 @@ class Lockstep:
         """
         self._rendezvous = rendezvous
 
-    def changes_submitted(self, replicator: Replicator, fleet: FleetLink) -> None:
+    def changes_submitted(self, replicator: Replicator, fleet: FleetClient) -> None:
         """Wait until the robot's disk, and a server that is in reach, have the changes."""
         saved = replicator.flush(LOCKSTEP_PATIENCE)
         if saved and fleet.server_in_reach():
@@ -88,6 +88,6 @@ class Lockstep:
         """Wait until every other robot has finished the tick: the server then has all that it will have."""
         self._rendezvous()
 
-    def answers(self, fleet: FleetLink) -> tuple[Answer, ...]:
+    def answers(self, fleet: FleetClient) -> tuple[Answer, ...]:
         """Wait for every answer."""
         return fleet.answers(wait=True)

@@ -17,17 +17,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from merge.belief.consistency import ConsistencySettings, sort_links
-from merge.belief.witnesses import FalseWitnesses
-from merge.graph.component import solve_graph
-from merge.graph.factors import Measurement
-from merge.graph.fragments import Fragment
-from merge.graph.links import Link
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, sort_links
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link
 
 A, B, FALSE, TRUE = "#1f4e79", "#8a4b08", "#c0392b", "#1e8449"
-HEARD = FalseWitnesses(40.0, np.array([30.0, 8.0, 4.0, 2.0]))
+HEARD = ChanceSupport(40.0, np.array([30.0, 8.0, 4.0, 2.0]))
 """What all other pairs of maps have shown: 40 places that look alike and are the same, 44 that are not. Of
 these 30 bring one link, 8 two, 4 three and 2 four."""
 STEP = PoseGaussian(Pose2(0.8, 0.0, 0.0), np.diag([0.02**2, 0.02**2, 0.01**2]))

@@ -2,7 +2,7 @@
 
 import gymnasium
 
-env = gymnasium.make("sim.gym:mapweave/Park-v0", seconds=10.0)
+env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0", seconds=10.0)
 for seed in range(3):
     observation, info = env.reset(seed=seed)
     env.action_space.seed(seed)

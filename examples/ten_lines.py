@@ -1,8 +1,8 @@
 """The simulator as a library: a world, a robot, steps, observations."""
 
-from agent.observation import Command
-from sim.simulation import Simulation
-from sim.worlds.catalog import make_world
+from mapweave.agent.observation import Command
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.worlds.catalog import make_world
 
 with Simulation(make_world("office", 7), ["robot"], seed=7) as simulation:
     for _ in range(50):

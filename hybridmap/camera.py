@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class Camera:
 
     Frames: robot is x forward, y left, z up with its origin on the floor below the middle of the axle;
     camera is x right, y down, z forward. Pixels are undistorted: lens distortion is removed where images
-    enter (agent.vision) and is unknown from there on.
+    enter (mapweave.agent.vision) and is unknown from there on.
 
     Attributes:
         width: image width, px.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybridmap.node import Edge, EdgeId, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeId, MapId, Node, NodeId
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 A descriptor is made RootSIFT (Arandjelovic and Zisserman, CVPR 2012: divide by the L1 norm, take square
 roots, so that Euclidean distance compares histograms by the Hellinger kernel), centred, projected on 32 fixed
 axes that tell features apart (benchmarks.train_descriptor), and each coordinate is rounded to a whole number
-of steps, the same step for all. With a coder that spends bits by frequency (wire.landmark_codec) that is
-within a quarter of a bit a coordinate of the best that any rounding can do (Gish and Pierce 1968).
+of steps, the same step for all. With a coder that spends bits by frequency (mapweave.wire.landmark_codec)
+that is within a quarter of a bit a coordinate of the best that any rounding can do (Gish and Pierce 1968).
 """
 
 from __future__ import annotations
@@ -14,9 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue
-from hybridmap.landmark_tables import DIMENSIONS, SIFT_DIMENSIONS, SYMBOLS, LandmarkTables, landmark_tables
-from hybridmap.node import CODE_BYTES
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.landmark_tables import (
+    DIMENSIONS,
+    SIFT_DIMENSIONS,
+    SYMBOLS,
+    LandmarkTables,
+    landmark_tables,
+)
+from mapweave.hybridmap.node import CODE_BYTES
 
 ZERO = SYMBOLS // 2
 """The symbol of a coordinate of zero steps."""

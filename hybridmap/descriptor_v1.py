@@ -12,8 +12,8 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.descriptor import quantise
-from hybridmap.landmark_tables import landmark_tables
+from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.landmark_tables import landmark_tables
 
 CODE_BYTES_V1 = 16
 FILE_V1 = "descriptor_v1.npz"

@@ -8,9 +8,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.node import MapId, Node, NodeId
-from hybridmap.pose import Array, PoseGaussian
-from hybridmap.ruling import Ruling
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, PoseGaussian
 
 
 class Standing(StrEnum):
@@ -73,12 +73,12 @@ class PairExplanation:
         standing: what has become of them.
         reason: in words.
         matches: (M, 2) int64, landmarks of a and of b that look alike, each the other's best.
-        shared: (K, 2) int64, of these, those that agree on one posture.
-        residuals_px: (K,) px, how far these are from where the posture predicts them (NaN: behind the image).
-        a_from_b: the posture that the landmarks give; None if they agree on none.
-        evidence: numbers of registration.recognition, empty without a posture.
-        probability: that the link is right, see merge.belief.credence; None without a posture, or where
-            nothing joins the two.
+        shared: (K, 2) int64, of these, those that agree on one pose.
+        residuals_px: (K,) px, how far these are from where the pose predicts them (NaN: behind the image).
+        a_from_b: the pose that the landmarks give; None if they agree on none.
+        evidence: numbers of mapweave.registration.recognition, empty without a pose.
+        probability: that the link is right, see mapweave.merge.outlier_rejection.link_probability; None
+            without a pose, or where nothing joins the two.
         misfit: against the merged map; None if nothing joins the two.
         witnesses: other links between the same two pieces of map.
         claims: what the robots themselves say of the two by their edges, whether the servo could drive them,
@@ -99,7 +99,7 @@ class PairExplanation:
     misfit: Misfit | None = None
     witnesses: tuple[Witness, ...] = ()
     claims: tuple[str, ...] = ()
-    rulings: tuple[Ruling, ...] = ()
+    rulings: tuple[ManualConstraint, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class NearMiss:
         a: node of the first map.
         b: node of the second.
         matches: landmarks that look alike.
-        inliers: of these, those that agree on the best posture.
+        inliers: of these, those that agree on the best pose.
         lacks: what it lacks, in words; of a link that stands, whether routes may use it.
     """
 
@@ -133,7 +133,7 @@ class MapsExplanation:
         links: between the two.
         landmarks: behind these.
         refused: links that were found and refused.
-        unverified: pairs that looked alike and showed no common posture.
+        unverified: pairs that looked alike and showed no common pose.
         nearest: pairs that came nearest to a link, best first; of links that were refused, then of others. Of
             two maps that are one the links with the fewest landmarks behind them, weakest first.
         rulings: what people have ruled about the two maps, in order.
@@ -148,7 +148,7 @@ class MapsExplanation:
     refused: int
     unverified: int
     nearest: tuple[NearMiss, ...] = ()
-    rulings: tuple[Ruling, ...] = ()
+    rulings: tuple[ManualConstraint, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +158,8 @@ class Hop:
     Attributes:
         a: from here.
         b: to there.
-        kind: of the edge, see hybridmap.node.EdgeKind; `near` if the two stand in one place, `superseded` if
-            one stands for the other.
+        kind: of the edge, see mapweave.hybridmap.node.EdgeKind; `near` if the two stand in one place,
+            `superseded` if one stands for the other.
         distance: m, between the two.
         turn: rad, between their headings, signed.
         cost: what it adds to the cost of a route, m.

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 
 import networkx as nx
 
-from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.node import Edge, EdgeId, Node, NodeId
-from hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.node import Edge, EdgeId, Node, NodeId
+from mapweave.hybridmap.pose import PoseGaussian
 
 
 class HybridMap:
@@ -65,7 +65,7 @@ class HybridMap:
         return sorted(nx.connected_components(present), key=len, reverse=True)
 
     def edge_between(self, start: NodeId, end: NodeId) -> PoseGaussian | None:
-        """Posture `start_from_end` by the most certain edge between two nodes, or None without an edge."""
+        """Pose `start_from_end` by the most certain edge between two nodes, or None without an edge."""
         best: PoseGaussian | None = None
         for edge_id in self.graph.get_edge_data(start, end) or ():
             edge = self.edges[edge_id]

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidFile
-from hybridmap.node import CODE_BYTES
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import CODE_BYTES
 
 SIFT_DIMENSIONS = 128
 DIMENSIONS = CODE_BYTES
@@ -40,7 +40,7 @@ class LandmarkTables:
         basis: (128, 32) float32, the axes on which descriptors are projected.
         step: of the grid on which each coordinate is rounded.
         codes: (32, 64) int64, frequencies of the symbols of each coordinate.
-        shares: (64,) int64, likewise of a depth's uncertainty, see hybridmap.grid.
+        shares: (64,) int64, likewise of a depth's uncertainty, see mapweave.hybridmap.quantization.
         cells: (64,) int64, likewise of a depth.
     """
 

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, PoseGaussian
-from hybridmap.ranges import Ranges
-from hybridmap.wake import Wake
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 
 CODE_BYTES = 32
-"""Length of a compact descriptor in memory, a byte for each coordinate (hybridmap.descriptor)."""
+"""Length of a compact descriptor in memory, a byte for each coordinate (mapweave.hybridmap.descriptor)."""
 
 UNMEASURED_SCALE = 0.2
 """Where no depth is known better than by this share, the scale is what is not known. Mapping keeps no depth
@@ -189,12 +189,12 @@ class Landmarks:
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A place: the robot's posture when it took an image, and what it saw.
+    """A place: the robot's pose when it took an image, and what it saw.
 
     Attributes:
         id: never reused.
         stamp_ns: when the image was taken.
-        map_from_robot: posture in the agent's own map frame.
+        map_from_robot: pose in the agent's own map frame.
         camera: intrinsics and mount of the camera that took the image.
         landmarks: what is in the image.
         clock: what `stamp_ns` was read from. Times of two robots can be compared only if it is the same;
@@ -213,7 +213,7 @@ class Node:
     clock: str = ""
     radius: float = 0.0
     ranges: Ranges = field(default_factory=Ranges)
-    wake: Wake = field(default_factory=Wake)
+    wake: TrajectorySegment = field(default_factory=TrajectorySegment)
 
     def __post_init__(self) -> None:
         """Refuse a wake of other sensors.
@@ -258,7 +258,7 @@ class Edge:
         id: of the agent (or server) that says so.
         a: one end.
         b: the other end; for edges within a map the later node.
-        a_from_b: posture of b's robot frame in a's.
+        a_from_b: pose of b's robot frame in a's.
         kind: how it was obtained.
         shared: (K, 2) int, landmark indices in a and in b that are the same physical point.
         evidence: numbers that support it, for example inliers; keys are short, values are floats.

@@ -1,4 +1,4 @@
-"""Planar postures, SE(2), and Gaussian postures."""
+"""Planar poses, SE(2), and Gaussian poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ def wrap_angle(angle: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Pose2:
-    """A posture in the plane: where frame b stands in frame a. Name it `a_from_b`.
+    """A pose in the plane: where frame b stands in frame a. Name it `a_from_b`.
 
     Attributes:
         x: m, in a.
@@ -90,9 +90,9 @@ class Pose2:
 
 @dataclass(frozen=True, eq=False)
 class PoseGaussian:
-    """A posture with uncertainty, perturbed on the right.
+    """A pose with uncertainty, perturbed on the right.
 
-    The true posture is `mean @ Pose2(d)` with d ~ N(0, covariance): the covariance is in the moving
+    The true pose is `mean @ Pose2(d)` with d ~ N(0, covariance): the covariance is in the moving
     frame b of `a_from_b`, order (x m, y m, heading rad). This is also GTSAM's convention.
     """
 
@@ -108,25 +108,25 @@ class PoseGaussian:
         p = np.asarray(self.covariance, dtype=np.float64)
         finite = map(math.isfinite, (self.mean.x, self.mean.y, self.mean.heading))
         if p.shape != (3, 3) or not np.isfinite(p).all() or not all(finite):
-            raise InvalidValue("a posture needs finite numbers and a (3, 3) covariance")
+            raise InvalidValue("a pose needs finite numbers and a (3, 3) covariance")
         if not _is_covariance(*p.ravel().tolist()):
-            raise InvalidValue("a posture's covariance must be symmetric and positive semi-definite")
+            raise InvalidValue("a pose's covariance must be symmetric and positive semi-definite")
         object.__setattr__(self, "covariance", 0.5 * (p + p.T))
 
     def __matmul__(self, other: PoseGaussian) -> PoseGaussian:
-        """Compose two independent Gaussian postures to first order."""
+        """Compose two independent Gaussian poses to first order."""
         ad = other.mean.inverse().adjoint
         return PoseGaussian(
             self.mean @ other.mean, nearest_covariance(ad @ self.covariance @ ad.T + other.covariance)
         )
 
     def inverse(self) -> PoseGaussian:
-        """Return the Gaussian of the inverse posture to first order."""
+        """Return the Gaussian of the inverse pose to first order."""
         ad = self.mean.adjoint
         return PoseGaussian(self.mean.inverse(), nearest_covariance(ad @ self.covariance @ ad.T))
 
     def mahalanobis2(self, other: Pose2) -> float:
-        """Squared Mahalanobis distance of a posture from the mean, 3 degrees of freedom."""
+        """Squared Mahalanobis distance of a pose from the mean, 3 degrees of freedom."""
         d = (self.mean.inverse() @ other).vector
         return float(d @ np.linalg.solve(self.covariance + 1e-12 * np.eye(3), d))
 
@@ -169,7 +169,7 @@ def _is_covariance(*p: float) -> bool:
 
 
 def averaged(poses: Sequence[PoseGaussian]) -> PoseGaussian:
-    """One posture from several estimates of it, each weighted by its information.
+    """One pose from several estimates of it, each weighted by its information.
 
     The covariance is the estimates' own on average: what they err by alike does not average out, and how much
     that is nobody knows.

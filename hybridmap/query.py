@@ -8,9 +8,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.node import EdgeKind, Node, NodeId
-from hybridmap.pose import Array, PoseGaussian
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import EdgeKind, Node, NodeId
+from mapweave.hybridmap.pose import Array, PoseGaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Whereabouts:
 
     Attributes:
         node: the node that was recognised.
-        node_from_robot: the robot's posture in that node's robot frame.
+        node_from_robot: the robot's pose in that node's robot frame.
         merged_from_robot: the same in the merged frame of the node's component, if it has one.
         component: number of the node's component in the merged map.
         inliers: landmarks that agree.
@@ -80,7 +80,7 @@ class RouteLeg:
 
     Attributes:
         node: the node to reach, with its landmarks.
-        previous_from_node: its posture in the robot frame of the node before; identity for the first.
+        previous_from_node: its pose in the robot frame of the node before; identity for the first.
         kind: of the edge that is driven; None for the first node, where the route starts.
     """
 

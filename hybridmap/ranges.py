@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array
 
 LONGEST = 60.0
 """No proximity sensor reaches further, m."""

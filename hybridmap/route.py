@@ -9,9 +9,9 @@ from typing import Any
 
 import networkx as nx
 
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
-from hybridmap.pose import Pose2
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.pose import Pose2
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Ways:
         self,
         hybrid_map: HybridMap,
         *,
-        postures: Mapping[NodeId, Pose2] | None = None,
+        poses: Mapping[NodeId, Pose2] | None = None,
         penalties: Mapping[EdgeId, float] | None = None,
         blocked: Collection[tuple[NodeId, NodeId]] = (),
         closed: Collection[EdgeId] = (),
@@ -68,10 +68,10 @@ class Ways:
         """
         s = settings or RouteSettings()
         self._map = hybrid_map
-        self._postures = postures
+        self._poses = poses
         self._closed = closed
         self._toll = toll
-        self._places = postures if postures is not None else _own_postures(hybrid_map)
+        self._places = poses if poses is not None else _own_poses(hybrid_map)
         self._barred = {frozenset(pair) for pair in blocked}
         self._graph: nx.Graph = nx.Graph()
         # In the order of ids, so that among ways of equal cost the same one is found whatever came first.
@@ -81,21 +81,21 @@ class Ways:
                 continue
             if edge.a not in self._places or edge.b not in self._places:
                 continue
-            cost = edge_cost(edge, self._places, postures is not None, s) + max(
+            cost = edge_cost(edge, self._places, poses is not None, s) + max(
                 (penalties or {}).get(edge.id, 0.0), 0.0
             )
             if not self._graph.has_edge(edge.a, edge.b):
                 self._graph.add_edge(edge.a, edge.b, choices=[], barred=barred)
             self._graph.edges[edge.a, edge.b]["choices"].append((cost, edge.id))
-        self._comparable = postures is not None or len({node_id.map for node_id in self._graph}) <= 1
+        self._comparable = poses is not None or len({node_id.map for node_id in self._graph}) <= 1
 
     def find(self, start: NodeId, goal: NodeId) -> Route:
         """The cheapest way; see `find_route`."""
         for name, node_id in (("start", start), ("goal", goal)):
             if node_id not in self._map.nodes:
                 return Route((), (), 0.0, f"{name} {node_id} is not in the map")
-            if self._postures is not None and node_id not in self._postures:
-                return Route((), (), 0.0, f"{name} {node_id} has no posture in the merged map")
+            if self._poses is not None and node_id not in self._poses:
+                return Route((), (), 0.0, f"{name} {node_id} has no pose in the merged map")
         if start == goal:
             return Route((start,), (), 0.0, "already there")
         try:
@@ -130,10 +130,10 @@ class Ways:
             return f"{start} and {goal} are in parts of the map that nothing joins"
         ties = [hop for hop in present.edges(keys=True) if hop[2] in self._closed]
         if not nx.has_path(nx.restricted_view(present, [], ties), start, goal):
-            return f"what joins {start} and {goal} only ties postures: nothing there could be driven"
+            return f"what joins {start} and {goal} only ties poses: nothing there could be driven"
         if self._barred:
             return f"every way from {start} to {goal} is blocked ({len(self._barred)} pairs)"
-        return f"a node on every way from {start} to {goal} has no posture in the merged map"
+        return f"a node on every way from {start} to {goal} has no pose in the merged map"
 
 
 def find_route(
@@ -141,7 +141,7 @@ def find_route(
     start: NodeId,
     goal: NodeId,
     *,
-    postures: Mapping[NodeId, Pose2] | None = None,
+    poses: Mapping[NodeId, Pose2] | None = None,
     penalties: Mapping[EdgeId, float] | None = None,
     blocked: Collection[tuple[NodeId, NodeId]] = (),
     closed: Collection[EdgeId] = (),
@@ -149,9 +149,9 @@ def find_route(
 ) -> Route:
     """Find the cheapest way from node to node.
 
-    An edge costs the Euclidean distance of its two nodes, as in the paper, by `postures`; the heuristic is
-    the distance to the goal by the same postures, so it is admissible and consistent by the triangle
-    inequality, whatever is added. Where no postures are given, each node's own posture in its map is used;
+    An edge costs the Euclidean distance of its two nodes, as in the paper, by `poses`; the heuristic is
+    the distance to the goal by the same poses, so it is admissible and consistent by the triangle
+    inequality, whatever is added. Where no poses are given, each node's own pose in its map is used;
     between nodes of two maps, whose frames have nothing in common, the heuristic is then zero and a link
     costs the distance that it measured.
 
@@ -159,18 +159,18 @@ def find_route(
         hybrid_map: nodes and edges; edges to nodes that are not there lead nowhere.
         start: where the robot is.
         goal: where it shall be.
-        postures: all in one frame; nodes without one cannot be on the way.
+        poses: all in one frame; nodes without one cannot be on the way.
         penalties: extra cost of edges, m; not negative, negative ones count as none.
         blocked: pairs of nodes, in either order, between which the robot cannot drive.
         closed: edges that nobody could drive: they only say how nodes stand to each other, see
-            hybridmap.reach.
+            mapweave.hybridmap.reachability.
         settings: what a way costs.
 
     Returns:
         The way; one node and no edge if start is goal.
     """
     ways = Ways(
-        hybrid_map, postures=postures, penalties=penalties, blocked=blocked, closed=closed, settings=settings
+        hybrid_map, poses=poses, penalties=penalties, blocked=blocked, closed=closed, settings=settings
     )
     return ways.find(start, goal)
 
@@ -188,5 +188,5 @@ def edge_cost(edge: Edge, places: Mapping[NodeId, Pose2], one_frame: bool, setti
     return way + settings.per_edge + settings.per_turn * turn
 
 
-def _own_postures(hybrid_map: HybridMap) -> dict[NodeId, Pose2]:
+def _own_poses(hybrid_map: HybridMap) -> dict[NodeId, Pose2]:
     return {node.id: node.map_from_robot.mean for node in hybrid_map.nodes.values()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hybridmap.node import NodeId
+from mapweave.hybridmap.node import NodeId
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hybridmap.node import Node, NodeId
-from mapserver.known import Known
-from mapserver.living import LivingPlaces
-from mapserver.merging.merger import Merger
-from mapserver.relocalizing.relocalization import Relocalizer
-from mapserver.routes import Router
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.mapserver.active_nodes import ActiveNodes
+from mapweave.mapserver.coverage import Coverage
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.routes import Router
+from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +28,12 @@ class Answers:
     merged: MergedMap
     relocalizer: Relocalizer
     router: Router
-    known: Known
+    known: Coverage
 
     @classmethod
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
         """Answers from a merged map; nodes that are newer, of which `node_of` knows, lie nowhere yet."""
         set_apart = [node for one in merged.set_apart for node in merger.maps[one].nodes]
-        places = LivingPlaces(merger.index, node_of, merged, set_apart)
+        places = ActiveNodes(merger.index, node_of, merged, set_apart)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
-        return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Known(merged))
+        return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Coverage(merged))

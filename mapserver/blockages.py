@@ -6,7 +6,7 @@ import threading
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from hybridmap.node import NodeId
+from mapweave.hybridmap.node import NodeId
 
 Pair = tuple[NodeId, NodeId]
 

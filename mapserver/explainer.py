@@ -8,23 +8,23 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
-from hybridmap.errors import InvalidMessage
-from hybridmap.explanation import Explanation, MapsExplanation, PairExplanation, RouteExplanation
-from hybridmap.history import Happening
-from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import Ruling, Rulings
-from mapserver.answers import Answers
-from mapserver.desk import Desk
-from mapserver.log.store import Store
-from mapserver.route_explaining import explain_route
-from mapserver.ruling_history import said_of, with_rulings
-from mapserver.services import guarded
-from merge.belief.consistency import ConsistencySettings
-from merge.explaining.explanation import explain_nodes
-from merge.explaining.maps import explain_fleet, explain_maps
-from merge.undoing import check_ruling
-from wire.bus import Bus, Closing, Request
-from wire.explanation_messages import (
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.explanation import Explanation, MapsExplanation, PairExplanation, RouteExplanation
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.mapserver.admission_control import AdmissionControl
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.route_explaining import explain_route
+from mapweave.mapserver.ruling_history import said_of, with_rulings
+from mapweave.mapserver.services import guarded
+from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
+from mapweave.merge.explanation.node_explanation import explain_nodes
+from mapweave.merge.manual_constraints import check_manual_constraint
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.wire.bus import Bus, Closing, Request
+from mapweave.wire.explanation_messages import (
     MAX_MAPS_TOLD,
     ExplainRequest,
     decode_explain_request,
@@ -33,10 +33,10 @@ from wire.explanation_messages import (
     encode_pair,
     encode_ruling,
 )
-from wire.history_codec import encode_history
-from wire.keys import Keys
-from wire.log_messages import encode_record
-from wire.route_explanation import encode_route_explanation
+from mapweave.wire.history_codec import encode_history
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import encode_record
+from mapweave.wire.route_explanation import encode_route_explanation
 
 log = logging.getLogger(__name__)
 
@@ -49,16 +49,16 @@ class RulingBook:
     def __init__(self, store: Store) -> None:
         """Read the record."""
         self._store = store
-        made: list[Ruling] = []
+        made: list[ManualConstraint] = []
         for body in store.rulings():
             try:
                 made.append(decode_ruling(body))
             except InvalidMessage as error:
                 log.error("a ruling cannot be read (%s); it is left out", error)
-        self._rulings = Rulings(made)
+        self._rulings = ManualConstraints(made)
 
     @property
-    def rulings(self) -> Rulings:
+    def rulings(self) -> ManualConstraints:
         """All of them, in order."""
         return self._rulings
 
@@ -66,7 +66,7 @@ class RulingBook:
         """All maps of which the server has anything: they can be retired."""
         return self._store.maps()
 
-    def add(self, ruling: Ruling) -> None:
+    def add(self, ruling: ManualConstraint) -> None:
         """Enter a ruling; it is on the disk when this returns.
 
         Raises:
@@ -74,7 +74,7 @@ class RulingBook:
             InvalidFile: the disk does not take it; then nothing has changed.
         """
         self._store.add_ruling(encode_ruling(ruling))
-        self._rulings = Rulings([*self._rulings.made, ruling])
+        self._rulings = ManualConstraints([*self._rulings.made, ruling])
 
 
 class Explainer:
@@ -86,13 +86,13 @@ class Explainer:
         keys: Keys,
         name: str,
         answers: Callable[[], Answers],
-        desk: Desk,
+        desk: AdmissionControl,
         book: RulingBook,
-        rule: Callable[[Rulings], None],
+        rule: Callable[[ManualConstraints], None],
         settled: Callable[[], bool],
         consistency: ConsistencySettings,
         wary: Callable[[], Collection[tuple[NodeId, NodeId]]],
-        happenings: Callable[[], Iterable[Happening]],
+        happenings: Callable[[], Iterable[MapEvent]],
     ) -> None:
         """Begin to answer.
 
@@ -159,14 +159,14 @@ class Explainer:
             return _still(explain_nodes(merged, first, second, None, self._consistency), settled)
         return (_still(explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])), settled),)
 
-    def history(self) -> tuple[Happening, ...]:
+    def history(self) -> tuple[MapEvent, ...]:
         """What has become of the maps, and what people have ruled, in order."""
         return with_rulings(self._happenings(), self._book.rulings)
 
     def _decree(self, payload: bytes) -> bytes:
         ruling = decode_ruling(payload)
         with self._turn:
-            check_ruling(self._answers().merged, self._book.rulings, ruling, self._book.maps())
+            check_manual_constraint(self._answers().merged, self._book.rulings, ruling, self._book.maps())
             self._book.add(ruling)
             self._rule(self._book.rulings)
         said = said_of(ruling)

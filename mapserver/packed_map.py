@@ -11,13 +11,13 @@ import weakref
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 
-from hybridmap.errors import Busy
-from hybridmap.history import Happening
-from mapserver.answers import Answers
-from mapserver.mapfiles import map_file_of
-from merge.graph.merged import MergedMap
-from wire.bus import Request
-from wire.mapfile import pack_map_file
+from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.map_files import map_file_of
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.storage.map_file import pack_map_file
+from mapweave.wire.bus import Request
 
 MAX_WAITING = 256
 """Questions; more are refused."""
@@ -31,7 +31,7 @@ class PackedMap:
     def __init__(
         self,
         answers: Callable[[], Answers],
-        history: Callable[[], Iterable[Happening]],
+        history: Callable[[], Iterable[MapEvent]],
         answer: Callable[[Request, Callable[[], bytes]], None],
         executor: Executor,
     ) -> None:
@@ -50,7 +50,7 @@ class PackedMap:
         self._lock = threading.Lock()
         self._waiting: list[Request] = []
         self._working = False
-        self._packed: tuple[weakref.ref[MergedMap], tuple[Happening, ...], bytes] | None = None
+        self._packed: tuple[weakref.ref[MergedMap], tuple[MapEvent, ...], bytes] | None = None
 
     def ask(self, request: Request) -> None:
         """Answer some time later.

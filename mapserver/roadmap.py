@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.reach import RECOGNISED
-from hybridmap.reach_book import ReachBook
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.reachability import RECOGNISED
+from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.merge.pose_graph.merged_map import MergedMap
 
 NEAR, SUCCESSION = IMPLIED = ("near", "superseded")
 """Stand for the agents in the ids of edges that follow from where nodes are."""
@@ -24,7 +24,7 @@ Faded = Mapping[NodeId, NDArray[np.bool_]]
 class ClosedEdges(Collection[EdgeId]):
     """Edges of a map that the servo could not drive; each is looked at when it is asked about."""
 
-    def __init__(self, union: HybridMap, faded: Faded, book: ReachBook) -> None:
+    def __init__(self, union: HybridMap, faded: Faded, book: ReachabilityCache) -> None:
         """Take a map.
 
         Args:
@@ -61,12 +61,12 @@ class Roadmap:
         merged: the map.
         union: its nodes and edges. Besides, nodes that stand in one place are joined, whatever they show: a
             robot can turn there. And every superseded node is joined with the one that stands for it.
-        closed: edges that only tie postures.
-        postures: of all nodes.
+        closed: edges that only tie poses.
+        poses: of all nodes.
         living: of those that no other node stands for.
     """
 
-    def __init__(self, merged: MergedMap, near: float, reaches: ReachBook) -> None:
+    def __init__(self, merged: MergedMap, near: float, reaches: ReachabilityCache) -> None:
         """Take a merged map.
 
         Args:
@@ -78,19 +78,19 @@ class Roadmap:
         self.union: HybridMap = merged.union()
         self.closed = ClosedEdges(self.union, merged.faded, reaches)
         reaches.forget(self.union.edges)
-        self.postures = {node: merged.pose(node) for node in merged.postures}
-        self.living = {node: p for node, p in self.postures.items() if node not in merged.superseded}
+        self.poses = {node: merged.pose(node) for node in merged.poses}
+        self.living = {node: p for node, p in self.poses.items() if node not in merged.superseded}
         self._join_near(near)
         for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
-            if node in self.postures and fate.by in self.postures:
+            if node in self.poses and fate.by in self.poses:
                 self._join(EdgeId(SUCCESSION, 0, k), node, fate.by)
 
     def _join_near(self, near: float) -> None:
         for number, members in enumerate(self.merged.components):
-            nodes = sorted(node for node in members if node in self.postures)
+            nodes = sorted(node for node in members if node in self.poses)
             if not nodes:
                 continue
-            places = np.array([[self.postures[n].x, self.postures[n].y] for n in nodes])
+            places = np.array([[self.poses[n].x, self.poses[n].y] for n in nodes])
             for k, (i, j) in enumerate(sorted(cKDTree(places).query_pairs(near))):
                 if not self._drivable_between(nodes[i], nodes[j]):
                     self._join(EdgeId(NEAR, number, k), nodes[i], nodes[j])
@@ -100,7 +100,7 @@ class Roadmap:
         return any(edge_id not in self.closed for edge_id in known)
 
     def _join(self, edge_id: EdgeId, a: NodeId, b: NodeId) -> None:
-        between: Pose2 = self.postures[a].inverse() @ self.postures[b]
+        between: Pose2 = self.poses[a].inverse() @ self.poses[b]
         edge = Edge(edge_id, a, b, PoseGaussian(between, np.zeros((3, 3))), EdgeKind.LOOP)
         self.union.edges[edge.id] = edge
         self.union.graph.add_edge(a, b, key=edge.id)

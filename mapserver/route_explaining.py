@@ -7,17 +7,17 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from hybridmap.explanation import Hop, MapsExplanation, RouteExplanation
-from hybridmap.node import Edge, MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.reach import RECOGNISED
-from hybridmap.route import Route, edge_cost
-from mapserver.roadmap import IMPLIED
-from mapserver.routes import Router
-from merge.explaining.maps import explain_maps
-from merge.explaining.own import reach_words
-from merge.explaining.parting import joined_maps
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.explanation import Hop, MapsExplanation, RouteExplanation
+from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.reachability import RECOGNISED
+from mapweave.hybridmap.route import Route, edge_cost
+from mapweave.mapserver.roadmap import IMPLIED
+from mapweave.mapserver.routes import Router
+from mapweave.merge.explanation.component_changes import joined_maps
+from mapweave.merge.explanation.map_explanation import explain_maps
+from mapweave.merge.explanation.own_edges import reach_words
+from mapweave.merge.pose_graph.merged_map import MergedMap
 
 TOLL = 1e4
 """What a gap costs where as few as possible are looked for, m: more than any way through a building."""
@@ -76,21 +76,21 @@ def explain_route(
         frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), router.settings.wary_cost
     )
     found, why_not = Route((), (), 0.0, ""), ""
-    postures: Mapping[NodeId, Pose2] = {}
-    for postures in router.choices(start, goal):
-        found = router.ways(postures, blocked, wary).find(start, goal)
+    poses: Mapping[NodeId, Pose2] = {}
+    for poses in router.choices(start, goal):
+        found = router.ways(poses, blocked, wary).find(start, goal)
         if found.nodes:
             break
         why_not = found.reason
     if not found.nodes:
-        least = router.ways(postures, blocked, wary, TOLL).find(start, goal)
-        gaps = _gaps(router, least, postures, known)
+        least = router.ways(poses, blocked, wary, TOLL).find(start, goal)
+        gaps = _gaps(router, least, poses, known)
         many = "1 gap is" if len(gaps) == 1 else f"{len(gaps)} gaps are"
         more = f"; {many} on the way that lacks least" if gaps else ""
         return RouteExplanation(start, goal, False, f"{why_not}{more}", gaps=gaps)
-    best = router.ways(postures, toll=0.0).find(start, goal)
-    gaps = _gaps(router, best, postures, known) if best.cost < found.cost - CLEARLY else ()
-    hops = tuple(_hops(router, found, postures, known))
+    best = router.ways(poses, toll=0.0).find(start, goal)
+    gaps = _gaps(router, best, poses, known) if best.cost < found.cost - CLEARLY else ()
+    hops = tuple(_hops(router, found, poses, known))
     return RouteExplanation(start, goal, True, _why(router, found, best, hops, gaps), hops, gaps)
 
 
@@ -110,38 +110,34 @@ def _why(router: Router, found: Route, best: Route, hops: tuple[Hop, ...], gaps:
     return reason
 
 
-def _hops(router: Router, way: Route, postures: Mapping[NodeId, Pose2], known: _Hindrances) -> Iterator[Hop]:
+def _hops(router: Router, way: Route, poses: Mapping[NodeId, Pose2], known: _Hindrances) -> Iterator[Hop]:
     edges = router.roads.union.edges
     for (a, b), edge_id in zip(pairwise(way.nodes), way.edges, strict=True):
         edge, words = edges[edge_id], known.words(frozenset((a, b)))
         more = router.settings.wary_cost if words else 0.0
-        told = _hop(router, edge, a, b, postures, more)
+        told = _hop(router, edge, a, b, poses, more)
         yield told if not words else replace(told, words=f"{told.words}; {words}")
 
 
-def _gaps(
-    router: Router, way: Route, postures: Mapping[NodeId, Pose2], known: _Hindrances
-) -> tuple[Hop, ...]:
+def _gaps(router: Router, way: Route, poses: Mapping[NodeId, Pose2], known: _Hindrances) -> tuple[Hop, ...]:
     """Those hops of a way that robots do not drive, or had better not."""
     roads, out = router.roads, []
     for a, b in pairwise(way.nodes):
         between = [roads.union.edges[key] for key in roads.union.graph.get_edge_data(a, b)]
-        best = min(between, key=lambda e: (edge_cost(e, postures, True, router.settings.route), e.id))
+        best = min(between, key=lambda e: (edge_cost(e, poses, True, router.settings.route), e.id))
         words = known.words(frozenset((a, b)))
         if words or all(edge.id in roads.closed for edge in between):
-            told = _hop(router, best, a, b, postures, 0.0)
+            told = _hop(router, best, a, b, poses, 0.0)
             out.append(replace(told, words=words) if words else told)
     return tuple(out)
 
 
-def _hop(
-    router: Router, edge: Edge, a: NodeId, b: NodeId, postures: Mapping[NodeId, Pose2], more: float
-) -> Hop:
-    between = postures[a].inverse() @ postures[b]
+def _hop(router: Router, edge: Edge, a: NodeId, b: NodeId, poses: Mapping[NodeId, Pose2], more: float) -> Hop:
+    between = poses[a].inverse() @ poses[b]
     implied = edge.id.agent in IMPLIED
     kind = edge.id.agent if implied else str(edge.kind)
     words = WORDS[kind] if implied or edge.kind not in RECOGNISED else reach_words(router.merged, edge)
-    cost = edge_cost(edge, postures, True, router.settings.route) + more
+    cost = edge_cost(edge, poses, True, router.settings.route) + more
     return Hop(a, b, kind, between.distance(Pose2()), between.heading, cost, words)
 
 

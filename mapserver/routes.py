@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hybridmap.node import EdgeId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import RouteAnswer, RouteLeg
-from hybridmap.reach import RECOGNISED
-from hybridmap.reach_book import ReachBook
-from hybridmap.route import Route, RouteSettings, Ways
-from hybridmap.ruling import reason_of
-from mapserver.living import without_faded
-from mapserver.roadmap import Roadmap
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.node import EdgeId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import RouteAnswer, RouteLeg
+from mapweave.hybridmap.reachability import RECOGNISED
+from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.hybridmap.route import Route, RouteSettings, Ways
+from mapweave.mapserver.active_nodes import without_faded
+from mapweave.mapserver.roadmap import Roadmap
+from mapweave.merge.pose_graph.merged_map import MergedMap
 
 ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""
@@ -51,7 +51,10 @@ class Router:
     """Answers how to get from node to node. It stands for one merged map; make another for the next."""
 
     def __init__(
-        self, merged: MergedMap, settings: RouterSettings | None = None, reaches: ReachBook | None = None
+        self,
+        merged: MergedMap,
+        settings: RouterSettings | None = None,
+        reaches: ReachabilityCache | None = None,
     ) -> None:
         """Take a merged map. Nothing is made of it before the first question.
 
@@ -62,7 +65,7 @@ class Router:
         """
         self.merged = merged
         self.settings = settings or RouterSettings()
-        self._reaches = reaches or ReachBook()
+        self._reaches = reaches or ReachabilityCache()
         self._turn = threading.Lock()
         self._made: Roadmap | None = None
 
@@ -94,14 +97,14 @@ class Router:
                 at a node that is nearer and better placed; None if it stands at the start node.
 
         Returns:
-            The legs. Their relative postures are those of the optimised graph: each is the best estimate
+            The legs. Their relative poses are those of the optimised graph: each is the best estimate
             from all edges together. That of the first is relative to `start`.
         """
         if missing := self.missing(start, goal):
             return RouteAnswer((), missing)
         reason = ""
-        for postures in self.choices(start, goal):
-            best, reason = self._cheapest(start, goal, postures, blocked, wary, start_from_robot)
+        for poses in self.choices(start, goal):
+            best, reason = self._cheapest(start, goal, poses, blocked, wary, start_from_robot)
             if best is not None:
                 return self._answer(start, best)
         return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
@@ -109,7 +112,7 @@ class Router:
     def missing(self, start: NodeId, goal: NodeId) -> str:
         """Why there is no way whatever can be driven, in words; empty if there may be one."""
         for name, node in (("start", start), ("goal", goal)):
-            if node not in self.merged.postures:
+            if node not in self.merged.poses:
                 retired = self.merged.rulings.retired.get(node.map)
                 apart = self.merged.set_apart.get(node.map)
                 why = f": {reason_of(retired)}" if retired is not None else ""
@@ -120,23 +123,23 @@ class Router:
         return ""
 
     def choices(self, start: NodeId, goal: NodeId) -> Iterator[Mapping[NodeId, Pose2]]:
-        """Postures of nodes over which a way is looked for, one after the other.
+        """Poses of nodes over which a way is looked for, one after the other.
 
         Nodes that others stand for are passed only where it must be.
         """
-        yield self.roads.living | {node: self.roads.postures[node] for node in (start, goal)}
-        yield self.roads.postures
+        yield self.roads.living | {node: self.roads.poses[node] for node in (start, goal)}
+        yield self.roads.poses
 
     def ways(
         self,
-        postures: Mapping[NodeId, Pose2],
+        poses: Mapping[NodeId, Pose2],
         blocked: Collection[tuple[NodeId, NodeId]] = (),
         wary: Collection[tuple[NodeId, NodeId]] = (),
         toll: float | None = None,
     ) -> Ways:
-        """The ways over nodes with these postures; see `route` and hybridmap.route.Ways."""
+        """The ways over nodes with these poses; see `route` and mapweave.hybridmap.route.Ways."""
         return Ways(
-            self.roads.union, postures=postures, penalties=self._penalties(wary), blocked=blocked,
+            self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=blocked,
             closed=self.roads.closed, settings=self.settings.route, toll=toll,
         )  # fmt: skip
 
@@ -144,16 +147,16 @@ class Router:
         self,
         start: NodeId,
         goal: NodeId,
-        postures: Mapping[NodeId, Pose2],
+        poses: Mapping[NodeId, Pose2],
         blocked: Collection[tuple[NodeId, NodeId]],
         wary: Collection[tuple[NodeId, NodeId]],
         start_from_robot: Pose2 | None,
     ) -> tuple[Route | None, str]:
-        """The cheapest way over nodes with these postures, or why the nearest entry has none."""
-        ways = self.ways(postures, blocked, wary)
+        """The cheapest way over nodes with these poses, or why the nearest entry has none."""
+        ways = self.ways(poses, blocked, wary)
         best: Route | None = None
         reason, best_cost = "", math.inf
-        for entry, cost in self._entries(start, postures, start_from_robot, blocked):
+        for entry, cost in self._entries(start, poses, start_from_robot, blocked):
             if cost >= best_cost:
                 break
             found = ways.find(entry, goal)
@@ -174,7 +177,7 @@ class Router:
     def _entries(
         self,
         start: NodeId,
-        postures: Mapping[NodeId, Pose2],
+        poses: Mapping[NodeId, Pose2],
         start_from_robot: Pose2 | None,
         blocked: Collection[tuple[NodeId, NodeId]],
     ) -> list[tuple[NodeId, float]]:
@@ -182,11 +185,11 @@ class Router:
         if start_from_robot is None:
             return [(start, 0.0)]
         s = self.settings
-        here = postures[start] @ start_from_robot
+        here = poses[start] @ start_from_robot
         component = self.merged.component_of(start)
         barred = {frozenset(pair) for pair in blocked}
         members = self.merged.components[component or 0]
-        near = sorted((here.distance(postures[n]), n) for n in members if n in postures)
+        near = sorted((here.distance(poses[n]), n) for n in members if n in poses)
         entries = [
             (node, s.entry_cost * distance - self._saved(here, node, distance, barred))
             for distance, node in near
@@ -197,16 +200,16 @@ class Router:
     def _saved(self, here: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
         """By how much it is cheaper to get to a node for a robot that stands on an edge to it, m."""
         s, roads = self.settings, self.roads
-        target = roads.postures[node]
+        target = roads.poses[node]
         goal = np.array([target.x, target.y])
         at = np.array([here.x, here.y])
         saved = 0.0
         for _, other, edge_id in roads.union.graph.edges(node, keys=True):
             if roads.union.edges[edge_id].kind in RECOGNISED or frozenset((node, other)) in barred:
                 continue
-            if other not in roads.postures:
+            if other not in roads.poses:
                 continue
-            along = np.array([roads.postures[other].x, roads.postures[other].y]) - goal
+            along = np.array([roads.poses[other].x, roads.poses[other].y]) - goal
             share = float(np.clip((at - goal) @ along / max(along @ along, 1e-9), 0.0, 1.0))
             off = float(np.linalg.norm(at - goal - share * along))
             if off <= s.on_edge and share < 1.0:

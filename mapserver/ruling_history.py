@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from hybridmap.history import Happening, Kind
-from hybridmap.ruling import Ruling, Rulings, reason_of
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 
 
-def with_rulings(happenings: Iterable[Happening], rulings: Rulings) -> tuple[Happening, ...]:
+def with_rulings(happenings: Iterable[MapEvent], rulings: ManualConstraints) -> tuple[MapEvent, ...]:
     """What has happened by itself and what people have ruled, in order."""
-    ruled = [Happening(ruling.stamp_ns, Kind.RULED, said_of(ruling)) for ruling in rulings.made]
+    ruled = [MapEvent(ruling.stamp_ns, MapEventKind.RULED, said_of(ruling)) for ruling in rulings.made]
     return tuple(sorted([*ruled, *happenings], key=lambda one: one.stamp_ns))
 
 
-def said_of(ruling: Ruling) -> str:
+def said_of(ruling: ManualConstraint) -> str:
     """What has come of a ruling, in one sentence."""
     first, second = ruling.ends
     who = ruling.who or "somebody"

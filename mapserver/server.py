@@ -13,26 +13,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
-from hybridmap.explanation import Explanation
-from hybridmap.history import Happening
-from hybridmap.query import RelocalizeAnswer, View
-from mapserver.blockages import Blockages
-from mapserver.chronicle import Chronicle
-from mapserver.desk import Desk, DeskSettings
-from mapserver.explainer import Explainer, RulingBook
-from mapserver.herald import Herald
-from mapserver.log.ingest import Ingest
-from mapserver.log.store import Store
-from mapserver.merging.findingskeeper import FindingsKeeper
-from mapserver.places.placekeeper import EVERY, PlaceKeeper
-from mapserver.schedule import LiveSchedule, Schedule
-from mapserver.services import Services
-from mapserver.upkeep import Upkeep
-from merge.merging import MergeSettings
-from wire.bus import Bus
-from wire.explanation_messages import ExplainRequest
-from wire.keys import Keys
-from wire.log_messages import Scalar, encode_record
+from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.query import RelocalizeAnswer, View
+from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
+from mapweave.mapserver.blockages import Blockages
+from mapweave.mapserver.explainer import Explainer, RulingBook
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.map_history import MapHistory
+from mapweave.mapserver.merge_worker import MergeWorker
+from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.mapserver.pose_broadcast import PoseBroadcast
+from mapweave.mapserver.retrieval.index_keeper import EVERY, PlaceIndexKeeper
+from mapweave.mapserver.schedule import LiveSchedule, Schedule
+from mapweave.mapserver.services import Services
+from mapweave.merge.merging import MergeSettings
+from mapweave.wire.bus import Bus
+from mapweave.wire.explanation_messages import ExplainRequest
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Scalar, encode_record
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class ServerSettings:
 
     status_every: float = 0.5
     merge_share: float = 0.4
-    desk: DeskSettings = field(default_factory=DeskSettings)
+    desk: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
 
 
@@ -87,13 +87,15 @@ class MapServer:
         self._schedule = clock = schedule or LiveSchedule()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = Store(path)
-        self._keeper = PlaceKeeper(self._store, path)
-        findings = FindingsKeeper(path, not self._store.positions(), clock.monotonic)
-        self._chronicle = Chronicle(self._store, clock=clock.time_ns)
-        self._upkeep = Upkeep(clock, s.merge_share, self._keeper.index, s.merge, findings, self._chronicle)
+        self._keeper = PlaceIndexKeeper(self._store, path)
+        findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
+        self._chronicle = MapHistory(self._store, clock=clock.time_ns)
+        self._upkeep = MergeWorker(
+            clock, s.merge_share, self._keeper.index, s.merge, findings, self._chronicle
+        )
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
-        self._desk = Desk(s.desk, clock.monotonic, clock.executor(s.desk.workers))
+        self._desk = AdmissionControl(s.desk, clock.monotonic, clock.executor(s.desk.workers))
         self._blockages = Blockages()
 
     def __enter__(self) -> MapServer:
@@ -110,7 +112,7 @@ class MapServer:
             lambda: upkeep.settled, self._settings.merge.consistency,
             lambda: self._blockages.known(clock.monotonic()), lambda: self._chronicle.happenings,
         )  # fmt: skip
-        self._herald = Herald(self._bus, self._keys, self._name, clock=clock.monotonic)
+        self._herald = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(self._settings.status_every, self._tell)
         clock.every(EVERY, self._keeper.look)
         return self
@@ -142,7 +144,7 @@ class MapServer:
         loops = sum(link.within for link in merged.links)
         traffic = self._store.traffic()
         return {
-            "nodes": len(merged.postures),
+            "nodes": len(merged.poses),
             "superseded": len(merged.superseded),
             "maps": len(merged.maps),
             "components": len(merged.components),
@@ -180,7 +182,7 @@ class MapServer:
         """
         return self._desk.submit(lambda: self._explainer.explain(request), usual=False)
 
-    def history(self) -> tuple[Happening, ...]:
+    def history(self) -> tuple[MapEvent, ...]:
         """What has become of the maps and what people have ruled, in order."""
         return self._explainer.history()
 

@@ -6,18 +6,18 @@ import logging
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 
-from hybridmap.errors import Busy, MapweaveError
-from hybridmap.history import Happening
-from hybridmap.query import RouteAnswer
-from mapserver.answers import Answers
-from mapserver.blockages import Blockages
-from mapserver.desk import Desk
-from mapserver.packed_map import PackedMap
-from mapserver.wire_limits import Pairs, drivable, said
-from wire.bus import Bus, Closing, Request
-from wire.keys import Keys
-from wire.log_messages import Scalar, encode_record
-from wire.messages import (
+from mapweave.hybridmap.errors import Busy, MapweaveError
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.query import RouteAnswer
+from mapweave.mapserver.admission_control import AdmissionControl
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.blockages import Blockages
+from mapweave.mapserver.packed_map import PackedMap
+from mapweave.mapserver.wire_limits import Pairs, drivable, said
+from mapweave.wire.bus import Bus, Closing, Request
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Scalar, encode_record
+from mapweave.wire.messages import (
     decode_known_request,
     decode_route_request,
     decode_view,
@@ -40,10 +40,10 @@ class Services:
         keys: Keys,
         name: str,
         answers: Callable[[], Answers],
-        desk: Desk,
+        desk: AdmissionControl,
         blockages: Blockages,
         status: Callable[[], dict[str, Scalar]],
-        history: Callable[[], Iterable[Happening]],
+        history: Callable[[], Iterable[MapEvent]],
         clock: Callable[[], float],
         executor: Executor,
     ) -> None:

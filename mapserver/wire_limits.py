@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from hybridmap.errors import InvalidValue
-from hybridmap.node import NodeId
-from hybridmap.pose import PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
-from mapserver.relocalizing.judgement import NOWHERE
-from wire.posture_codec import pack_posture
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
+from mapweave.mapserver.relocalization.verdict import NOWHERE
+from mapweave.wire.pose_codec import pack_pose
 
 FARTHEST = 1e5
 """A node that is farther from the middle of its map is no place for robots, m: float32 has steps of 8 mm
@@ -27,16 +27,16 @@ MOST_DETOURS = 8
 Pairs = tuple[tuple[NodeId, NodeId], ...]
 
 
-def can_be_said(posture: PoseGaussian | None) -> bool:
-    """Whether a posture is in the range of messages; none at all is."""
+def can_be_said(pose: PoseGaussian | None) -> bool:
+    """Whether a pose is in the range of messages; none at all is."""
     try:
-        return posture is None or bool(pack_posture(posture))
+        return pose is None or bool(pack_pose(pose))
     except InvalidValue:
         return False
 
 
 def said(answer: RelocalizeAnswer) -> RelocalizeAnswer:
-    """An answer without candidates that cannot be said. One of which only the merged posture cannot stays
+    """An answer without candidates that cannot be said. One of which only the merged pose cannot stays
     without.
 
     The certainty stays: where the robot may be at a place that cannot be said, it is not sure to be at the

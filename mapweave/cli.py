@@ -7,9 +7,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from hybridmap.errors import MapweaveError
 from mapweave.commands import agent, demo, evaluate, map_file, relocalize, replay, server, sim
 from mapweave.extras import MissingExtra, extra_of
+from mapweave.hybridmap.errors import MapweaveError
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help."
 MISSING_EXTRA = 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-from hybridmap.errors import MapweaveError
+from mapweave.hybridmap.errors import MapweaveError
 
 MODULES = {
     "server": ("faiss", "gtsam", "numba", "scipy"),

@@ -7,14 +7,14 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from agent.sharing import journal
-from agent.sharing.kept import Kept
-from hybridmap.change import ChangeBody, NodePut
-from hybridmap.errors import InvalidFile, InvalidValue
-from hybridmap.node import MapId
-from mapserver.log import store
-from mapserver.log.salvage import Salvage, salvage
-from wire.mapfile import MapFile, write_map_file
+from mapweave.agent.replication import journal
+from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.hybridmap.change import ChangeBody, NodePut
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log import store
+from mapweave.mapserver.log.salvage import Salvage, salvage
+from mapweave.storage.map_file import MapFile, write_map_file
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def _read(source: Path) -> tuple[dict[MapId, tuple[tuple[ChangeBody, ...], str]]
     kind = _application_id(source)
     if kind == journal.APPLICATION_ID:
         with closing(journal.Journal(source)) as of_agent:
-            kept = {map_id: Kept.of(of_agent, map_id) for map_id in of_agent.maps()}
+            kept = {map_id: RetainedMap.of(of_agent, map_id) for map_id in of_agent.maps()}
         return {map_id: (one.contents, one.complaint) for map_id, one in kept.items()}, ""
     if kind == store.APPLICATION_ID:
         found = salvage(source)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import SettingsError
 
 
 def check_output(folder: Path) -> Path:

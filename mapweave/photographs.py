@@ -16,21 +16,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.sharing.journal import Journal
-from agent.sharing.replication import Replicator
-from hybridmap.camera import Camera
-from hybridmap.change import ChangeBody, EdgePut, NodePut
-from hybridmap.errors import InvalidValue
-from hybridmap.grid import settle
-from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.quantization import settle
+from mapweave.registration.selection import choose, worth
+from mapweave.storage.image_file import read_grey
 from mapweave.structure_from_motion import PIXEL_SIGMA, Structure, reconstruct
-from registration.selection import choose, worth
-from storage.image_file import read_grey
-from vision.lens import Lens
-from vision.sift import Sift
-from wire.bus import Bus
-from wire.keys import Keys
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
 
 SCALE_SHARE = 0.3
 """By which the stated spacing may be off, as a share of it."""
@@ -39,7 +39,7 @@ LEAST_LANDMARKS = 12
 """A photograph that shows fewer points is no place that a robot could recognise."""
 
 FLOOR = (0.01, 0.01)
-"""What a posture is never better than, m and rad: the camera is not quite level."""
+"""What a pose is never better than, m and rad: the camera is not quite level."""
 
 
 def map_of_photographs(

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agent.pipeline import PipelineSettings
-from mapserver.desk import DeskSettings
-from wire.tables import build, read_toml
+from mapweave.agent.pipeline import PipelineSettings
+from mapweave.mapserver.admission_control import AdmissionSettings
+from mapweave.storage.settings_file import build, read_toml
 
 if TYPE_CHECKING:
-    from merge.merging import MergeSettings
+    from mapweave.merge.merging import MergeSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Settings:
 
     network: NetworkSettings = dataclasses.field(default_factory=NetworkSettings)
     pipeline: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
-    desk: DeskSettings = dataclasses.field(default_factory=DeskSettings)
+    desk: AdmissionSettings = dataclasses.field(default_factory=AdmissionSettings)
     merge: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -68,6 +68,6 @@ def merge_settings(settings: Settings, path: Path | None) -> MergeSettings:
     Raises:
         SettingsError: names or values are wrong.
     """
-    from merge.merging import MergeSettings
+    from mapweave.merge.merging import MergeSettings
 
     return build(MergeSettings, settings.merge, f"{path}: merge")

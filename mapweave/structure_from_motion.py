@@ -17,11 +17,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array
-from hybridmap.query import View
-from registration.matching import match
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.query import View
+from mapweave.registration.matching import match
 
 PIXEL_SIGMA = 0.7
 """px, of a SIFT feature; as in triangulation."""

@@ -11,16 +11,16 @@ from dataclasses import replace
 
 import networkx as nx
 
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import Rulings
-from merge.belief.memory import Memory
-from merge.graph.links import Link, RefusedLink
-from merge.graph.merged import MergedMap, Postures
-from merge.graph.verdicts import Verdict, Verdicts
-from merge.merging import MergeSettings, decide
-from merge.standing import Standing
-from merge.undoing import undo
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.merge.manual_constraints import apply_constraints
+from mapweave.merge.merging import MergeSettings, decide
+from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
+from mapweave.merge.standing_decisions import StandingDecisions
 
 EXACT = 600
 """Islands of as many nodes are decided as a whole whenever they change: that is soon done, and the outcome
@@ -41,18 +41,18 @@ class Islands:
         """
         self._settings = settings or MergeSettings()
         self._exact = exact
-        self._memory = Memory()
+        self._memory = DecisionCache()
         self._merged: dict[frozenset[MapId], MergedMap] = {}
-        self._standing: dict[frozenset[MapId], Standing] = {}
+        self._standing: dict[frozenset[MapId], StandingDecisions] = {}
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
-        self._rulings = Rulings()
+        self._rulings = ManualConstraints()
 
     def merge(
         self,
         maps: Mapping[MapId, HybridMap],
         verdicts: Verdicts,
         touched: set[MapId],
-        rulings: Rulings,
+        rulings: ManualConstraints,
     ) -> MergedMap:
         """Merge.
 
@@ -88,14 +88,14 @@ class Islands:
         self,
         maps: Mapping[MapId, HybridMap],
         verdicts: Iterable[Verdict],
-        rulings: Rulings,
-        earlier: Sequence[Standing],
-    ) -> tuple[MergedMap, Standing]:
+        rulings: ManualConstraints,
+        earlier: Sequence[StandingDecisions],
+    ) -> tuple[MergedMap, StandingDecisions]:
         links, refused = _sorted_out(verdicts)
-        undone = undo(maps, links, rulings)
+        undone = apply_constraints(maps, links, rulings)
         everything = undone.maps, undone.links, [*refused, *undone.refused], self._settings, self._memory
         small = sum(len(one.nodes) for one in maps.values()) <= self._exact
-        before = None if small or not earlier else Standing.union(earlier)
+        before = None if small or not earlier else StandingDecisions.union(earlier)
         merged, stands = decide(*everything, before)
         if stands.changed > CHANGED * stands.size:
             merged, stands = decide(*everything)
@@ -131,7 +131,7 @@ def _together(
     islands: list[MergedMap],
     maps: Mapping[MapId, HybridMap],
     across: Iterable[Verdict],
-    rulings: Rulings,
+    rulings: ManualConstraints,
 ) -> MergedMap:
     """One merged map of islands that have nothing to do with each other."""
     graphs = sorted(
@@ -143,13 +143,13 @@ def _together(
         key=lambda item: (-len(item[0].nodes), item[0].anchor),
     )
     solved = tuple(graph for graph, _ in graphs)
-    postures = Postures(solved)
+    poses = Poses(solved)
     links = sorted((link for one in islands for link in one.links), key=lambda link: link.pair)
     refused = [refusal for one in islands for refusal in one.refused]
     apart, between = _sorted_out(across)
-    undone = undo({}, apart, rulings)
-    refused += [r for r in (*between, *undone.refused) if r.a in postures and r.b in postures]
+    undone = apply_constraints({}, apart, rulings)
+    refused += [r for r in (*between, *undone.refused) if r.a in poses and r.b in poses]
     refused.sort(key=lambda refusal: refusal.pair)
     components = tuple(component for _, component in graphs)
-    whole = MergedMap(dict(sorted(maps.items())), tuple(links), tuple(refused), components, postures, solved)
+    whole = MergedMap(dict(sorted(maps.items())), tuple(links), tuple(refused), components, poses, solved)
     return replace(whole, rulings=rulings)

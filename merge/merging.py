@@ -16,25 +16,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from merge.belief.agglomeration import agglomerate
-from merge.belief.consistency import ConsistencySettings
-from merge.belief.distinctness import weigh
-from merge.belief.drives import refuse_drives
-from merge.belief.groups import LinkGroup
-from merge.belief.joining import optimise
-from merge.belief.memory import Memory
-from merge.belief.readmission import readmitted
-from merge.bodies.refutation import Refutation
-from merge.bodies.settings import ExclusionSettings
-from merge.graph.candidates import Pair
-from merge.graph.fragments import Fragment
-from merge.graph.links import Link, RefusedLink
-from merge.graph.merged import MergedMap, Postures
-from merge.graph.posegraph import PoseGraph
-from merge.graph.solver import Solver
-from merge.standing import Standing
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.merge.mutual_exclusion.refutation import Refutation
+from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
+from mapweave.merge.outlier_rejection.agglomerative_joining import agglomerate
+from mapweave.merge.outlier_rejection.closing_links import optimise
+from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
+from mapweave.merge.outlier_rejection.distinctness import weigh
+from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
+from mapweave.merge.outlier_rejection.link_groups import LinkGroup
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.outlier_rejection.readmission import readmitted
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.standing_decisions import StandingDecisions
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def merge_maps(
     Returns:
         The merged map. It does not depend on the order of maps, links or nodes.
     """
-    return decide(maps, links, refused, settings or MergeSettings(), Memory())[0]
+    return decide(maps, links, refused, settings or MergeSettings(), DecisionCache())[0]
 
 
 def decide(
@@ -77,9 +77,9 @@ def decide(
     links: Iterable[Link],
     refused: Iterable[RefusedLink],
     settings: MergeSettings,
-    memory: Memory,
-    before: Standing | None = None,
-) -> tuple[MergedMap, Standing]:
+    memory: DecisionCache,
+    before: StandingDecisions | None = None,
+) -> tuple[MergedMap, StandingDecisions]:
     """Merge, and tell what was decided, so that the next merge can begin from it.
 
     Args:
@@ -96,10 +96,10 @@ def decide(
     """
     s = settings
     fragments = memory.fragments(maps, s.consistency, s.strain)
-    solver = Solver(fragments)
+    solver = ComponentSolver(fragments)
     by_node = solver.by_node
     given = {link.pair: link for link in links if link.a in by_node and link.b in by_node}
-    standing = before or Standing()
+    standing = before or StandingDecisions()
     known = {pair for pair, link in given.items() if standing.given.get(pair) is link}
     news = (given.keys() - known) | (standing.given.keys() - known)
     fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
@@ -145,10 +145,10 @@ def decide(
         tuple(sorted((link.canonical() for link in kept), key=lambda link: link.pair)),
         tuple(sorted(refusals, key=lambda r: r.pair)),
         tuple(frozenset(graph.nodes) for graph in solved),
-        Postures(solved),
+        Poses(solved),
         tuple(solved),
     )
-    return merged, Standing(
+    return merged, StandingDecisions(
         given,
         weighed,
         frozenset(link.pair for link in merged.links),
@@ -162,7 +162,7 @@ def decide(
 
 
 def _joined(
-    solver: Solver,
+    solver: ComponentSolver,
     groups: Mapping[Pair, LinkGroup],
     held: Sequence[Link],
     closed: Set[Pair],
@@ -181,12 +181,12 @@ def _joined(
 
 def _weighed(
     given: Mapping[Pair, Link],
-    standing: Standing,
+    standing: StandingDecisions,
     known: Set[Pair],
     fresh: Set[tuple[MapId, MapId]],
     by_node: Mapping[NodeId, Fragment],
     maps: Mapping[MapId, HybridMap],
-    memory: Memory,
+    memory: DecisionCache,
     s: MergeSettings,
 ) -> dict[Pair, Link]:
     """Links with their doubles, which are looked for among those between maps of which links are new."""

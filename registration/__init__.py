@@ -1,1 +1,1 @@
-"""Where two views of a place were taken from each other: matching, minimal postures, refinement, verdict."""
+"""Where two views of a place were taken from each other: matching, minimal poses, refinement, verdict."""

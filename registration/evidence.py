@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.node import Landmarks
-from hybridmap.pose import Pose2
-from registration.gauss_newton import PlanarFix
-from registration.sightings import Sightings
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import Landmarks
+from mapweave.hybridmap.pose import Pose2
+from mapweave.registration.gauss_newton import PlanarFix
+from mapweave.registration.sightings import Sightings
 
 GRID = (6, 4)
 """Columns and rows of cells in which the spread over an image is counted."""
@@ -28,7 +28,7 @@ def gather(
     usable: int,
     fix: PlanarFix,
 ) -> dict[str, float]:
-    """The numbers that speak for a posture; all finite.
+    """The numbers that speak for a pose; all finite.
 
     Args:
         a: landmarks of the one side.
@@ -38,7 +38,7 @@ def gather(
         inliers: (K, 2) indices in a and b that agree.
         matches: mutual matches.
         usable: of these, with a depth on either side.
-        fix: the posture `a_from_b`.
+        fix: the pose `a_from_b`.
     """
     seen_a, seen_b = a.take(inliers[:, 0]), b.take(inliers[:, 1])
     depths = np.where(seen_a.has_depth, seen_a.depths, seen_b.depths)
@@ -74,7 +74,7 @@ def _seen(
 
 
 def depth_agreement(forward: Sightings, fix: PlanarFix) -> float:
-    """Share of the landmarks whose pixels fit the posture that fit in depth too; 1 if few have two depths."""
+    """Share of the landmarks whose pixels fit the pose that fit in depth too; 1 if few have two depths."""
     both = forward.depth_measured
     nothing = np.full(len(forward), np.nan)
     pixels_only = replace(forward, depths=nothing, depth_sigmas=nothing)

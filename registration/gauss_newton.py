@@ -1,4 +1,4 @@
-"""The best posture near a first one, by iterated Gauss-Newton, and how certain it is.
+"""The best pose near a first one, by iterated Gauss-Newton, and how certain it is.
 
 The points may move within their own uncertainty. They are variables that are eliminated in closed form: each
 round linearises at the points' present estimates, the residual refers back to where they were given, and
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from registration import projection
-from registration.projection import (
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.registration import projection
+from mapweave.registration.projection import (
     DEPTH_DECADES,
     GATE,
     Linear,
@@ -25,7 +25,7 @@ from registration.projection import (
     linearise,
     normal_equations,
 )
-from registration.sightings import Sightings
+from mapweave.registration.sightings import Sightings
 
 DEPTH_GATE = 11.34
 """Chi-square 99 % point for 3 degrees of freedom."""
@@ -36,15 +36,15 @@ NO_DEPTH_SIGMA = 1e3
 
 @dataclass(frozen=True, eq=False)
 class PlanarFix:
-    """A posture from sightings.
+    """A pose from sightings.
 
     Attributes:
-        node_from_robot: posture of the robot in the points' frame.
+        node_from_robot: pose of the robot in the points' frame.
         inliers: (N,) which sightings agree with it.
         mean_square: mean squared normalised residual of the inliers; 1 when the uncertainties are right.
         rms_px: of the inliers' residuals, px, after the points moved within their uncertainty.
         log_evidence: sum over the inliers of how much likelier they are than wrong matches, nats.
-        rival: what the mirrored posture explains (see mirror.py), as a share of what this one does; 0 if
+        rival: what the mirrored pose explains (see mirror.py), as a share of what this one does; 0 if
             there is no other.
     """
 
@@ -81,17 +81,17 @@ def stack_sightings(parts: Sequence[Sightings]) -> Stack:
 
 
 def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) -> tuple[Pose2, Array] | None:
-    """Bring a posture to its best.
+    """Bring a pose to its best.
 
     Args:
         stack: the sightings.
         pose: where to start.
-        prior: what else is known of the posture.
+        prior: what else is known of the pose.
         rounds: of Gauss-Newton at most.
 
     Returns:
-        The posture and the points (N, 3) m at their best for it; None if the inliers do not determine a
-        posture.
+        The pose and the points (N, 3) m at their best for it; None if the inliers do not determine a
+        pose.
     """
     sure, pose_vector, points = projection.improve(stack, pose.vector, *_mean_and_information(prior), rounds)
     return (Pose2.from_vector(pose_vector), points) if sure else None
@@ -105,7 +105,7 @@ def refine(
     rounds: int,
     shift_sigma: float = 0.0,
 ) -> PlanarFix | None:
-    """Bring a posture to its best and say how certain it is.
+    """Bring a pose to its best and say how certain it is.
 
     The covariance is the inverse information, larger where the residuals are larger than they should be,
     and larger by what does not average out: a common scale error of the points, or of the measured depths,
@@ -115,12 +115,12 @@ def refine(
         stack: the sightings.
         pose: where to start.
         scale_sigma: share by which all points, or all measured depths, may be wrong together.
-        prior: what else is known of the posture.
+        prior: what else is known of the pose.
         rounds: of Gauss-Newton at most.
         shift_sigma: px by which all pixels may be off together, to either side.
 
     Returns:
-        The posture, or None if the inliers do not determine one.
+        The pose, or None if the inliers do not determine one.
     """
     improved = improve(stack, pose, prior, rounds)
     if improved is None:
@@ -166,7 +166,7 @@ def _common_scales(stack: Stack, linear: Linear, points: Array) -> list[Array]:
 
 
 def _gradient(linear: Linear, residuals: Array) -> Array:
-    """(3,) gradient of the posture by other residuals (N, 3), with the same weights."""
+    """(3,) gradient of the pose by other residuals (N, 3), with the same weights."""
     f00, f10, f11, f20, f21, f22 = linear.factor.T
     white = np.empty_like(residuals)
     white[:, 0] = residuals[:, 0] / f00

@@ -2,7 +2,7 @@
 
 A camera in the hand is off level and off its height by amounts that nobody knows, and all that it shows is
 off by them alike. A robot's camera is level and at its height. So the photograph's pitch, roll and rise are
-found together with the robot's posture, by Gauss-Newton on the landmarks that were recognised.
+found together with the robot's pose, by Gauss-Newton on the landmarks that were recognised.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.node import LEAST_DEPTH_SHARE, Landmarks, Node
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.query import View
-from registration.planar_ambiguity import mirrored
-from registration.recognition import Recognition, of_unknown_scale
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import LEAST_DEPTH_SHARE, Landmarks, Node
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.registration.planar_ambiguity import mirrored
+from mapweave.registration.recognition import Recognition, of_unknown_scale
 
 TILT_SIGMA, RISE_SIGMA = math.radians(2.0), 0.05
 """By which a camera in the hand is off level, rad, and off its height, m."""
@@ -78,9 +78,9 @@ def level(node: Node, view: View, found: Recognition) -> Levelled:
     best = min(fits, key=lambda fit: fit.cost)
     mean, turn = Pose2.from_vector(best.state[:3]), np.eye(3)
     turn[:2, :2] = mean.rotation.T
-    posture = PoseGaussian(mean, turn @ best.covariance[:3, :3] @ turn.T)
-    posture = of_unknown_scale(posture, node.landmarks.scale_share, node.camera, view.camera)
-    return Levelled(replace(node, landmarks=_levelled(node.landmarks, node.camera, best.state[3:])), posture)
+    pose = PoseGaussian(mean, turn @ best.covariance[:3, :3] @ turn.T)
+    pose = of_unknown_scale(pose, node.landmarks.scale_share, node.camera, view.camera)
+    return Levelled(replace(node, landmarks=_levelled(node.landmarks, node.camera, best.state[3:])), pose)
 
 
 class _Fit(NamedTuple):
@@ -92,7 +92,7 @@ class _Fit(NamedTuple):
 
 
 def _fit(start: Array, pixels: Array, expected: Callable[[Array, float], Array]) -> _Fit | None:
-    """Gauss-Newton from a posture (3,); None if the pixels determine none.
+    """Gauss-Newton from a pose (3,); None if the pixels determine none.
 
     Args:
         start: x, y, heading.

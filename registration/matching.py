@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.descriptor import rounding_noise
-from hybridmap.errors import InvalidValue
-from hybridmap.landmark_tables import landmark_tables
-from hybridmap.node import CODE_BYTES
+from mapweave.hybridmap.descriptor import rounding_noise
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.landmark_tables import landmark_tables
+from mapweave.hybridmap.node import CODE_BYTES
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Postures of a planar robot from the fewest sightings that determine one, many at once.
+"""Poses of a planar robot from the fewest sightings that determine one, many at once.
 
 With the camera at (tx, ty, heading) of the points' frame, c and s the heading's cosine and sine,
     X = c px + s py - A,   Y = -s px + c py - B,   A = c tx + s ty,   B = -s tx + c ty.
@@ -13,13 +13,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
-from registration.pose_arrays import inverse_poses
-from registration.sightings import Sightings
+from mapweave.hybridmap.pose import Array
+from mapweave.registration.pose_arrays import inverse_poses
+from mapweave.registration.sightings import Sightings
 
 
 def hypotheses(sightings: Sightings, count: int, rng: np.random.Generator) -> Array:
-    """(H, 3) wanted postures from minimal sets of sightings; degenerate sets are left out."""
+    """(H, 3) wanted poses from minimal sets of sightings; degenerate sets are left out."""
     found = []
     if len(sightings) >= 3:
         found.append(_from_three_bearings(sightings, rng.integers(0, len(sightings), (count, 3))))
@@ -36,7 +36,7 @@ def hypotheses(sightings: Sightings, count: int, rng: np.random.Generator) -> Ar
 
 
 def _from_three_bearings(sightings: Sightings, chosen: NDArray[np.int64]) -> Array:
-    """(H, 3) postures from (H, 3) chosen sightings, by their horizontal bearings; NaN where degenerate."""
+    """(H, 3) poses from (H, 3) chosen sightings, by their horizontal bearings; NaN where degenerate."""
     px, py = sightings.points[:, 0][chosen], sightings.points[:, 1][chosen]
     a = sightings.slopes[:, 0][chosen]
     rows = np.stack([py - a * px, -px - a * py, a])
@@ -74,7 +74,7 @@ def _depths(sightings: Sightings) -> tuple[Array, Array]:
 
 
 def _from_two_depths(sightings: Sightings, chosen: NDArray[np.int64], depths: Array) -> Array:
-    """(H, 3) postures that carry two points of the robot's plane onto two points of the frame's."""
+    """(H, 3) poses that carry two points of the robot's plane onto two points of the frame's."""
     ahead = depths[chosen]
     qx, qy = ahead + sightings.camera.mount_forward, ahead * sightings.slopes[:, 0][chosen]
     px, py = sightings.points[:, 0][chosen], sightings.points[:, 1][chosen]

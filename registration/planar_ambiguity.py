@@ -1,4 +1,4 @@
-"""The second posture from which a flat thing looks almost the same.
+"""The second pose from which a flat thing looks almost the same.
 
 Seen from afar a wall with prints looks the same from a place as far to the other side of its middle: what
 tells the two apart is perspective, second order in its size over its distance (the two-fold ambiguity of
@@ -14,22 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Pose2, wrap_angle
+from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 
-def mirrored(posture: Pose2, points: NDArray[Any]) -> Pose2:
-    """Reflect a posture in the plane that stands on the line through points, in their middle.
+def mirrored(pose: Pose2, points: NDArray[Any]) -> Pose2:
+    """Reflect a pose in the plane that stands on the line through points, in their middle.
 
     The middle of the points keeps its bearing. Twice mirrored is where it was.
 
     Args:
-        posture: of the robot, in the points' frame.
+        pose: of the robot, in the points' frame.
         points: (N, 2) m, seen from above, N > 1.
     """
     middle = points.mean(axis=0)
     line = np.linalg.svd(points - middle, full_matrices=False)[2][0]
-    away = np.array([posture.x, posture.y]) - middle
+    away = np.array([pose.x, pose.y]) - middle
     there = away - 2.0 * float(away @ line) * line
     turned = math.atan2(there[1], there[0]) - math.atan2(away[1], away[0])
     x, y = middle + there
-    return Pose2(float(x), float(y), wrap_angle(posture.heading + turned))
+    return Pose2(float(x), float(y), wrap_angle(pose.heading + turned))

@@ -1,7 +1,7 @@
 """Where a planar robot stood when it saw known points: three degrees of freedom, robust.
 
 Static localization of the paper's section 6 (least squares on n >= 4 known points), made robust: many
-postures are solved at once from two or three sightings each, scored by likelihood, and the best refined.
+poses are solved at once from two or three sightings each, scored by likelihood, and the best refined.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from registration.gauss_newton import PlanarFix, improve, refine, stack_sightings
-from registration.minimal_poses import hypotheses
-from registration.planar_ambiguity import mirrored
-from registration.projection import Stack
-from registration.sightings import Sightings
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.registration.gauss_newton import PlanarFix, improve, refine, stack_sightings
+from mapweave.registration.minimal_poses import hypotheses
+from mapweave.registration.planar_ambiguity import mirrored
+from mapweave.registration.projection import Stack
+from mapweave.registration.sightings import Sightings
 
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
 
@@ -29,18 +29,18 @@ PREVIEW = 20
 
 @dataclass(frozen=True)
 class PlanarPoseSettings:
-    """How a posture is found.
+    """How a pose is found.
 
     Attributes:
-        hypotheses: postures tried from three bearings, and as many from two points with depth.
+        hypotheses: poses tried from three bearings, and as many from two points with depth.
         finalists: best hypotheses that are refined.
         rounds: of Gauss-Newton at most.
         pixel_sigma: standard deviation of a matched pixel, px. A SIFT feature found again at another scale
             is off by about one pixel.
         scale_sigma: share by which all points of one frame may be too near or too far together; they come
             from one drive with one set of wheels, so their errors are not independent.
-        least_inliers: fewer give no posture.
-        apart: two postures nearer to each other than this are the same, m.
+        least_inliers: fewer give no pose.
+        apart: two poses nearer to each other than this are the same, m.
     """
 
     hypotheses: int = 100
@@ -71,10 +71,10 @@ def solve_planar_pose(
         rng: draws the hypotheses.
         point_covariances: (N, 3, 3) m^2; exact points without.
         settings: how.
-        prior: what is known of the posture already; counts as a measurement.
+        prior: what is known of the pose already; counts as a measurement.
 
     Returns:
-        The posture, or None if the sightings do not determine one.
+        The pose, or None if the sightings do not determine one.
     """
     s = settings or PlanarPoseSettings()
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
@@ -140,7 +140,7 @@ def _weighed(
     s: PlanarPoseSettings,
     prior: PoseGaussian | None,
 ) -> PlanarFix:
-    """The better of a posture and the one mirrored in what it sees, with how the other compares."""
+    """The better of a pose and the one mirrored in what it sees, with how the other compares."""
     seen = fix.inliers & ~stack.inverted
     if int(seen.sum()) < s.least_inliers:
         return fix
@@ -158,7 +158,7 @@ def _weighed(
 
 
 def _scores(parts: Sequence[Sightings], poses: Array) -> Array:
-    """(H,) nats: how much better each of the (H, 3) postures explains the sightings than chance does."""
+    """(H,) nats: how much better each of the (H, 3) poses explains the sightings than chance does."""
     scores = np.zeros(len(poses))
     for part in parts:
         scores += part.log_ratios(poses).sum(axis=1)

@@ -1,6 +1,6 @@
-"""Many planar postures at once: the operations of hybridmap.pose on arrays.
+"""Many planar poses at once: the operations of mapweave.hybridmap.pose on arrays.
 
-A posture is a row (x m, y m, heading rad). A Gaussian posture is a row and a (3, 3) covariance of its
+A pose is a row (x m, y m, heading rad). A Gaussian pose is a row and a (3, 3) covariance of its
 perturbation on the right, as in PoseGaussian.
 """
 
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
 
 
 def compose_poses(a: Array, b: Array) -> Array:
-    """(N, 3) postures `x_from_y` and (N, 3) `y_from_z` -> (N, 3) `x_from_z`, headings wrapped."""
+    """(N, 3) poses `x_from_y` and (N, 3) `y_from_z` -> (N, 3) `x_from_z`, headings wrapped."""
     cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
     heading = (a[:, 2] + b[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return np.stack(
@@ -25,7 +25,7 @@ def compose_poses(a: Array, b: Array) -> Array:
 
 
 def inverse_poses(poses: Array) -> Array:
-    """(N, 3) inverse postures."""
+    """(N, 3) inverse poses."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x = -cos * poses[:, 0] - sin * poses[:, 1]
     y = sin * poses[:, 0] - cos * poses[:, 1]
@@ -44,7 +44,7 @@ def adjoints(poses: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PoseGaussians:
-    """N Gaussian postures.
+    """N Gaussian poses.
 
     Attributes:
         means: (N, 3) m, m, rad.
@@ -55,13 +55,13 @@ class PoseGaussians:
     covariances: Array
 
     def __matmul__(self, other: PoseGaussians) -> PoseGaussians:
-        """Compose independent Gaussian postures to first order, row by row."""
+        """Compose independent Gaussian poses to first order, row by row."""
         ad = adjoints(inverse_poses(other.means))
         carried = ad @ self.covariances @ ad.transpose(0, 2, 1)
         return PoseGaussians(compose_poses(self.means, other.means), carried + other.covariances)
 
     def inverse(self) -> PoseGaussians:
-        """The Gaussians of the inverse postures to first order."""
+        """The Gaussians of the inverse poses to first order."""
         ad = adjoints(self.means)
         return PoseGaussians(inverse_poses(self.means), ad @ self.covariances @ ad.transpose(0, 2, 1))
 

@@ -10,13 +10,13 @@ import math
 
 import numpy as np
 
-from hybridmap.node import Node
-from hybridmap.pose import Array, PoseGaussian
-from hybridmap.query import View
-from registration.gauss_newton import refine, stack_sightings
-from registration.planar_pose import PlanarPoseSettings
-from registration.recognition import Recognition, of_unknown_scale
-from registration.sightings import Sightings
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.registration.gauss_newton import refine, stack_sightings
+from mapweave.registration.planar_pose import PlanarPoseSettings
+from mapweave.registration.recognition import Recognition, of_unknown_scale
+from mapweave.registration.sightings import Sightings
 
 LEAST_SIGMA, ROUNDS = 0.1, 3
 """px, pixels are rounded in a node; and how often the noise is measured anew."""
@@ -42,7 +42,7 @@ def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSett
         node: the place.
         view: the image's features.
         found: that the view shows the node, by landmarks of the node that have a depth.
-        pose: how postures are found.
+        pose: how poses are found.
 
     Returns:
         `node_from_robot`; that of the recognition where there is nothing to add.

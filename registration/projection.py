@@ -1,11 +1,12 @@
-"""Known points in the image of a planar robot: how likely they are there, and which posture they imply.
+"""Known points in the image of a planar robot: how likely they are there, and which pose they imply.
 
 With q the point in the axes of a robot at (x, y, heading), forward, left and up, and the camera
 `mount_forward` ahead of the axle, looking along the robot's x axis,
     X = q_x - mount_forward,  a = q_y / X,  b = (q_z - mount_height) / X,  u = cx - fx a,  v = cy - fy b.
 By the point, in the robot's axes, du = (fx a, -fx, 0) / X and dv = (fy b, 0, -fy) / X.
 
-These are kernels (hybridmap.jit): what is written for sighting n runs for each in turn or for all at once.
+These are kernels (mapweave.hybridmap.jit): what is written for sighting n runs for each in turn or for all
+at once.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridmap.jit import Cube, Flags, Index, Matrix, Vector, compiled, for_each, for_each_pair
+from mapweave.hybridmap.jit import Cube, Flags, Index, Matrix, Vector, compiled, for_each, for_each_pair
 
 NEAREST = 0.05
 """Points less than this ahead of the optical centre count as not visible, m."""
@@ -29,7 +30,7 @@ DEPTH_DECADES = math.log(100.0)
 LOG_DEPTH_DENSITY = math.log(DEPTH_DECADES) - 0.5 * math.log(2.0 * math.pi)
 
 SMALL_STEP = 1e-4
-"""Gauss-Newton ends when no component moves more, m and rad: far below any posture's uncertainty."""
+"""Gauss-Newton ends when no component moves more, m and rad: far below any pose's uncertainty."""
 
 
 class Optics(NamedTuple):
@@ -67,7 +68,7 @@ class Seen(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """H postures of the robot in the points' frame: (H,) m, m and the heading's cosine and sine."""
+    """H poses of the robot in the points' frame: (H,) m, m and the heading's cosine and sine."""
 
     x: Vector
     y: Vector
@@ -77,7 +78,7 @@ class Poses(NamedTuple):
 
 @for_each_pair
 def _log_ratio(h: Index, n: Index, seen: Seen, poses: Poses) -> Vector:
-    """How much likelier sighting n is under posture h than as a wrong match, nats; see `log_ratios`."""
+    """How much likelier sighting n is under pose h than as a wrong match, nats; see `log_ratios`."""
     optics, p = seen.optics, seen.covariances
     c, s = poses.cos[h], poses.sin[h]
     dx, dy = seen.points[n, 0] - poses.x[h], seen.points[n, 1] - poses.y[h]
@@ -111,7 +112,7 @@ def _log_ratio(h: Index, n: Index, seen: Seen, poses: Poses) -> Vector:
 
 @compiled
 def log_ratios(seen: Seen, poses: Poses) -> Matrix:
-    """(H, N) how much likelier sightings are under postures than as wrong matches, nats; 0 where the point is
+    """(H, N) how much likelier sightings are under poses than as wrong matches, nats; 0 where the point is
     behind the camera or outside the 99 % gate.
     """
     return _log_ratio(len(poses.x), len(seen.points), seen, poses)
@@ -128,7 +129,7 @@ class Stack(NamedTuple):
         measured: (N,) where the depth is.
         gates: (N,) largest squared normalised residual of an inlier.
         log_wrong: (N,) what -log of a right match's density is compared with, nats.
-        inverted: (N,) the point is in the robot's frame, and the image was taken where the wanted posture's
+        inverted: (N,) the point is in the robot's frame, and the image was taken where the wanted pose's
             frame has its origin.
         optics: (N, 6) fx, fy, cx, cy px, mount_height, mount_forward m.
     """
@@ -145,12 +146,12 @@ class Stack(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """A stack linearised at a posture and at points.
+    """A stack linearised at a pose and at points.
 
     Attributes:
         reprojection_px: (N, 2) observed minus predicted, against the points where they are now.
         white: (N, 3, 4) for u px, v px and depth m the residual against the point where it was given, and the
-            derivatives of the prediction by the posture's x, y and heading, perturbed on the right as in
+            derivatives of the prediction by the pose's x, y and heading, perturbed on the right as in
             PoseGaussian; whitened by the inverse of the residuals' Cholesky factor. 0 where not visible.
         factor: (N, 6) Cholesky's, 00 10 11 20 21 22, of the covariance of the residuals.
         by_point: (N, 4) du by forward and left, dv by forward and up, px/m, in the axes of the robot whose
@@ -174,11 +175,11 @@ class Linear(NamedTuple):
 
 
 @for_each
-def _linearise(n: Index, stack: Stack, posture: Vector, points: Matrix, out: Linear) -> None:
+def _linearise(n: Index, stack: Stack, pose: Vector, points: Matrix, out: Linear) -> None:
     """Fill in what `linearise` says of sighting n."""
     fx, fy, cx, cy = stack.optics[n, 0], stack.optics[n, 1], stack.optics[n, 2], stack.optics[n, 3]
-    x, y, cos, sin = posture[0], posture[1], math.cos(posture[2]), math.sin(posture[2])
-    # Where the robot whose camera it is stands in the points' frame: at the posture, or at its inverse.
+    x, y, cos, sin = pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])
+    # Where the robot whose camera it is stands in the points' frame: at the pose, or at its inverse.
     inverse = 1.0 * stack.inverted[n]
     direct = 1.0 - inverse
     c, s = cos, sin * (direct - inverse)
@@ -209,8 +210,8 @@ def _linearise(n: Index, stack: Stack, posture: Vector, points: Matrix, out: Lin
     f21 = (v_x * xx + v_z * xz - f20 * f10) / f11
     f22 = np.sqrt(xx + noise[n, 2] - f20 * f20 - f21 * f21)
 
-    # A step of the posture moves the point in the robot's axes by -(1, 0, -left) and -(0, 1, forward); where
-    # inverted, inverse(posture @ d) = inverse(posture) @ (-Ad(posture) d) to first order.
+    # A step of the pose moves the point in the robot's axes by -(1, 0, -left) and -(0, 1, forward); where
+    # inverted, inverse(pose @ d) = inverse(pose) @ (-Ad(pose) d) to first order.
     visible = depth > NEAREST
     white = out.white
     for k in range(4):
@@ -246,14 +247,14 @@ def _linearise(n: Index, stack: Stack, posture: Vector, points: Matrix, out: Lin
 
 
 @compiled
-def linearise(stack: Stack, posture: Vector, points: Matrix) -> Linear:
-    """Linearise sightings at a posture (3,) and at points (N, 3) m near those of the stack."""
+def linearise(stack: Stack, pose: Vector, points: Matrix) -> Linear:
+    """Linearise sightings at a pose (3,) and at points (N, 3) m near those of the stack."""
     count = len(stack.points)
     out = Linear(
         np.empty((count, 2)), np.empty((count, 3, 4)), np.empty((count, 6)), np.empty((count, 4)),
         np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count, np.bool_), np.empty(count),
     )  # fmt: skip
-    _linearise(count, stack, posture, points, out)
+    _linearise(count, stack, pose, points, out)
     return out
 
 
@@ -261,7 +262,7 @@ def linearise(stack: Stack, posture: Vector, points: Matrix) -> Linear:
 def normal_equations(linear: Linear) -> Matrix:
     """(4, 4) products of the columns of all white rows, each counted by its weight.
 
-    Of the posture, [1:, 1:] is the information and [1:, 0] the gradient.
+    Of the pose, [1:, 1:] is the information and [1:, 0] the gradient.
     """
     rows = (linear.white * np.sqrt(linear.weights)[:, None, None]).reshape(-1, 4)
     return rows.T @ rows
@@ -269,7 +270,7 @@ def normal_equations(linear: Linear) -> Matrix:
 
 @compiled
 def determined(information: Matrix) -> bool:
-    """Whether a posture's (3, 3) information is far from singular; lengths and angles count alike at 1 m."""
+    """Whether a pose's (3, 3) information is far from singular; lengths and angles count alike at 1 m."""
     if not np.isfinite(information).all():
         return False
     values = np.linalg.eigvalsh(information)
@@ -278,7 +279,7 @@ def determined(information: Matrix) -> bool:
 
 @for_each
 def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matrix) -> None:
-    """Put point n where it fits best after a step of the posture, within its uncertainty; outliers back."""
+    """Put point n where it fits best after a step of the pose, within its uncertainty; outliers back."""
     white, factor, p = linear.white, linear.factor, stack.covariances
     # The residual that is left, times the inverse of its covariance.
     left0 = white[n, 0, 0] - white[n, 0, 1] * step[0] - white[n, 0, 2] * step[1] - white[n, 0, 3] * step[2]
@@ -301,36 +302,36 @@ def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matri
 def improve(
     stack: Stack, start: Vector, prior: Vector, prior_information: Matrix, rounds: int
 ) -> tuple[bool, Vector, Matrix]:
-    """Bring a posture to its best near a first one by Gauss-Newton.
+    """Bring a pose to its best near a first one by Gauss-Newton.
 
     Args:
         stack: the sightings.
         start: (3,) m, m, rad.
-        prior: (3,) mean of what else is known of the posture.
+        prior: (3,) mean of what else is known of the pose.
         prior_information: (3, 3) of that, zero if nothing is.
         rounds: at most.
 
     Returns:
-        Whether the inliers determine a posture; the posture (3,); and the points (N, 3) m that fit it best.
+        Whether the inliers determine a pose; the pose (3,); and the points (N, 3) m that fit it best.
     """
-    posture, points = start.copy(), stack.points.copy()
+    pose, points = start.copy(), stack.points.copy()
     away = np.empty(3)
     for _ in range(rounds):
-        linear = linearise(stack, posture, points)
+        linear = linearise(stack, pose, points)
         products = normal_equations(linear)
         information = products[1:, 1:] + prior_information
-        c, s = math.cos(posture[2]), math.sin(posture[2])
-        dx, dy = prior[0] - posture[0], prior[1] - posture[1]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        dx, dy = prior[0] - pose[0], prior[1] - pose[1]
         away[0], away[1] = c * dx + s * dy, c * dy - s * dx
-        away[2] = (prior[2] - posture[2] + math.pi) % (2.0 * math.pi) - math.pi
+        away[2] = (prior[2] - pose[2] + math.pi) % (2.0 * math.pi) - math.pi
         if not determined(information):
-            return False, posture, points
+            return False, pose, points
         gradient = products[1:, 0] + prior_information @ away
         step = np.linalg.solve(information, gradient).astype(np.float64)
-        posture[0] += c * step[0] - s * step[1]
-        posture[1] += s * step[0] + c * step[1]
-        posture[2] = (posture[2] + step[2] + math.pi) % (2.0 * math.pi) - math.pi
+        pose[0] += c * step[0] - s * step[1]
+        pose[1] += s * step[0] + c * step[1]
+        pose[2] = (pose[2] + step[2] + math.pi) % (2.0 * math.pi) - math.pi
         _move_point(len(points), stack, linear, step, points)
         if np.abs(step).max() < SMALL_STEP:
             break
-    return True, posture, points
+    return True, pose, points

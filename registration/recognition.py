@@ -1,10 +1,10 @@
 """Is this image of that place, and where was it taken: matches, then geometry, then an honest verdict.
 
 What the geometry can rule out is chance: a wrong match hits the small gate around a point's projection about
-once in three hundred times, so a handful of inliers more than the posture needs is no accident. What it
+once in three hundred times, so a handful of inliers more than the pose needs is no accident. What it
 cannot rule out is another place with the same things in it. So a recognition also has to explain a good share
-of the features that matched at all, all over the image, and determine the posture; and its numbers are kept
-as evidence for those who can compare places (merge, mapserver.relocalizing.relocalization).
+of the features that matched at all, all over the image, and determine the pose; and its numbers are kept
+as evidence for those who can compare places (merge, mapweave.mapserver.relocalization.relocalizer).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.node import Landmarks, Node
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import View
-from registration.evidence import GRID, depth_agreement, gather
-from registration.matching import MatchSettings, match
-from registration.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
-from registration.sightings import Sightings
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import Landmarks, Node
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.registration.evidence import GRID, depth_agreement, gather
+from mapweave.registration.matching import MatchSettings, match
+from mapweave.registration.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
+from mapweave.registration.sightings import Sightings
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class RecognitionSettings:
 
     Attributes:
         matching: how features are matched.
-        pose: how the posture is found.
+        pose: how the pose is found.
         least_inliers: landmarks that agree.
         least_share: of the matches that could have been inliers.
         least_cells: cells of the 6 x 4 grid with an inlier, in either image.
-        least_seen: of the landmarks that should be in the image by the posture found, on the side where it
+        least_seen: of the landmarks that should be in the image by the pose found, on the side where it
             is more. A poster that hangs in two rooms explains few of what else should be there.
         least_depths: of the landmarks that fit by their pixels and have a depth on both sides, how many
             agree in depth too.
@@ -45,7 +45,7 @@ class RecognitionSettings:
         most_position_share: largest standard deviation of the position as a share of the median depth of
             the inliers.
         most_heading_sigma: rad.
-        most_rival: what the posture mirrored in what is seen may explain, as a share of what the best does:
+        most_rival: what the pose mirrored in what is seen may explain, as a share of what the best does:
             a flat thing from afar looks almost the same from two sides.
     """
 
@@ -68,12 +68,12 @@ class Recognition:
     """A place was recognised.
 
     Attributes:
-        node_from_robot: posture of the robot that took the view, in the node's robot frame. For two nodes
+        node_from_robot: pose of the robot that took the view, in the node's robot frame. For two nodes
             a and b this is `a_from_b`.
         pairs: (K, 2) int64, inliers: landmark of the node (a), feature of the view (landmark of b).
         matches: mutual matches, with or without depth.
         usable: matches with a depth on either side, which could have been inliers.
-        fix: the posture with its residuals.
+        fix: the pose with its residuals.
         evidence: the numbers that support it, for an edge's `evidence`.
     """
 
@@ -97,9 +97,9 @@ class Refusal:
     Attributes:
         reason: in words.
         matches: mutual matches.
-        pairs: (K, 2) int64, landmarks that agree on the best posture; none without one.
-        node_from_robot: the best posture, which was not good enough; None if nothing agrees on any.
-        evidence: the numbers by which it was refused; empty without a posture.
+        pairs: (K, 2) int64, landmarks that agree on the best pose; none without one.
+        node_from_robot: the best pose, which was not good enough; None if nothing agrees on any.
+        evidence: the numbers by which it was refused; empty without a pose.
     """
 
     reason: str
@@ -220,7 +220,7 @@ def _examine(
     ]
     fix = solve_sightings(sightings, rng=rng, settings=s.pose)
     if fix is None:
-        return Refusal(f"{len(usable)} matches agree on no posture", len(pairs))
+        return Refusal(f"{len(usable)} matches agree on no pose", len(pairs))
     inliers = usable[fix.inliers]
     evidence = gather(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
     evidence["depths"] = depth_agreement(sightings[0], fix)
@@ -229,24 +229,24 @@ def _examine(
     if reason:
         return Refusal(reason, len(pairs), inliers, fix.node_from_robot, evidence)
     unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
-    posture = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
-    return Recognition(posture, inliers, len(pairs), len(usable), fix, evidence)
+    pose = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
+    return Recognition(pose, inliers, len(pairs), len(usable), fix, evidence)
 
 
-def of_unknown_scale(posture: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:
-    """A posture that may be too far away, or too near, by a share of the way between the two cameras.
+def of_unknown_scale(pose: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:
+    """A pose that may be too far away, or too near, by a share of the way between the two cameras.
 
     Args:
-        posture: node_from_robot.
+        pose: node_from_robot.
         share: Landmarks.scale_share.
         of_node: camera that took the node.
         of_view: the robot's.
     """
     if not share:
-        return posture
-    camera = (posture.mean @ Pose2(of_view.mount_forward)).vector[:2] - [of_node.mount_forward, 0.0]
-    change = np.append(share * (posture.mean.rotation.T @ camera), 0.0)
-    return PoseGaussian(posture.mean, posture.covariance + np.outer(change, change))
+        return pose
+    camera = (pose.mean @ Pose2(of_view.mount_forward)).vector[:2] - [of_node.mount_forward, 0.0]
+    change = np.append(share * (pose.mean.rotation.T @ camera), 0.0)
+    return PoseGaussian(pose.mean, pose.covariance + np.outer(change, change))
 
 
 def _sightings(
@@ -275,13 +275,13 @@ def _sightings(
 
 
 def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
-    """Why a posture is not good enough, in words; empty if it is."""
+    """Why a pose is not good enough, in words; empty if it is."""
     e = evidence
     inliers = int(e["inliers"])
     if inliers < s.least_inliers:
-        return f"{inliers} landmarks agree on a posture; {s.least_inliers} are needed"
+        return f"{inliers} landmarks agree on a pose; {s.least_inliers} are needed"
     if e["share"] < s.least_share:
-        return f"only {e['share']:.0%} of the matches agree on one posture"
+        return f"only {e['share']:.0%} of the matches agree on one pose"
     if e["cells"] < s.least_cells:
         return f"the {inliers} landmarks that agree lie in {int(e['cells'])} of {math.prod(GRID)} image cells"
     if e["seen"] < s.least_seen:
@@ -291,7 +291,7 @@ def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
     if e["log_evidence"] < s.least_evidence:
         return f"the {inliers} landmarks that agree are hardly better than chance"
     if e["rival"] > s.most_rival:
-        return f"a posture on the other side of what is seen explains {e['rival']:.0%} as much"
+        return f"a pose on the other side of what is seen explains {e['rival']:.0%} as much"
     if e["mean_square"] > s.most_mean_square:
         return f"the residuals are {math.sqrt(e['mean_square']):.1f} times what they should be"
     if e["sigma_xy"] > s.most_position_share * e["depth"]:

@@ -1,7 +1,7 @@
 """Which landmarks a node keeps: those that will be found again, all over the image, and unlike each other.
 
 A landmark's worth is given by who has followed it. What else is kept already lowers it: a second landmark
-at the same spot adds little, for a posture is determined by spread. So they are chosen one by one, always
+at the same spot adds little, for a pose is determined by spread. So they are chosen one by one, always
 the one that is worth most then, until the node has cost what it may.
 """
 
@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.descriptor import decode, rounding_noise
-from hybridmap.errors import InvalidValue
-from hybridmap.grid import FINE_BITS, PixelGrid, round_depths
-from hybridmap.landmark_tables import DIMENSIONS, TOTAL_BITS, landmark_tables
-from hybridmap.node import Landmarks
-from hybridmap.pose import Array
-from registration.matching import squared_distances
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.descriptor import decode, rounding_noise
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.landmark_tables import DIMENSIONS, TOTAL_BITS, landmark_tables
+from mapweave.hybridmap.node import Landmarks
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.quantization import FINE_BITS, PixelGrid, round_depths
+from mapweave.registration.matching import squared_distances
 
 FIXED_BYTES = 330
-"""A node without landmarks: names, posture, camera, 16 ranges, checksums and the transport's frame."""
+"""A node without landmarks: names, pose, camera, 16 ranges, checksums and the transport's frame."""
 
 LANE_BITS = 3.25
 """What a landmark costs at most beyond the logarithms of its numbers: whole bits, and the row it is in."""

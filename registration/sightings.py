@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array
-from registration.pose_arrays import inverse_poses
-from registration.projection import Optics, Poses, Seen, log_ratios
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
+from mapweave.registration.pose_arrays import inverse_poses
+from mapweave.registration.projection import Optics, Poses, Seen, log_ratios
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,14 +24,14 @@ class Sightings:
     """N points that are known in one frame and were seen, rightly or wrongly matched, in one image.
 
     Attributes:
-        points: (N, 3) m, in the frame where the robot's posture is wanted; finite.
+        points: (N, 3) m, in the frame where the robot's pose is wanted; finite.
         covariances: (N, 3, 3) m^2, of the points.
         pixels: (N, 2) px, where the image shows them.
         camera: that took the image.
         pixel_sigma: standard deviation of a pixel, px.
         depths: (N,) m, measured along the optical axis of the image; NaN where not measured.
         depth_sigmas: (N,) m, of these.
-        inverted: the points are in the robot's frame, and the image was taken where the wanted posture's
+        inverted: the points are in the robot's frame, and the image was taken where the wanted pose's
             frame has its origin.
     """
 
@@ -98,14 +98,14 @@ class Sightings:
         return np.isfinite(self.depths) & np.isfinite(self.depth_sigmas)
 
     def log_ratios(self, poses: Array) -> Array:
-        """How much likelier each sighting is under each posture than as a wrong match.
+        """How much likelier each sighting is under each pose than as a wrong match.
 
         A right match is Gaussian around the point's projection, with the point's covariance carried into
         the image and the pixel's noise added; a wrong one is anywhere in the image. So a point that is hardly
         known gives little, and one with an uncertain depth must still lie along its own short line.
 
         Args:
-            poses: (H, 3) m, m, rad, wanted postures.
+            poses: (H, 3) m, m, rad, wanted poses.
 
         Returns:
             (H, N) nats; 0 for sightings outside the 99 % gate or behind the camera.

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2
-from sim import surface
-from sim.floorplan import Rectangle, distances_to
-from sim.grain import clouds
-from sim.places import Points
-from sim.texture import Image, Texture
-from sim.world import Block, PanelSet, block_panels
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim import surface
+from mapweave.sim.floorplan import Rectangle, distances_to
+from mapweave.sim.image_noise import clouds
+from mapweave.sim.placement import Points
+from mapweave.sim.texture import Image, Texture
+from mapweave.sim.world import Block, PanelSet, block_panels
 
 AHEAD = 0.5
 """Who walks stops when a robot is nearer than this ahead, m."""

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, Odometry, RobotDescription
-from hybridmap.pose import Array, Pose2
-from sim import surface
-from sim.camera import check_range
-from sim.floorplan import Rectangle
-from sim.texture import Texture
-from sim.world import Block, PanelSet, block_panels
+from mapweave.agent.observation import Command, Odometry, RobotDescription
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim import surface
+from mapweave.sim.camera import check_range
+from mapweave.sim.floorplan import Rectangle
+from mapweave.sim.texture import Texture
+from mapweave.sim.world import Block, PanelSet, block_panels
 
 if TYPE_CHECKING:
-    from sim.physics import Physics
+    from mapweave.sim.physics import Physics
 
 WHEEL_RADIUS = 0.05
 """Nominal, m: what the robot believes."""

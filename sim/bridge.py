@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from agent.drivers.messages import (
+from mapweave.agent.drivers.messages import (
     AGAIN,
     ENDED,
     StepRequest,
@@ -17,14 +17,14 @@ from agent.drivers.messages import (
     encode_description,
     encode_observation,
 )
-from agent.drivers.remote import clip
-from hybridmap.errors import MapweaveError
-from sim.desk import ControlDesk
-from sim.keys import SimKeys
-from sim.lockstep import Lockstep, Seat
-from sim.lockstep_robot import Rendezvous, decode_rendezvous
-from sim.simulated import Simulated
-from wire.bus import Bus, Request
+from mapweave.agent.drivers.remote import clip
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.sim.ground_truth_service import GroundTruthService
+from mapweave.sim.keys import SimKeys
+from mapweave.sim.lockstep import Lockstep, Seat
+from mapweave.sim.lockstep_robot import Rendezvous, decode_rendezvous
+from mapweave.sim.simulation_interface import Simulated
+from mapweave.wire.bus import Bus, Request
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class SimBridge:
         self._farewell = farewell
         self._lockstep = Lockstep(simulation.robots, patience, expected)
         self._wall = dict.fromkeys(("waiting", "replying", "control"), 0.0)
-        self._desk = ControlDesk(simulation, lambda: self._lockstep.active, self._wall, self._stop)
+        self._desk = GroundTruthService(simulation, lambda: self._lockstep.active, self._wall, self._stop)
         self._changed = threading.Condition()
         self._inbox: deque[Callable[[], None]] = deque()
         self._limit: int | None = 0 if held else None

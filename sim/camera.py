@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array
 
 Distortion = tuple[float, float, float, float, float]
 """(k1, k2, p1, p2, k3), OpenCV's order."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hybridmap.errors import InvalidValue
-from sim.camera import check_range
-from wire.tables import build
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim.camera import check_range
+from mapweave.storage.settings_file import build
 
 LONGEST = 1e6
 """No event takes longer, s."""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agent.observation import Odometry
-from hybridmap.pose import Array
-from sim.events import Fail
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.events import Fail
 
 
 class Faults:

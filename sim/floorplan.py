@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
 
 CELL = 0.05
 """Grid step of the free-space search, m."""

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Pose2
-from sim.floorplan import FloorPlan, Grid, Rectangle, distances_to
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.floorplan import FloorPlan, Grid, Rectangle, distances_to
 
 PASSAGE = 0.45
 """A disc of this radius gets from the middle of each room to all rooms to which it got before, m."""

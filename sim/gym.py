@@ -1,7 +1,7 @@
 """A Gymnasium environment: one robot parks before what it sees, in a new world for each seed.
 
     import gymnasium
-    env = gymnasium.make("sim.gym:mapweave/Park-v0")
+    env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0")
 
 Gymnasium is an extra: `pip install mapweave[gym]`.
 """
@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, Observation
-from hybridmap.errors import InvalidValue, SettingsError
-from hybridmap.pose import Pose2, wrap_angle
-from sim.places import is_clear
-from sim.robots import RobotSetup
-from sim.simulation import TICK, Simulation
-from sim.world import World
-from sim.worlds.catalog import make_world
+from mapweave.agent.observation import Command, Observation
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.sim.placement import is_clear
+from mapweave.sim.robots import RobotSetup
+from mapweave.sim.simulation import TICK, Simulation
+from mapweave.sim.world import World
+from mapweave.sim.worlds.catalog import make_world
 
 try:
     import gymnasium
     from gymnasium import spaces
 except ImportError:
-    raise SettingsError("sim.gym needs Gymnasium: pip install mapweave[gym]") from None
+    raise SettingsError("mapweave.sim.gym needs Gymnasium: pip install mapweave[gym]") from None
 
 REACHED = 0.05
 """A robot is parked when it is nearer than this to the goal, m,"""
@@ -46,7 +46,7 @@ Seen = dict[str, Any]
 
 
 class MapweaveEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
-    """Drive to a posture that is given relative to the start.
+    """Drive to a pose that is given relative to the start.
 
     Observation, a dict:
         image: (H, W) uint8, as the camera gives it; where a frame was dropped, the one before.
@@ -77,7 +77,7 @@ class MapweaveEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         """Describe what will be seen and done; the world is built by `reset`.
 
         Args:
-            kind: of world, see sim.worlds.catalog.
+            kind: of world, see mapweave.sim.worlds.catalog.
             seconds: an episode that takes longer is truncated, simulated s.
             robot: what to drive.
             render_mode: "rgb_array", or None.
@@ -221,4 +221,4 @@ class MapweaveEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         }
 
 
-gymnasium.register(id="mapweave/Park-v0", entry_point="sim.gym:MapweaveEnv")
+gymnasium.register(id="mapweave/Park-v0", entry_point="mapweave.sim.gym:MapweaveEnv")

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array
-from sim.camera import CameraSetup, Distortion, undistorted
-from sim.renderer import Renderer
-from sim.scene import Scene
-from sim.texture import Image
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.camera import CameraSetup, Distortion, undistorted
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.scene import Scene
+from mapweave.sim.texture import Image
 
 MARGIN_PX = 2
 """The ideal picture reaches so far beyond what the lens shows, for interpolation."""
@@ -68,7 +68,7 @@ class Imager:
     def picture(
         self,
         scene: Scene,
-        posture: tuple[NDArray[np.float64], NDArray[np.float64]],
+        pose: tuple[NDArray[np.float64], NDArray[np.float64]],
         lamps: float,
         turn_rate: float,
         seconds: float,
@@ -78,7 +78,7 @@ class Imager:
 
         Args:
             scene: all there is to see.
-            posture: (3,) m of the robot's origin, and (3, 3) rotation of its axes, in world.
+            pose: (3,) m of the robot's origin, and (3, 3) rotation of its axes, in world.
             lamps: brightness, 1 as painted.
             turn_rate: of the robot, rad/s.
             seconds: since the picture before, s.
@@ -87,7 +87,7 @@ class Imager:
         Returns:
             (H, W) grey, as the robot gets it.
         """
-        position, rotation = posture
+        position, rotation = pose
         self._adapt(seconds)
         camera = self.setup.intrinsics
         if covered is not None:

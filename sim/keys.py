@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybridmap.node import check_name
-from wire.keys import Keys
+from mapweave.hybridmap.node import check_name
+from mapweave.wire.keys import Keys
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class SimKeys(Keys):
 
     def control(self) -> str:
         """Where the simulator takes commands (kidnap, truth, stop)."""
-        return f"{self.root}/sim/control"
+        return f"{self.root}/sim/ground_truth_client"
 
     def sim_alive(self) -> str:
         """Under which the simulator is alive."""

@@ -10,10 +10,10 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from agent.drivers.messages import AGAIN, StepRequest
-from hybridmap.errors import InvalidValue
-from sim.lockstep_robot import Rendezvous
-from wire.bus import Request
+from mapweave.agent.drivers.messages import AGAIN, StepRequest
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim.lockstep_robot import Rendezvous
+from mapweave.wire.bus import Request
 
 log = logging.getLogger(__name__)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agent.drivers.remote import PATIENCE, RemoteRobot
-from sim.keys import SimKeys
-from wire.bus import Bus
-from wire.packing import MAX_NUMBER, Reader, pack
+from mapweave.agent.drivers.remote import PATIENCE, RemoteRobot
+from mapweave.sim.keys import SimKeys
+from mapweave.wire.bus import Bus
+from mapweave.wire.packing import MAX_NUMBER, Reader, pack
 
 MAX_BYTES = 64
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2
-from sim.camera import CameraSetup
-from sim.floorplan import FloorPlan
-from sim.imager import Imager
-from sim.scene import Scene
-from sim.texture import Image
-from sim.world import PanelSet, World
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.camera import CameraSetup
+from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.imager import Imager
+from mapweave.sim.scene import Scene
+from mapweave.sim.texture import Image
+from mapweave.sim.world import PanelSet, World
 
 CLEARANCE = 0.3
 """m on either side of the way, so that a robot can follow."""
@@ -31,7 +31,7 @@ above or below its height; and by which share of it a step is longer or shorter 
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A picture, and where it was really taken: below the camera, which looked along the posture's x axis."""
+    """A picture, and where it was really taken: below the camera, which looked along the pose's x axis."""
 
     image: Image
     world_from_camera: Pose2

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import RobotDescription
-from hybridmap.pose import Array, Pose2
-from sim.physics import Physics
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.physics import Physics
 
 HEIGHT = 0.12
 """Of the sensors above the floor, m."""

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array
-from sim.scene import Scene, cross
-from sim.texture import Image, Texture
-from sim.warp import warped
-from sim.world import PanelSet
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.scene import Scene, cross
+from mapweave.sim.texture import Image, Texture
+from mapweave.sim.warp import warped
+from mapweave.sim.world import PanelSet
 
 NEAR = 0.03
 """Nothing nearer than this along the optical axis is drawn, m."""

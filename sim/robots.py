@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from agent.observation import RobotDescription
-from hybridmap.errors import InvalidValue, SettingsError
-from hybridmap.node import check_name
-from hybridmap.pose import Pose2
-from sim.body import BodySettings
-from sim.camera import CAMERAS, CameraSetup, check_range
-from wire.tables import build
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.node import check_name
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.body import BodySettings
+from mapweave.sim.camera import CAMERAS, CameraSetup, check_range
+from mapweave.storage.settings_file import build
 
 MOST_ROBOTS = 16
 """In one simulation."""

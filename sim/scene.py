@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
-from sim.world import PanelSet
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.world import PanelSet
 
 
 class Scene:

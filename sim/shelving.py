@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sim.grain import clouds
-from sim.print import geometric_art, text_page
-from sim.signage import sign, write
-from sim.texture import Image
+from mapweave.sim.image_noise import clouds
+from mapweave.sim.printed_textures import geometric_art, text_page
+from mapweave.sim.signage import sign, write
+from mapweave.sim.texture import Image
 
 DESIGNS = 5
 """Kinds of carton in one warehouse."""

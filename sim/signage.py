@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sim.grain import noise
-from sim.print import LETTERS, text_page
-from sim.texture import Image
+from mapweave.sim.image_noise import noise
+from mapweave.sim.printed_textures import LETTERS, text_page
+from mapweave.sim.texture import Image
 
 CAPITALS = np.array(list("ABCDEFGHJKLMNPQRSTUVWXYZ"))
 DIGITS = np.array(list("0123456789"))

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agent.observation import Observation, RobotDescription
-from hybridmap.pose import Pose2, wrap_angle
-from sim.body import Body
-from sim.faults import Faults
-from sim.imager import Imager
-from sim.rangers import Rangers
-from sim.robots import RobotSetup
-from sim.stage import RigidPose, Stage
-from sim.texture import Image
+from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.sim.body import Body
+from mapweave.sim.faults import Faults
+from mapweave.sim.imager import Imager
+from mapweave.sim.rangers import Rangers
+from mapweave.sim.robots import RobotSetup
+from mapweave.sim.stage import RigidPose, Stage
+from mapweave.sim.texture import Image
 
 
 class SimulatedRobot:
@@ -62,7 +62,7 @@ class SimulatedRobot:
         self._dropped = (-1, False)
 
     def look(self, tick: int) -> RigidPose:
-        """Read the true posture out of the physics; call after whatever may have moved the robot."""
+        """Read the true pose out of the physics; call after whatever may have moved the robot."""
         self._placement = placement = self.body.position_and_rotation()
         position, rotation = placement
         pose = Pose2(float(position[0]), float(position[1]), math.atan2(rotation[1, 0], rotation[0, 0]))

@@ -11,19 +11,19 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, Observation, RobotDescription
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2
-from sim import rangers
-from sim.body import body_panels
-from sim.events import SimEvent
-from sim.happening import Happening
-from sim.places import starting_places
-from sim.robots import RobotSetup, robot_setups
-from sim.simulated_robot import SimulatedRobot
-from sim.snapshot import Snapshot
-from sim.stage import SUBSTEPS, Stage
-from sim.world import World
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim import rangers
+from mapweave.sim.body import body_panels
+from mapweave.sim.event_executor import EventExecutor
+from mapweave.sim.events import SimEvent
+from mapweave.sim.placement import starting_places
+from mapweave.sim.robots import RobotSetup, robot_setups
+from mapweave.sim.simulated_robot import SimulatedRobot
+from mapweave.sim.snapshot import Snapshot
+from mapweave.sim.stage import SUBSTEPS, Stage
+from mapweave.sim.world import World
 
 TICK = 0.1
 """Simulated time of a tick, s."""
@@ -70,7 +70,7 @@ class Simulation:
             setup.name: SimulatedRobot(setup, self._stage, place, (seed, k))
             for k, (setup, place) in enumerate(zip(setups, places, strict=True))
         }
-        self._happening = Happening(self._stage, self._robots, seed)
+        self._happening = EventExecutor(self._stage, self._robots, seed)
         self._clock = re.sub(r"[^a-z0-9-]", "-", f"sim-{world.name}-{seed}".lower())[:32]
         self._wall = {"physics": 0.0, "rangers": 0.0}
         self._log: dict[str, list[Array]] = {name: [] for name in self.robots}
@@ -200,7 +200,7 @@ class Simulation:
         return self._robots[name]
 
     def _sense(self) -> None:
-        """Read postures and rangers of all robots: PyBullet serves one thread at a time."""
+        """Read poses and rangers of all robots: PyBullet serves one thread at a time."""
         start = time.perf_counter()
         robots = tuple(self._robots.values())
         self._stage.place_robots([robot.look(self.tick) for robot in robots])

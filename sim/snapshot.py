@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Pose2
-from sim.floorplan import Rectangle
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.floorplan import Rectangle
 
 
 @dataclass(frozen=True, eq=False)

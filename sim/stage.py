@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, Pose2
-from sim.actors import Actor, figure_panels
-from sim.physics import Physics
-from sim.scene import Scene
-from sim.world import Block, PanelSet, World
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.actors import Actor, figure_panels
+from mapweave.sim.physics import Physics
+from mapweave.sim.scene import Scene
+from mapweave.sim.world import Block, PanelSet, World
 
 SUBSTEPS = 8
 """Steps of the physics in a tick: 80 Hz."""
@@ -68,7 +68,7 @@ class Stage:
         self._cast: list[_Cast] = []
         self._light = (1.0, 1.0, 0, 0)
         self.lamps = 1.0
-        self._postures: tuple[RigidPose, ...] = ()
+        self._poses: tuple[RigidPose, ...] = ()
         self.scene = self._assemble()
 
     @property
@@ -76,10 +76,10 @@ class Stage:
         """Who is there now."""
         return tuple(one.actor for one in self._cast)
 
-    def place_robots(self, postures: Sequence[RigidPose]) -> None:
+    def place_robots(self, poses: Sequence[RigidPose]) -> None:
         """Show the robots where they are now."""
-        self._postures = tuple(postures)
-        for number, (position, rotation) in enumerate(postures):
+        self._poses = tuple(poses)
+        for number, (position, rotation) in enumerate(poses):
             self.scene.place(number, rotation, position)
 
     def pass_time(self, tick: int, seconds: float, robots: Array) -> None:
@@ -144,7 +144,7 @@ class Stage:
 
     def _assemble(self) -> Scene:
         scene = self.scene = Scene([*self._looks, self._still, *(one.looks for one in self._cast)])
-        self.place_robots(self._postures)
+        self.place_robots(self._poses)
         for number in range(len(self._cast)):
             self._stand(number)
         return scene

@@ -1,4 +1,4 @@
-"""Painters of whole surfaces: walls, furniture, floors. `sim.worlds.light` shines on them."""
+"""Painters of whole surfaces: walls, furniture, floors. `mapweave.sim.worlds.light` shines on them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import itertools
 import cv2
 import numpy as np
 
-from sim.grain import Field, clouds, noise
-from sim.print import LETTERS, framed_print
-from sim.texture import Image
+from mapweave.sim.image_noise import Field, clouds, noise
+from mapweave.sim.printed_textures import LETTERS, framed_print
+from mapweave.sim.texture import Image
 
 TEXELS_PER_METRE = 280
 """Resolution of walls and furniture: what a 320 px, 60 degree camera resolves at 1 m."""

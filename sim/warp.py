@@ -7,8 +7,8 @@ import math
 import cv2
 import numpy as np
 
-from hybridmap.pose import Array
-from sim.texture import Image, Texture
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.texture import Image, Texture
 
 
 def warped(

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2
-from sim.floorplan import FloorPlan, Rectangle
-from sim.furnishing import rearrange
-from sim.starting import spread
-from sim.texture import Texture
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.furnishing import rearrange
+from mapweave.sim.start_poses import spread
+from mapweave.sim.texture import Texture
 
 
 @dataclass(frozen=True, slots=True)

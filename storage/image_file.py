@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.errors import DeviceError, InvalidValue
-from wire.whole_file import read_whole
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.storage.atomic_file import read_whole
 
 MAX_PIXELS = 50_000_000
 """Larger images are refused before they are decoded; phones take up to 50 megapixels."""

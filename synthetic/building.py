@@ -15,17 +15,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.change import ChangeBody, EdgePut, NodePut
-from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from merge.graph.candidates import Pair
-from merge.graph.links import Link
-from synthetic.world import (
-    Sensing,
-    World,
-    room,
-    take_node,
-)
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.links import Link
+from synthetic.world import Sensing, World, room, take_node
 
 WIDTH, DEPTH = 5.0, 4.0
 """Of a room, m."""
@@ -122,7 +117,7 @@ class Building:
                 yield map_id, EdgePut(Edge(edge_id, earlier, node_id, step, EdgeKind.MAPPED))
 
     def _corner(self, robot: int, k: int) -> Pose2:
-        """World posture of the room's corner: rooms differ in what they show alone."""
+        """World pose of the room's corner: rooms differ in what they show alone."""
         x, y, _ = self.truth[robot, k]
         # Stops are never further than a half pitch from the middle.
         cell = np.round((np.array([x, y]) - [WIDTH / 2, DEPTH / 2]) / PITCH)

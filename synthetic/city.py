@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from hybridmap.pose import Array, Pose2
-from mapweave.g2o import G2oEdge, G2oGraph
+from mapweave.formats.g2o import G2oEdge, G2oGraph
+from mapweave.hybridmap.pose import Array, Pose2
 
 HEADING_SIGMAS = {"grid_a": 0.01, "grid_b": 0.03, "grid_c": 0.1}
 """Of each edge, rad."""
@@ -27,7 +27,7 @@ RECOGNISED = 0.4
 
 
 def draw_grid(nodes: int, heading_sigma: float, rng: np.random.Generator) -> G2oGraph:
-    """Draw a graph; its postures are those of dead reckoning.
+    """Draw a graph; its poses are those of dead reckoning.
 
     Args:
         nodes: how many.
@@ -38,8 +38,8 @@ def draw_grid(nodes: int, heading_sigma: float, rng: np.random.Generator) -> G2o
     true = _drive(nodes, rng)
     edges = [_edge(k, k + 1, true, sigmas, rng) for k in range(nodes - 1)]
     seen: dict[tuple[int, int], list[int]] = {}
-    for k, posture in enumerate(true):
-        here = seen.setdefault((round(posture.x), round(posture.y)), [])
+    for k, pose in enumerate(true):
+        here = seen.setdefault((round(pose.x), round(pose.y)), [])
         edges += [_edge(i, k, true, sigmas, rng) for i in here if k - i > APART and rng.random() < RECOGNISED]
         here.append(k)
     poses = {0: Pose2()}

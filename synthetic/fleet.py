@@ -1,6 +1,6 @@
 """Synthetic fleets: maps that drift, links that are true, and links that are false.
 
-Only postures are drawn, no landmarks: what is tried here begins where verification ends. False links come as
+Only poses are drawn, no landmarks: what is tried here begins where verification ends. False links come as
 they do in buildings: a place that looks like another gives one to four of them, which agree with each other
 and with as many landmarks as true ones have.
 """
@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import CODE_BYTES, Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from merge.graph.links import Link
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import CODE_BYTES, Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.merge.pose_graph.links import Link
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25, mount_forward=0.08)
 BARE = Landmarks(
@@ -90,7 +90,7 @@ def draw_fleet(
         map_id = MapId(f"r{k}", 1)
         walk = walk_of(s, rng)
         maps[map_id] = map_of(map_id, walk, rng)
-        truth |= {NodeId(map_id.agent, 1, n): posture for n, posture in enumerate(walk)}
+        truth |= {NodeId(map_id.agent, 1, n): pose for n, pose in enumerate(walk)}
     true = _true_links(truth, s, rng)
     wanted = round(len(true) * false_share / (1.0 - false_share))
     false = _false_links(truth, {link.pair for link in true}, wanted, s, rng)
@@ -103,12 +103,12 @@ def map_of(map_id: MapId, walk: list[Pose2], rng: np.random.Generator) -> Hybrid
     """A robot's map of a walk, in its own frame, by edges that are off by about `STEP_SIGMAS`."""
     one, covariance = HybridMap(), np.diag(STEP_SIGMAS**2)
     here = PoseGaussian(Pose2(), np.zeros((3, 3)))
-    for k, posture in enumerate(walk):
+    for k, pose in enumerate(walk):
         node_id = NodeId(map_id.agent, map_id.epoch, k)
         step = None
         if k:
             noise = Pose2.from_vector(rng.normal(0, STEP_SIGMAS))
-            step = PoseGaussian(walk[k - 1].inverse() @ posture @ noise, covariance)
+            step = PoseGaussian(walk[k - 1].inverse() @ pose @ noise, covariance)
             here = here @ step
         one.apply(NodePut(Node(node_id, k * 1_000_000_000, here, CAMERA, BARE)))
         if step is not None:

@@ -16,13 +16,13 @@ import gtsam
 import networkx as nx
 import numpy as np
 
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2
-from merge.graph.component import along_tree
-from merge.graph.factors import Factors, Measurement
-from merge.graph.fragments import Fragment, fragment_by_node
-from merge.graph.links import Link
-from merge.graph.optimization import ANCHOR_SIGMA, add_measurements
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.pose_graph.component import along_tree
+from mapweave.merge.pose_graph.factors import Factors, Measurement
+from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, add_measurements
 
 SURE = 0.5
 """Weight from which a measurement counts as right; at the end nearly all weights are 0 or 1."""

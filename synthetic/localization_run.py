@@ -1,6 +1,6 @@
-"""The localization filter at work: landmarks as a map has them, a posture nearly unknown, drives at a node.
+"""The localization filter at work: landmarks as a map has them, a pose nearly unknown, drives at a node.
 
-A start is as the paper's: the posture is wrong by 1 m in x and in y and by 1 rad (standard deviations), at
+A start is as the paper's: the pose is wrong by 1 m in x and in y and by 1 rad (standard deviations), at
 least four landmarks of the node are in view for the static fix, and the filter has 19 steps to find itself.
 """
 
@@ -11,22 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.ekf.localization import LocalizationFilter
-from agent.observation import Odometry
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from synthetic.mapping_run import (
-    AXLE,
-    CAMERA,
-    TICK,
-    WHEEL_NOISE,
-)
+from mapweave.agent.ekf.localization_filter import LocalizationFilter
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from synthetic.mapping_run import AXLE, CAMERA, TICK, WHEEL_NOISE
 
 FEW = 6
 """So many landmarks in view at the start, or fewer, are few."""
 
 _PIXEL = 0.7
 _NEAR, _TURNED = 0.10, math.radians(3.0)
-"""m and rad: a start has converged when the posture stays nearer to the truth than this."""
+"""m and rad: a start has converged when the pose stays nearer to the truth than this."""
 _LEAST, _MOST = 4, 30
 _WRONG = np.array([1.0, 1.0, 1.0])
 """m, m, rad: the paper's start."""
@@ -65,10 +60,10 @@ class Start:
 
     Attributes:
         visible: landmarks in view at the start.
-        converged: whether the posture was near the truth from the nineteenth step on.
-        healthy: whether the filter would let the robot drive by its posture at the end.
-        near: whether that posture is near the truth.
-        nees: squared Mahalanobis distance of the true posture at the end, 3 degrees of freedom.
+        converged: whether the pose was near the truth from the nineteenth step on.
+        healthy: whether the filter would let the robot drive by its pose at the end.
+        near: whether that pose is near the truth.
+        nees: squared Mahalanobis distance of the true pose at the end, 3 degrees of freedom.
         before: the node as the map had it.
         after: and as the drive left it.
     """

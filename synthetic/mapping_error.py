@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.mapping import FilterSettings, MappingFilter
-from hybridmap.pose import Array
+from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.hybridmap.pose import Array
 from synthetic.mapping_run import AXLE, WHEEL_NOISE, MappingRun
 
 

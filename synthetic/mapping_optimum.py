@@ -1,12 +1,12 @@
-"""The independent optimum: all postures and landmarks of a mapping run at once, by GTSAM."""
+"""The independent optimum: all poses and landmarks of a mapping run at once, by GTSAM."""
 
 from __future__ import annotations
 
 import gtsam
 import numpy as np
 
-from agent.observation import Odometry
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Array, Pose2
 from synthetic.mapping_run import AXLE, WHEEL_NOISE, MappingRun
 
 _RIGID = 1e-6
@@ -19,7 +19,7 @@ def batch_optimum(run: MappingRun, prior_depth: float, prior_spread: float) -> t
     It starts at the truth, so that it is the optimum near the truth and not the luck of a start.
 
     Returns:
-        The last posture in the first robot frame, (3,), and the landmarks in it, (N, 3) m.
+        The last pose in the first robot frame, (3,), and the landmarks in it, (N, 3) m.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     camera = run.camera
@@ -55,7 +55,7 @@ def _l(i: int) -> int:
 
 
 def _camera_pose(run: MappingRun, pose: Pose2) -> gtsam.Pose3:
-    """world_from_camera of a robot posture; the camera is x right, y down, z forward."""
+    """world_from_camera of a robot pose; the camera is x right, y down, z forward."""
     c, s = np.cos(pose.heading), np.sin(pose.heading)
     world_from_robot = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     robot_from_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.observation import Odometry
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3)
 AXLE = 0.24
@@ -28,7 +28,7 @@ class MappingRun:
     Attributes:
         camera: of the robot.
         points: (N, 3) m, landmarks in the first robot frame.
-        poses: T + 1 true postures in the first robot frame.
+        poses: T + 1 true poses in the first robot frame.
         odometry: T steps as the wheels tell them.
         pixels: (T + 1, N, 2) px; NaN where a landmark is out of the image.
         pixel_sigma: px.

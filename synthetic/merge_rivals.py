@@ -7,18 +7,22 @@ from collections.abc import Callable, Mapping, Sequence
 import networkx as nx
 import numpy as np
 
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Array, Pose2
-from mapweave.scoring import align
-from merge.belief.cliques import best_clique
-from merge.belief.consistency import ConsistencySettings, group_links, loop_distances2
-from merge.belief.cutting import fragments_of
-from merge.graph.fragments import fragment_by_node
-from merge.graph.links import Link
-from merge.graph.merged import MergedMap, Postures
-from merge.graph.solver import Solver
-from merge.merging import MergeSettings, merge_maps
+from mapweave.evaluation.map_score import align
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.merge.merging import MergeSettings, merge_maps
+from mapweave.merge.outlier_rejection.max_clique import best_clique
+from mapweave.merge.outlier_rejection.pairwise_consistency import (
+    ConsistencySettings,
+    group_links,
+    loop_distances2,
+)
+from mapweave.merge.outlier_rejection.segmentation import fragments_of
+from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.fragments import fragment_by_node
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from synthetic.fleet import SyntheticFleet
 from synthetic.gnc import inliers
 
@@ -33,13 +37,13 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
     fragments = fragments_of(maps)
     by_node = fragment_by_node(fragments)
     believed = [link for link in links if link.a in by_node and link.b in by_node]
-    graphs = Solver(fragments).solve(believed, believed=True)
+    graphs = ComponentSolver(fragments).solve(believed, believed=True)
     return MergedMap(
         maps,
         tuple(sorted(believed, key=lambda link: link.pair)),
         (),
         tuple(frozenset(graph.nodes) for graph in graphs),
-        Postures(graphs),
+        Poses(graphs),
         tuple(graphs),
     )
 
@@ -103,7 +107,7 @@ def error(merged: MergedMap, truth: dict[NodeId, Pose2]) -> float:
 
 def positions(merged: MergedMap, nodes: list[NodeId]) -> Array:
     """(N, 2) m, each in its component's frame."""
-    means = [merged.postures[node].merged_from_robot.mean for node in nodes]
+    means = [merged.poses[node].merged_from_robot.mean for node in nodes]
     return np.array([[mean.x, mean.y] for mean in means])
 
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from mapweave.g2o import G2oEdge, G2oGraph
-from merge.graph.links import Link
-from merge.graph.merged import MergedMap
+from mapweave.formats.g2o import G2oEdge, G2oGraph
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.fleet import BARE, CAMERA
 
 WEIGHT = 20.0
@@ -80,7 +80,7 @@ def chi2_of(
     """Chi-square of all the file's edges, the refused ones too, at a merge; None if it is in pieces."""
     if len(merged.components) != 1:
         return None
-    poses = {k: merged.postures[node].merged_from_robot.mean for k, node in nodes.items()}
+    poses = {k: merged.poses[node].merged_from_robot.mean for k, node in nodes.items()}
     back = poses[min(poses)].inverse()
     values = gtsam.Values()
     for k, pose in poses.items():

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.descriptor import quantise
-from hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, TOTAL_BITS, landmark_tables
-from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.query import View
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, TOTAL_BITS, landmark_tables
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.query import View
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25, mount_forward=0.08)
 

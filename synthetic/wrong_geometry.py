@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, View
-from mapserver.answers import Answers
-from mapserver.merging.merger import Merger
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, View
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.merging.merger import Merger
 from synthetic.world import World, room, take_node, take_view
 
 SIGMA_XY, SIGMA_HEADING = 0.015, 0.008
@@ -61,7 +61,7 @@ class House:
         raise ValueError(f"{at} is in no room")
 
     def inside(self, number: int, rng: np.random.Generator) -> Pose2:
-        """A random posture in a room."""
+        """A random pose in a room."""
         x, y, width, depth = self.boxes[number]
         low = [x + MARGIN, y + MARGIN, -math.pi]
         return Pose2.from_vector(rng.uniform(low, [x + width - MARGIN, y + depth - MARGIN, math.pi]))
@@ -86,7 +86,7 @@ def draw_house(rng: np.random.Generator, *, twins: bool = False, gap: float = 0.
 def draw_tour(
     house: House, visits: Sequence[int], stops: int, looks: int, rng: np.random.Generator
 ) -> list[Pose2]:
-    """Postures of a robot that goes from room to room and looks around at each stop."""
+    """Poses of a robot that goes from room to room and looks around at each stop."""
     tour: list[Pose2] = []
     for number in visits:
         for _ in range(stops):

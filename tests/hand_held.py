@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridmap.node import Landmarks, Node
+from mapweave.hybridmap.node import Landmarks, Node
 
 SCALE_SHARE = 0.3
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
 
 Distortion = tuple[float, float, float, float, float]
 """(k1, k2, p1, p2, k3), OpenCV's order."""

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.descriptor import encode
-from hybridmap.node import CODE_BYTES
-from hybridmap.pose import Array
-from hybridmap.query import View
-from vision.lens import Lens
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.descriptor import encode
+from mapweave.hybridmap.node import CODE_BYTES
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.query import View
+from mapweave.vision.lens import Lens
 
 TEXTURE_BLOCK_PX = 11
 """Side of the square in which texture is measured, about that of a tracked patch."""

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-from hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import SettingsError
 
 ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/\S+:\d+(\?\S*)?(#\S*)?")
 

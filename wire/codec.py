@@ -3,8 +3,8 @@
 A change is an envelope (sequence number, stamp) around a *body*. The body alone is what a map file holds. Ids
 of the body's own map are written as a bare number, ids of other maps in full.
 
-Encoding rounds (see hybridmap.grid), and brings variances and evidence within their bounds; what was decoded
-encodes to the same bytes again.
+Encoding rounds (see mapweave.hybridmap.quantization), and brings variances and evidence within their bounds;
+what was decoded encodes to the same bytes again.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId, check_name
-from hybridmap.ranges import Ranges
-from hybridmap.wake import Wake
-from wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
-from wire.landmarks_v1 import unpack_landmarks_v1
-from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
-from wire.posture_codec import MAX_MEASURED, pack_camera, pack_posture, unpack_camera, unpack_posture
-from wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
-from wire.wake_codec import MAX_WAKE_BYTES, pack_wake, unpack_wake
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId, check_name
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
+from mapweave.wire.landmarks_v1 import unpack_landmarks_v1
+from mapweave.wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+from mapweave.wire.pose_codec import MAX_MEASURED, pack_camera, pack_pose, unpack_camera, unpack_pose
+from mapweave.wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
+from mapweave.wire.trajectory_codec import MAX_WAKE_BYTES, pack_trajectory, unpack_trajectory
 
 MAX_RADIUS_MM = 100_000
 MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + MAX_WAKE_BYTES + 2048
@@ -35,7 +35,7 @@ MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 MAX_SHARED = MAX_LANDMARKS
 SINGLE = struct.Struct("<f")
 NO_RANGES = Ranges()
-NO_WAKE = Wake()
+NO_WAKE = TrajectorySegment()
 MAX_EVIDENCE = 64
 MOST_EVIDENCE = float(MAX_LANDMARKS)
 """Greatest number among the evidence: most are counts of landmarks or less. More says nothing more."""
@@ -151,7 +151,7 @@ def unwrap_body(data: bytes) -> tuple[int, int, bytes]:
 def _node_fields(node: Node) -> dict[str, object]:
     fields: dict[str, object] = {
         "t": node.stamp_ns,
-        "p": pack_posture(node.map_from_robot, MAX_MEASURED),
+        "p": pack_pose(node.map_from_robot, MAX_MEASURED),
         "c": pack_camera(node.camera),
         "m": pack_landmarks(node.landmarks, node.camera),
     }
@@ -162,7 +162,7 @@ def _node_fields(node: Node) -> dict[str, object]:
     if len(node.ranges):
         fields["g"] = pack_ranges(node.ranges)
     if len(node.wake):
-        fields["u"] = pack_wake(node.wake, node.ranges.reach)
+        fields["u"] = pack_trajectory(node.wake, node.ranges.reach)
     return fields
 
 
@@ -178,13 +178,13 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
     return Node(
         id=element,
         stamp_ns=reader.integer("t", 0, MAX_STAMP_NS),
-        map_from_robot=unpack_posture(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
+        map_from_robot=unpack_pose(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
         camera=camera,
         landmarks=_read_landmarks(reader, camera),
         clock=reader.name("z") if reader.has("z") else "",
         radius=reader.integer("r", 0, MAX_RADIUS_MM) / 1000.0 if reader.has("r") else 0.0,
         ranges=ranges,
-        wake=unpack_wake(reader.binary("u", MAX_WAKE_BYTES), ranges) if reader.has("u") else NO_WAKE,
+        wake=unpack_trajectory(reader.binary("u", MAX_WAKE_BYTES), ranges) if reader.has("u") else NO_WAKE,
     )
 
 
@@ -199,7 +199,7 @@ def _edge_fields(edge: Edge) -> dict[str, object]:
     fields: dict[str, object] = {
         "a": _reference(edge.a, edge.id.map),
         "b": _reference(edge.b, edge.id.map),
-        "p": pack_posture(edge.a_from_b, MAX_MEASURED),
+        "p": pack_pose(edge.a_from_b, MAX_MEASURED),
         "w": EDGE_KINDS[edge.kind],
     }
     if len(edge.shared):
@@ -218,7 +218,7 @@ def _read_edge(reader: Reader, element: NodeId) -> Edge:
         id=element,
         a=a,
         b=b,
-        a_from_b=unpack_posture(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
+        a_from_b=unpack_pose(reader.binary("p", MAX_BODY_BYTES), MAX_MEASURED),
         kind=KINDS_OF_EDGE[reader.integer("w", 1, len(EDGE_KINDS))],
         shared=_unpack_shared(reader.binary("h", 1 + 4 * MAX_SHARED) if reader.has("h") else b"\x01"),
         evidence={

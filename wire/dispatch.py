@@ -13,8 +13,8 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from hybridmap.errors import Busy, MapweaveError
-from wire.bus import Request, Sample
+from mapweave.hybridmap.errors import Busy, MapweaveError
+from mapweave.wire.bus import Request, Sample
 
 log = logging.getLogger(__name__)
 

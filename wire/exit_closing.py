@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from wire.bus import Closing
+from mapweave.wire.bus import Closing
 
 THREAD = "close-at-exit"
 _lock = threading.Lock()

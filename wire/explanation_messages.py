@@ -8,17 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.change import NodePut
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplanation, Standing, Witness
-from hybridmap.node import Node, NodeId
-from hybridmap.ruling import Ends, Ruling
-from wire.codec import MAX_BODY_BYTES, MAX_EVIDENCE, decode_body, encode_body
-from wire.landmark_codec import MAX_LANDMARKS
-from wire.messages import MAX_BLOCKED, read_blocked
-from wire.packing import MAX_NUMBER, Reader, pack
-from wire.posture_codec import MAX_POSITION, pack_posture, unpack_posture
-from wire.ruling_codec import pack_ruling, read_ends, read_ruling
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.explanation import (
+    MapsExplanation,
+    Misfit,
+    NearMiss,
+    PairExplanation,
+    Standing,
+    Witness,
+)
+from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.wire.codec import MAX_BODY_BYTES, MAX_EVIDENCE, decode_body, encode_body
+from mapweave.wire.landmark_codec import MAX_LANDMARKS
+from mapweave.wire.manual_constraint_codec import pack_manual_constraint, read_ends, read_manual_constraint
+from mapweave.wire.messages import MAX_BLOCKED, read_blocked
+from mapweave.wire.packing import MAX_NUMBER, Reader, pack
+from mapweave.wire.pose_codec import MAX_POSITION, pack_pose, unpack_pose
 
 MAX_MAPS_TOLD = 256
 """Pairs of maps in one answer."""
@@ -83,15 +90,15 @@ def decode_explain_request(data: bytes) -> ExplainRequest:
         raise reader.error(str(error)) from None
 
 
-def encode_ruling(ruling: Ruling) -> bytes:
+def encode_ruling(ruling: ManualConstraint) -> bytes:
     """Encode what somebody rules; raises InvalidValue if it would not decode."""
-    return _checked(pack({"r": pack_ruling(ruling)}), decode_ruling)
+    return _checked(pack({"r": pack_manual_constraint(ruling)}), decode_ruling)
 
 
-def decode_ruling(data: bytes) -> Ruling:
+def decode_ruling(data: bytes) -> ManualConstraint:
     """Decode what somebody rules; raises InvalidMessage."""
     reader = Reader(data, "ruling", 4096)
-    return read_ruling(reader, reader.any("r"))
+    return read_manual_constraint(reader, reader.any("r"))
 
 
 def encode_pair(told: PairExplanation) -> bytes:
@@ -106,17 +113,17 @@ def encode_pair(told: PairExplanation) -> bytes:
         "u": [_bounded(value) for value in told.residuals_px],
         "w": [[list(w.a), list(w.b), _bounded(w.distance2), w.agrees, w.kept] for w in told.witnesses],
         "c": list(told.claims),
-        "g": [pack_ruling(ruling) for ruling in told.rulings],
+        "g": [pack_manual_constraint(ruling) for ruling in told.rulings],
     }
     if told.a_from_b is not None:
-        fields["p"] = pack_posture(told.a_from_b)
+        fields["p"] = pack_pose(told.a_from_b)
         fields["x"] = {name: float(value) for name, value in told.evidence.items()}
     if told.probability is not None:
         fields["q"] = float(told.probability)
     if told.misfit is not None:
         misfit = told.misfit
         off = [float(value) for value in misfit.off]
-        fields["f"] = [pack_posture(misfit.merged_a_from_b), off, _bounded(misfit.strain2), misfit.alone]
+        fields["f"] = [pack_pose(misfit.merged_a_from_b), off, _bounded(misfit.strain2), misfit.alone]
     return _checked(pack(fields), decode_pair)
 
 
@@ -143,13 +150,13 @@ def decode_pair(data: bytes) -> PairExplanation:
         matches,
         shared,
         np.array(residuals),
-        unpack_posture(reader.binary("p", 64)) if reader.has("p") else None,
+        unpack_pose(reader.binary("p", 64)) if reader.has("p") else None,
         {name: reader.as_number(value, name, -INFINITE, INFINITE) for name, value in evidence.items()},
         reader.number("q", 0.0, 1.0) if reader.has("q") else None,
         _misfit(reader) if reader.has("f") else None,
         tuple(_witness(reader, value) for value in reader.array("w", MAX_WITNESSES)),
         tuple(reader.as_text(value, "claim", MAX_REASON) for value in reader.array("c", MAX_CLAIMS)),
-        tuple(read_ruling(reader, value) for value in reader.array("g", MAX_RULINGS)),
+        tuple(read_manual_constraint(reader, value) for value in reader.array("g", MAX_RULINGS)),
     )
 
 
@@ -173,7 +180,7 @@ def pack_maps(told: MapsExplanation) -> list[object]:
         told.reason,
         [told.links, told.landmarks, told.refused, told.unverified],
         [[list(n.a), list(n.b), n.matches, n.inliers, n.lacks] for n in told.nearest],
-        [pack_ruling(ruling) for ruling in told.rulings],
+        [pack_manual_constraint(ruling) for ruling in told.rulings],
     ]
 
 
@@ -198,7 +205,9 @@ def read_maps(reader: Reader, value: Any) -> MapsExplanation:
         refused=refused,
         unverified=unverified,
         nearest=tuple(_near(reader, near) for near in reader.as_array(parts[5], "nearest", MAX_NEAREST)),
-        rulings=tuple(read_ruling(reader, one) for one in reader.as_array(parts[6], "rulings", MAX_RULINGS)),
+        rulings=tuple(
+            read_manual_constraint(reader, one) for one in reader.as_array(parts[6], "rulings", MAX_RULINGS)
+        ),
     )
 
 
@@ -225,9 +234,9 @@ def _misfit(reader: Reader) -> Misfit:
     ]
     if len(off) != 3:
         raise reader.error("a misfit must be three numbers")
-    posture = unpack_posture(reader.as_binary(parts[0], "posture", 64))
+    pose = unpack_pose(reader.as_binary(parts[0], "pose", 64))
     strain2 = reader.as_number(parts[2], "strain", 0.0, INFINITE)
-    return Misfit(posture, np.array(off), strain2, _flag(reader, parts[3]))
+    return Misfit(pose, np.array(off), strain2, _flag(reader, parts[3]))
 
 
 def _witness(reader: Reader, value: Any) -> Witness:

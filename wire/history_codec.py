@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.history import Happening, Kind
-from hybridmap.node import MapId
-from wire.packing import MAX_STAMP_NS, Reader, pack
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.node import MapId
+from mapweave.wire.packing import MAX_STAMP_NS, Reader, pack
 
 MAX_WORDS = 4096
 MAX_HAPPENINGS = 100_000
@@ -29,19 +29,19 @@ class KeptHistory:
         set_apart: maps of which it was told that they are set apart.
     """
 
-    happenings: tuple[Happening, ...] = ()
+    happenings: tuple[MapEvent, ...] = ()
     parts: tuple[frozenset[MapId], ...] = ()
     apart: frozenset[tuple[MapId, MapId]] = frozenset()
     set_apart: frozenset[MapId] = frozenset()
 
 
-def encode_history(happenings: Sequence[Happening]) -> bytes:
+def encode_history(happenings: Sequence[MapEvent]) -> bytes:
     """What has happened, in order; raises InvalidValue if it would not decode."""
     data = pack({"h": [pack_happening(one) for one in happenings]})
     return _checked(data)
 
 
-def decode_history(data: bytes) -> tuple[Happening, ...]:
+def decode_history(data: bytes) -> tuple[MapEvent, ...]:
     """The same back; raises InvalidMessage."""
     return _happenings(Reader(data, "history", MAX_BYTES, MAX_VALUES))
 
@@ -72,22 +72,22 @@ def decode_kept_history(data: bytes) -> KeptHistory:
     )
 
 
-def _happenings(reader: Reader) -> tuple[Happening, ...]:
+def _happenings(reader: Reader) -> tuple[MapEvent, ...]:
     return read_happenings(reader, "h")
 
 
-def pack_happening(one: Happening) -> list[object]:
+def pack_happening(one: MapEvent) -> list[object]:
     """A happening as a list."""
     return [one.stamp_ns, one.kind.value, one.words]
 
 
-def read_happenings(reader: Reader, name: str) -> tuple[Happening, ...]:
+def read_happenings(reader: Reader, name: str) -> tuple[MapEvent, ...]:
     """A list of lists as happenings; raises InvalidMessage. Kinds of a newer program are left out."""
     found = (_read(reader, value) for value in reader.array(name, MAX_HAPPENINGS))
     return tuple(one for one in found if one is not None)
 
 
-def _read(reader: Reader, value: Any) -> Happening | None:
+def _read(reader: Reader, value: Any) -> MapEvent | None:
     parts = reader.as_array(value, "happening", 32)
     # More parts than are known here are a newer program's.
     if len(parts) < 3:
@@ -95,7 +95,7 @@ def _read(reader: Reader, value: Any) -> Happening | None:
     kind = reader.as_text(parts[1], "kind", 16)
     stamp_ns = reader.as_integer(parts[0], "stamp", 0, MAX_STAMP_NS)
     words = reader.as_text(parts[2], "words", MAX_WORDS)
-    return Happening(stamp_ns, Kind(kind), words) if kind in set(Kind) else None
+    return MapEvent(stamp_ns, MapEventKind(kind), words) if kind in set(MapEventKind) else None
 
 
 def _maps(reader: Reader, value: Any) -> list[MapId]:

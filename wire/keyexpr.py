@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 
-from hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue
 
 CHUNK = re.compile(r"[A-Za-z0-9._-]{1,64}")
 MAX_CHUNKS = 16

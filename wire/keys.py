@@ -1,13 +1,13 @@
 """Every key of a fleet: the version first, then who, then what. No data stands in a key.
 
-    mapweave/1/<fleet>/agent/<agent>/change/<epoch>   one change each; see wire.log_messages
+    mapweave/1/<fleet>/agent/<agent>/change/<epoch>   one change each; see mapweave.wire.log_messages
     mapweave/1/<fleet>/agent/<agent>/head/<epoch>     beacon: the newest sequence number
     mapweave/1/<fleet>/agent/<agent>/log/<epoch>      question: a range of the log
     mapweave/1/<fleet>/agent/<agent>/alive/<epoch>    liveliness
     mapweave/1/<fleet>/agent/<agent>/status           what it is doing, for people; question: the same, now
     mapweave/1/<fleet>/agent/<agent>/mission          question: an operator's command
     mapweave/1/<fleet>/server/<server>/ack/<agent>    what is on that server's disk; question: its newest map
-    mapweave/1/<fleet>/server/<server>/postures/<agent>  where its nodes lie in the merged map; question: all
+    mapweave/1/<fleet>/server/<server>/poses/<agent>  where its nodes lie in the merged map; question: all
     mapweave/1/<fleet>/server/<server>/relocalize     question; also route, known, map, explain, rule, history
     mapweave/1/<fleet>/server/<server>/status         as an agent's; likewise alive
     mapweave/1/<fleet>/robot/<robot>/describe         question to a robot's body; likewise step
@@ -20,8 +20,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import MapId, check_name
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId, check_name
 
 VERSION = "1"
 MAX_EPOCH = 2**53
@@ -113,13 +113,13 @@ class Keys:
         """Pattern: what any server says to an agent."""
         return f"{self.root}/server/*/ack/{check_name(agent)}"
 
-    def postures(self, server: str, agent: str) -> str:
+    def poses(self, server: str, agent: str) -> str:
         """Where a server tells an agent how its nodes lie in the merged map, and answers for all of them."""
-        return f"{self.root}/server/{check_name(server)}/postures/{check_name(agent)}"
+        return f"{self.root}/server/{check_name(server)}/poses/{check_name(agent)}"
 
-    def all_postures(self, server: str) -> str:
+    def all_poses(self, server: str) -> str:
         """Pattern: what a server tells every agent."""
-        return f"{self.root}/server/{check_name(server)}/postures/*"
+        return f"{self.root}/server/{check_name(server)}/poses/*"
 
     def relocalize(self, server: str) -> str:
         """Where a server tells from which place a view was taken."""
@@ -243,9 +243,9 @@ class Keys:
         server, agent = self._parse_names("server/*/ack/*", key)
         return server, agent
 
-    def parse_postures(self, key: str) -> tuple[str, str]:
+    def parse_poses(self, key: str) -> tuple[str, str]:
         """Which server, to which agent."""
-        server, agent = self._parse_names("server/*/postures/*", key)
+        server, agent = self._parse_names("server/*/poses/*", key)
         return server, agent
 
     def parse_server_alive(self, key: str) -> str:

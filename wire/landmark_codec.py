@@ -1,10 +1,10 @@
 """Landmarks as packed bytes: where nearly all of a map's size is. The layout stands in docs/wire.md.
 
-Whole numbers (hybridmap.grid, hybridmap.descriptor) are packed without loss, each for the bits that its
-frequency is worth. About 17.5 bytes a landmark: 13.3 for the descriptor, 1.7 for depth and sigma, 2.3 for
-the pixel. Where y never falls, the order of the landmarks costs nothing: the high bits of y are written as
-steps up (Elias 1974, Fano 1971). The low ones, and x, are what the lane of a landmark begins with, so they
-cost what they hold.
+Whole numbers (mapweave.hybridmap.quantization, mapweave.hybridmap.descriptor) are packed without loss, each
+for the bits that its frequency is worth. About 17.5 bytes a landmark: 13.3 for the descriptor, 1.7 for depth
+and sigma, 2.3 for the pixel. Where y never falls, the order of the landmarks costs nothing: the high bits of
+y are written as steps up (Elias 1974, Fano 1971). The low ones, and x, are what the lane of a landmark
+begins with, so they cost what they hold.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.grid import (
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION, landmark_tables
+from mapweave.hybridmap.node import CODE_BYTES, Landmarks
+from mapweave.hybridmap.quantization import (
     FINE_BITS,
     PixelGrid,
-    Rounded,
+    QuantizedLandmarks,
     restore_landmarks,
     round_landmarks,
 )
-from hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION, landmark_tables
-from hybridmap.node import CODE_BYTES, Landmarks
-from wire.lanes import BitReader, Column, Columns, Ints, LaneReader, LaneWriter, pack_bits
+from mapweave.wire.rans import BitReader, Column, Columns, Ints, LaneReader, LaneWriter, pack_bits
 
 MAX_LANDMARKS = 2000
 HEAD = struct.Struct("<BBHHHHH")
@@ -43,7 +43,7 @@ MAX_LANDMARKS_BYTES = MAX_LANDMARKS * ((CODE_BYTES + 3) * TOTAL_BITS + 32) // 8 
 
 
 def pack_landmarks(landmarks: Landmarks, camera: Camera) -> bytes:
-    """Encode landmarks, in their order. They are rounded, see hybridmap.grid.
+    """Encode landmarks, in their order. They are rounded, see mapweave.hybridmap.quantization.
 
     Raises:
         InvalidValue: too many, a code that is none, a pixel off the image, or a depth that is not positive or
@@ -72,7 +72,7 @@ def pack_features(pixels: NDArray[np.float32], codes: NDArray[np.uint8], camera:
         raise InvalidValue(f"features: shapes {pixels.shape} and {codes.shape} do not belong together")
     nothing = np.zeros(len(pixels), np.int64)
     x, y = PixelGrid.of(camera).round(pixels)
-    return _pack(Rounded(x, y, nothing, nothing), codes, with_depths=False)
+    return _pack(QuantizedLandmarks(x, y, nothing, nothing), codes, with_depths=False)
 
 
 def unpack_features(data: bytes, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -102,7 +102,7 @@ def _read_columns() -> tuple[Columns, Columns, Columns]:
     return Columns.of(_code_columns()), Columns.of([shares]), Columns.of([cells])
 
 
-def _pack(rounded: Rounded, codes: NDArray[np.uint8], with_depths: bool) -> bytes:
+def _pack(rounded: QuantizedLandmarks, codes: NDArray[np.uint8], with_depths: bool) -> bytes:
     count = len(codes)
     if count > MAX_LANDMARKS:
         raise InvalidValue(f"{count} landmarks, at most {MAX_LANDMARKS} are allowed")
@@ -128,7 +128,7 @@ def _pack(rounded: Rounded, codes: NDArray[np.uint8], with_depths: bool) -> byte
     return data + zlib.crc32(data).to_bytes(CHECK_BYTES, "little")
 
 
-def _unpack(data: bytes, with_depths: bool) -> tuple[Rounded, NDArray[np.uint8]]:
+def _unpack(data: bytes, with_depths: bool) -> tuple[QuantizedLandmarks, NDArray[np.uint8]]:
     if len(data) < HEAD.size + CHECK_BYTES:
         raise InvalidMessage(f"landmarks: {len(data)} bytes are too few")
     version, flags, count, least_x, reach_x, least_y, reach_y = HEAD.unpack_from(data)
@@ -148,7 +148,7 @@ def _unpack(data: bytes, with_depths: bool) -> tuple[Rounded, NDArray[np.uint8]]
     x, y = least_x + (seeds >> low), least_y + (high << low | seeds & ((1 << low) - 1))
     if x.max(initial=0) > min(least_x + reach_x, 65535) or y.max(initial=0) > min(least_y + reach_y, 65535):
         raise InvalidMessage("landmarks: a pixel is out of range")
-    return Rounded(x, y, share, depth), codes
+    return QuantizedLandmarks(x, y, share, depth), codes
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +182,7 @@ def _read(data: bytes, lay: _Layout) -> _Parts:
     return lanes.states - (1 << lay.size), high, codes, share, depth
 
 
-def _push_depths(lanes: LaneWriter, rounded: Rounded) -> None:
+def _push_depths(lanes: LaneWriter, rounded: QuantizedLandmarks) -> None:
     shares, cells = _depth_columns()
     known = np.flatnonzero(rounded.share)
     fine = FINE_BITS[rounded.share[known]]

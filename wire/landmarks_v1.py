@@ -1,7 +1,7 @@
 """Landmarks and features of the first version of messages and map files, which are still read.
 
-Columns of 16 bytes a descriptor (hybridmap.descriptor_v1), then x and y (uint16 on the finest grid that
-fits); landmarks have depth (uint16) and its sigma (uint8) besides, both logarithmic and 0 where they are
+Columns of 16 bytes a descriptor (mapweave.hybridmap.descriptor_v1), then x and y (uint16 on the finest grid
+that fits); landmarks have depth (uint16) and its sigma (uint8) besides, both logarithmic and 0 where they are
 not known.
 """
 
@@ -12,11 +12,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.descriptor_v1 import CODE_BYTES_V1, renew
-from hybridmap.errors import InvalidMessage
-from hybridmap.grid import PixelGrid
-from hybridmap.node import Landmarks
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.descriptor_v1 import CODE_BYTES_V1, renew
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.node import Landmarks
+from mapweave.hybridmap.quantization import PixelGrid
 
 FEATURE_BYTES = CODE_BYTES_V1 + 4
 LANDMARK_BYTES = FEATURE_BYTES + 3

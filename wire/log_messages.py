@@ -6,10 +6,10 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import MapId
-from wire.codec import MAX_CHANGE_BYTES
-from wire.packing import MAX_NUMBER, Reader, pack
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId
+from mapweave.wire.codec import MAX_CHANGE_BYTES
+from mapweave.wire.packing import MAX_NUMBER, Reader, pack
 
 MARK = struct.Struct("<QQ")
 MAX_ROWS = 256

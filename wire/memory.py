@@ -10,11 +10,19 @@ from typing import TypeVar
 
 import numpy as np
 
-from hybridmap.errors import NotConnected
-from wire.bus import Closing, Reply, Request, Sample
-from wire.dispatch import Dispatcher
-from wire.keyexpr import check_key, check_pattern, intersects, is_key
-from wire.memory_entities import Collector, Declared, MemoryRequest, Service, Subscription, Token, Watcher
+from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire.bus import Closing, Reply, Request, Sample
+from mapweave.wire.dispatch import Dispatcher
+from mapweave.wire.keyexpr import check_key, check_pattern, intersects, is_key
+from mapweave.wire.memory_entities import (
+    Collector,
+    Declared,
+    MemoryRequest,
+    Service,
+    Subscription,
+    Token,
+    Watcher,
+)
 
 _D = TypeVar("_D", bound=Declared)
 

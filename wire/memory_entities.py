@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from wire.bus import Reply, Request, Sample
-from wire.refusal import decode_refusal, encode_refusal
+from mapweave.wire.bus import Reply, Request, Sample
+from mapweave.wire.refusal import decode_refusal, encode_refusal
 
 if TYPE_CHECKING:
-    from wire.memory import MemoryBus
+    from mapweave.wire.memory import MemoryBus
 
 
 class Declared:

@@ -1,4 +1,6 @@
-"""Questions about the fleet's map and their answers as bytes: see hybridmap.query for what they mean."""
+"""Questions about the fleet's map and their answers as bytes: see mapweave.hybridmap.query for what they
+mean.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.change import NodePut
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import MapId, NodeId, check_name
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
-from wire.codec import EDGE_KINDS, KINDS_OF_EDGE, MAX_BODY_BYTES, decode_body, encode_body
-from wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_features, unpack_features
-from wire.landmarks_v1 import unpack_features_v1
-from wire.packing import MAX_NUMBER, Reader, pack
-from wire.posture_codec import MAX_POSITION, pack_camera, pack_posture, unpack_camera, unpack_posture
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId, check_name
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import (
+    Certainty,
+    KnownAnswer,
+    RelocalizeAnswer,
+    RouteAnswer,
+    RouteLeg,
+    View,
+    Whereabouts,
+)
+from mapweave.wire.codec import EDGE_KINDS, KINDS_OF_EDGE, MAX_BODY_BYTES, decode_body, encode_body
+from mapweave.wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_features, unpack_features
+from mapweave.wire.landmarks_v1 import unpack_features_v1
+from mapweave.wire.packing import MAX_NUMBER, Reader, pack
+from mapweave.wire.pose_codec import MAX_POSITION, pack_camera, pack_pose, unpack_camera, unpack_pose
 
 MAX_VIEW_BYTES = MAX_LANDMARKS_BYTES + 256
 MAX_CANDIDATES = 64
@@ -142,7 +152,7 @@ def encode_route_answer(answer: RouteAnswer) -> bytes:
     legs = [
         [
             encode_body(NodePut(leg.node)),
-            pack_posture(leg.previous_from_node),
+            pack_pose(leg.previous_from_node),
             NO_KIND if leg.kind is None else EDGE_KINDS[leg.kind],
         ]
         for leg in answer.legs
@@ -190,15 +200,15 @@ def decode_known_answer(data: bytes) -> KnownAnswer:
     views = np.frombuffer(packed, VIEW_TYPE).reshape(-1, 4).astype(np.float64)
     # A comparison with what is no number is false.
     if not (np.abs(views) <= [MAX_POSITION, MAX_POSITION, 4.0, 4.0]).all() or (views[:, 3] < 0.0).any():
-        raise reader.error("a view's posture or aperture is out of range")
+        raise reader.error("a view's pose or aperture is out of range")
     return KnownAnswer(views, reader.text("r", MAX_REASON))
 
 
 def _candidate(place: Whereabouts) -> list[object]:
-    merged = b"" if place.merged_from_robot is None else pack_posture(place.merged_from_robot)
+    merged = b"" if place.merged_from_robot is None else pack_pose(place.merged_from_robot)
     parts = [
         list(place.node),
-        pack_posture(place.node_from_robot),
+        pack_pose(place.node_from_robot),
         merged,
         place.component,
         place.inliers,
@@ -212,11 +222,11 @@ def _read_candidate(reader: Reader, value: Any) -> Whereabouts:
     # More parts than are known here are a newer program's.
     if len(parts) < 6:
         raise reader.error(f"a candidate has {len(parts)} parts instead of 6")
-    merged = reader.as_binary(parts[2], "merged posture", 64)
+    merged = reader.as_binary(parts[2], "merged pose", 64)
     return Whereabouts(
         node=reader.as_node_id(parts[0], "node"),
-        node_from_robot=unpack_posture(reader.as_binary(parts[1], "posture", 64)),
-        merged_from_robot=unpack_posture(merged) if merged else None,
+        node_from_robot=unpack_pose(reader.as_binary(parts[1], "pose", 64)),
+        merged_from_robot=unpack_pose(merged) if merged else None,
         component=reader.as_integer(parts[3], "component", -1, MAX_NUMBER),
         inliers=reader.as_integer(parts[4], "inliers", 0, MAX_LANDMARKS),
         probability=reader.as_number(parts[5], "probability", 0.0, 1.0),
@@ -231,9 +241,9 @@ def _read_leg(reader: Reader, value: Any) -> RouteLeg:
     body = decode_body(reader.as_binary(parts[0], "node", MAX_BODY_BYTES))
     if not isinstance(body, NodePut):
         raise reader.error("a leg leads to what is no node")
-    posture: PoseGaussian = unpack_posture(reader.as_binary(parts[1], "posture", 64))
+    pose: PoseGaussian = unpack_pose(reader.as_binary(parts[1], "pose", 64))
     kind = reader.as_integer(parts[2], "edge kind", NO_KIND, len(EDGE_KINDS))
-    return RouteLeg(body.node, posture, None if kind == NO_KIND else KINDS_OF_EDGE[kind])
+    return RouteLeg(body.node, pose, None if kind == NO_KIND else KINDS_OF_EDGE[kind])
 
 
 def _checked(data: bytes, decode: Any) -> bytes:

@@ -12,9 +12,9 @@ from typing import Any
 
 import msgpack
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import MapId, NodeId, check_name
-from wire.keys import MAX_EPOCH
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId, check_name
+from mapweave.wire.keys import MAX_EPOCH
 
 SCHEMA = 1
 """Version of all messages; raised when a program of the version before would misread one."""

@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.pose import Array
-from hybridmap.ranges import MOST, Ranges
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.ranges import MOST, Ranges
 
 MAX_RANGE_BYTES = 2 + 3 * MOST
 BEARING_STEP = 1e-4

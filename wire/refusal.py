@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 
-from wire.bus import Reply
+from mapweave.wire.bus import Reply
 
 MARK = b"refused: "
 """Begins a refusal that a handler made; all other errors are Zenoh's own, like its "Timeout"."""

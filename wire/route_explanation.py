@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.explanation import Hop, RouteExplanation
-from wire.explanation_messages import pack_maps, read_maps
-from wire.packing import Reader, pack
-from wire.posture_codec import MAX_POSITION
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.explanation import Hop, RouteExplanation
+from mapweave.wire.explanation_messages import pack_maps, read_maps
+from mapweave.wire.packing import Reader, pack
+from mapweave.wire.pose_codec import MAX_POSITION
 
 MAX_HOPS = 4096
 MAX_WORDS = 1024

@@ -17,14 +17,14 @@ from typing import TypeVar
 
 import zenoh
 
-from hybridmap.errors import NotConnected
-from wire import exit_closing
-from wire.bus import Closing, Reply, Request, Sample
-from wire.bus_settings import BusSettings
-from wire.dispatch import Dispatcher
-from wire.keyexpr import check_key, check_pattern
-from wire.zenoh_config import session_values
-from wire.zenoh_entities import Declared, Owner, Service, Subscription, Token, Watcher, read_reply
+from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire import exit_closing
+from mapweave.wire.bus import Closing, Reply, Request, Sample
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.dispatch import Dispatcher
+from mapweave.wire.keyexpr import check_key, check_pattern
+from mapweave.wire.zenoh_config import session_values
+from mapweave.wire.zenoh_entities import Declared, Owner, Service, Subscription, Token, Watcher, read_reply
 
 log = logging.getLogger(__name__)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from wire.bus_settings import BusSettings
+from mapweave.wire.bus_settings import BusSettings
 
 ACCEPT_PENDING = 1000
 """Connections of which a router does not know yet who they are."""

@@ -10,11 +10,11 @@ from typing import Any
 
 import zenoh
 
-from hybridmap.errors import NotConnected
-from wire.bus import Reply, Request, Sample
-from wire.dispatch import Dispatcher
-from wire.keyexpr import is_key
-from wire.refusal import decode_refusal, encode_refusal
+from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire.bus import Reply, Request, Sample
+from mapweave.wire.dispatch import Dispatcher
+from mapweave.wire.keyexpr import is_key
+from mapweave.wire.refusal import decode_refusal, encode_refusal
 
 log = logging.getLogger(__name__)
 

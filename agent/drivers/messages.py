@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from hybridmap.errors import InvalidMessage, InvalidValue
-from storage.image_file import decode_grey, image_size
-from wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
-from wire.posture_codec import pack_camera, unpack_camera
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.storage.image_file import decode_grey, image_size
+from mapweave.wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
+from mapweave.wire.pose_codec import pack_camera, unpack_camera
 
 ENDED = "the simulation has ended"
 """Refusal: there will be no more observations, and that is no failure."""

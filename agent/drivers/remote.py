@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from agent.drivers.messages import (
+from mapweave.agent.drivers.messages import (
     AGAIN,
     ENDED,
     StepRequest,
@@ -18,10 +18,10 @@ from agent.drivers.messages import (
     decode_observation,
     encode_step,
 )
-from agent.observation import Command, Observation, RobotDescription
-from hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
-from wire.bus import Bus, Closing
-from wire.keys import Keys
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
+from mapweave.wire.bus import Bus, Closing
+from mapweave.wire.keys import Keys
 
 ASK_TIMEOUT = 3.0
 """After what silence a question is asked again, s. A lost question costs no more than this."""

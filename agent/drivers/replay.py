@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from hybridmap.camera import Camera
-from hybridmap.errors import DeviceError, InvalidValue
-from storage.image_file import read_grey
-from wire.packing import MAX_STAMP_NS
-from wire.whole_file import read_whole
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.storage.atomic_file import read_whole
+from mapweave.storage.image_file import read_grey
+from mapweave.wire.packing import MAX_STAMP_NS
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 AXLE_PER_HEIGHT = 0.9

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.observation import Command, Observation, RobotDescription
 
 
 class Robot(Protocol):

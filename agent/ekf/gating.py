@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.innovations import leave_one_out, whiten
-from agent.ekf.report import Health
-from hybridmap.pose import Array
+from mapweave.agent.ekf.innovations import leave_one_out, whiten
+from mapweave.agent.ekf.update_report import Health
+from mapweave.hybridmap.pose import Array
 
 Mask = NDArray[np.bool_]
 
@@ -28,7 +28,7 @@ class Judgement(NamedTuple):
     Attributes:
         innovations: (m, 2) slopes, measured minus expected.
         believed: (m,) which of them to correct by.
-        whitening: (2k, 2k) what whitens the innovations of these k (agent.ekf.innovations.whiten).
+        whitening: (2k, 2k) what whitens the innovations of these k (mapweave.agent.ekf.innovations.whiten).
         health: what they tell of the filter.
         reason: what is wrong, in words; empty if nothing is.
     """
@@ -114,8 +114,9 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
         gate: chi-square threshold.
 
     Returns:
-        (N,) accepted; what whitens the accepted ones (agent.ekf.innovations.whiten), (2K, 2K); and the median
-        of their distances from what all others say, MEDIAN if the noise is as it is said and without any.
+        (N,) accepted; what whitens the accepted ones (mapweave.agent.ekf.innovations.whiten), (2K, 2K); and
+        the median of their distances from what all others say, MEDIAN if the noise is as it is said and
+        without any.
     """
     whitening = whiten(covariance)
     distances = leave_one_out(innovations, whitening)

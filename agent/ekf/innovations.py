@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
 
 LEAF = 32
 """Rows of a triangle that LAPACK inverts at once: measured, for triangles of 20 to 200 rows."""
@@ -44,7 +44,7 @@ def innovation_covariance(covariance: Array, slots: NDArray[np.intp], variances:
     """(2m, 2m) joint covariance S of the innovations of m landmarks.
 
     Args:
-        covariance: (3 + 3n, 3 + 3n) of [posture, (a, b, w) of each landmark].
+        covariance: (3 + 3n, 3 + 3n) of [pose, (a, b, w) of each landmark].
         slots: (m,) which landmarks, of 0 ... n - 1.
         variances: (2,) of a measured slope: horizontal, vertical.
     """

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.anchored import see
-from agent.ekf.gating import believe
-from agent.ekf.innovations import whiten
-from agent.ekf.node_state import NEAREST_SCALE, NodeState
-from hybridmap.pose import Array
+from mapweave.agent.ekf.gating import believe
+from mapweave.agent.ekf.innovations import whiten
+from mapweave.agent.ekf.inverse_depth import project_anchored
+from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState
+from mapweave.hybridmap.pose import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,18 +46,20 @@ class Fit:
         mean_nis: normalised innovation squared over its degrees of freedom; NaN if nothing was believed.
     """
 
-    state: NodeState
+    state: LocalizationState
     accepted: NDArray[np.bool_]
     innovations: Array
     mean_nis: float
 
 
-def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_forward: float) -> Fit | None:
+def iterated_update(
+    state: LocalizationState, start: Array, seen: Measurement, mount_forward: float
+) -> Fit | None:
     """Correct the state by an image (iterated extended Kalman filter: Gauss-Newton on the MAP cost).
 
     Args:
         state: before the update: prior mean and covariance.
-        start: (3,) posture at which to linearise first, the prior's or a better one.
+        start: (3,) pose at which to linearise first, the prior's or a better one.
         seen: the image.
         mount_forward: of the optical centre ahead of the axle, m.
 
@@ -70,19 +72,19 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
     first: Array | None = None
     accepted: NDArray[np.bool_] = np.ones(n, np.bool_)
     for _ in range(seen.most):
-        sight = see(pose_vector, rays[slots], mount_forward)
-        first_sight = see(pose_vector, state.first[slots], mount_forward)
+        sight = project_anchored(pose_vector, rays[slots], mount_forward)
+        first_sight = project_anchored(pose_vector, state.first[slots], mount_forward)
         if (np.minimum(sight.scale, first_sight.scale) <= NEAREST_SCALE).any():
             return None
-        by_posture = first_sight.by_posture[:, :2].reshape(2 * n, 3)
+        by_pose = first_sight.by_pose[:, :2].reshape(2 * n, 3)
         by_ray = first_sight.by_ray[:, :2]
-        rows = by_posture @ state.covariance[:3]
+        rows = by_pose @ state.covariance[:3]
         rows += (by_ray @ state.covariance[index].reshape(n, 3, -1)).reshape(2 * n, -1)
         columns = rows.T
-        spread = by_posture @ columns[:3] + (by_ray @ columns[index].reshape(n, 3, -1)).reshape(2 * n, 2 * n)
+        spread = by_pose @ columns[:3] + (by_ray @ columns[index].reshape(n, 3, -1)).reshape(2 * n, 2 * n)
         spread[np.arange(2 * n), np.arange(2 * n)] += np.tile(seen.variances, n)
         # The prior mean as seen from this linearisation point.
-        back = _linear(by_posture, by_ray, state.pose_vector - pose_vector, (state.rays - rays)[slots])
+        back = _linear(by_pose, by_ray, state.pose_vector - pose_vector, (state.rays - rays)[slots])
         innovations = seen.slopes - sight.rays[:, :2] - back
         if first is None:
             first = innovations
@@ -95,11 +97,11 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
         root = columns[:, np.repeat(accepted, 2)] @ whitening.T
         white = whitening @ innovations[accepted].ravel()
         step = root @ white
-        new_posture, new_rays = state.stepped(step)
-        change = _linear(by_posture, by_ray, new_posture - pose_vector, (new_rays - rays)[slots])
+        new_pose, new_rays = state.stepped(step)
+        change = _linear(by_pose, by_ray, new_pose - pose_vector, (new_rays - rays)[slots])
         promised = sight.rays[:, :2] + change
-        pose_vector, rays = new_posture, new_rays
-        kept = see(pose_vector, rays[slots], mount_forward).rays[:, :2]
+        pose_vector, rays = new_pose, new_rays
+        kept = project_anchored(pose_vector, rays[slots], mount_forward).rays[:, :2]
         if np.abs(kept - promised)[accepted].max() < seen.linear:
             break
     corrected = state.corrected(step, root)
@@ -108,6 +110,6 @@ def iterated_update(state: NodeState, start: Array, seen: Measurement, mount_for
     return Fit(corrected, accepted, first, nis)
 
 
-def _linear(by_posture: Array, by_ray: Array, pose_vector: Array, rays: Array) -> Array:
-    """(N, 2) change of the slopes to first order, for changes of posture (3,) and rays (N, 3)."""
-    return (by_posture @ pose_vector).reshape(-1, 2) + (by_ray @ rays[:, :, None])[:, :, 0]
+def _linear(by_pose: Array, by_ray: Array, pose_vector: Array, rays: Array) -> Array:
+    """(N, 2) change of the slopes to first order, for changes of pose (3,) and rays (N, 3)."""
+    return (by_pose @ pose_vector).reshape(-1, 2) + (by_ray @ rays[:, :, None])[:, :, 0]

@@ -1,4 +1,4 @@
-"""Exact planar motion: of the posture, and of landmarks in the moving camera's inverse-depth coordinates.
+"""Exact planar motion: of the pose, and of landmarks in the moving camera's inverse-depth coordinates.
 
 A landmark is (a, b, w) = (p1/p3, p2/p3, 1/p3) with p1 right, p2 down and p3 forward of the optical centre
 of the moving camera, m. One step of the wheels, u1 forward and u2 counter-clockwise, carries the optical
@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.observation import Odometry
-from hybridmap.pose import Array
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Array
 
 STANDS = 1e-4
 """A wheel's way below this is none, m."""
@@ -70,8 +70,8 @@ class WheelNoise:
         return np.array([[0.5 * right, 0.5 * left], [right / self.axle, -left / self.axle]])
 
 
-def move_posture(pose_vector: Array, odometry: Odometry, aside: float = 0.0) -> tuple[Array, Array, Array]:
-    """Move a posture by one step of the wheels.
+def move_pose(pose_vector: Array, odometry: Odometry, aside: float = 0.0) -> tuple[Array, Array, Array]:
+    """Move a pose by one step of the wheels.
 
     Args:
         pose_vector: (3,) [x m, y m, heading rad] in any fixed frame.
@@ -79,15 +79,15 @@ def move_posture(pose_vector: Array, odometry: Odometry, aside: float = 0.0) -> 
         aside: u3, how far the robot slips to the left of its way, m.
 
     Returns:
-        The posture after, (3,); its Jacobians by the posture before, (3, 3), and by (u1, u2, u3), (3, 3).
+        The pose after, (3,); its Jacobians by the pose before, (3, 3), and by (u1, u2, u3), (3, 3).
     """
     u1, u2 = odometry.forward, odometry.turn
     c, s = math.cos(pose_vector[2] + 0.5 * u2), math.sin(pose_vector[2] + 0.5 * u2)
     x, y = u1 * c - aside * s, u1 * s + aside * c
     after = pose_vector + np.array([x, y, u2])
-    by_posture = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    by_pose = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     by_input = np.array([[c, -0.5 * y, -s], [s, 0.5 * x, c], [0.0, 1.0, 0.0]])
-    return after, by_posture, by_input
+    return after, by_pose, by_input
 
 
 def transform_rays(
@@ -163,11 +163,11 @@ def propagate(
     """A P A^T + B S B^T + Q of a motion whose A is block diagonal, symmetric to the last bit.
 
     Args:
-        covariance: (3 + 3n, 3 + 3n) P before, of [posture, (a, b, w) of each landmark].
-        by_state: (1 + n, 3, 3) blocks of A: of the posture, then of each landmark.
+        covariance: (3 + 3n, 3 + 3n) P before, of [pose, (a, b, w) of each landmark].
+        by_state: (1 + n, 3, 3) blocks of A: of the pose, then of each landmark.
         by_input: (3 + 3n, 3) B, by (u1, u2, u3).
         input_root: (3, 3) root of the covariance S of these.
-        variances: (3,) of the posture, the diagonal of Q.
+        variances: (3,) of the pose, the diagonal of Q.
     """
     blocks, size = len(by_state), len(covariance)
     # Blocks times rows, never the dense product; P is symmetric, so that (A P)^T = P A^T.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
 
 MOST_EXCESS = 16.0
 """Pixels are never taken for worse than this times what is said, in variance."""

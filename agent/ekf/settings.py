@@ -15,7 +15,7 @@ class FilterSettings:
             that is not flat, shaking and blur make all pixels worse than any tracker knows.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
         side_slip: standard deviation of the slip aside of a step, as a share of the wheels' way.
-        posture_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
+        pose_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
         slip_sigmas: wheels that an image refutes by more than this have slipped.
         slip: sigma of (forward m, turn rad) of a step whose wheels the landmarks refute.
         distrust: for so many steps after that, wheels that claim to stand are not believed.
@@ -38,7 +38,7 @@ class FilterSettings:
     adaptation: float = 0.1
     wheel_floor: float = 1e-5
     side_slip: float = 0.0
-    posture_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     slip_sigmas: float = 4.5
     slip: tuple[float, float] = (0.1, 0.2)
     distrust: int = 10
@@ -71,7 +71,7 @@ class LocalizationSettings:
         lost_position: uncertainty of a position that was refuted, m (the paper's 1 m).
         lost_heading: uncertainty of a heading that was refuted, rad (the paper's 1 rad).
         least_fixed: landmarks that a static fix needs (paper, section 6).
-        least_refound: landmarks that a static fix needs to replace a posture that was refuted.
+        least_refound: landmarks that a static fix needs to replace a pose that was refuted.
         least_agreeing: fewer accepted landmarks than this are no good update.
         least_agreeing_share: nor is a smaller share of those seen.
         patience: so many bad updates in a row make the filter unhealthy.

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array
 
 STEPS = 4
 """Gauss-Newton steps after the linear solution that they start from."""
@@ -19,11 +19,11 @@ NEAREST = 1e-3
 
 
 class Triangulation(NamedTuple):
-    """Landmarks seen from the reference posture, in columns; NaN where a track was seen less than twice.
+    """Landmarks seen from the reference pose, in columns; NaN where a track was seen less than twice.
 
     Attributes:
-        rays: (N, 3) [a, b, w 1/m] at the reference, as in agent.ekf.motion; w <= 0 means that the track
-            may as well be at infinity.
+        rays: (N, 3) [a, b, w 1/m] at the reference, as in mapweave.agent.ekf.motion; w <= 0 means that the
+            track may as well be at infinity.
         ray_covariances: (N, 3, 3) their covariances, the trajectory taken as true.
         points_in_robot: (N, 3) m, in the reference's robot frame; NaN for w <= 0.
         depths: (N,) m along the optical axis of the reference; infinite for w <= 0.
@@ -56,7 +56,7 @@ def triangulate(
         pixels: (T, N, 2) px, undistorted; NaN where a track was not seen.
         camera: intrinsics and mount.
         pixel_sigma: standard deviation of a pixel, px.
-        reference: (3,) anchor_from_robot of the posture in whose camera to answer; the last by default.
+        reference: (3,) anchor_from_robot of the pose in whose camera to answer; the last by default.
 
     Raises:
         InvalidValue: shapes that do not belong together.
@@ -133,7 +133,7 @@ class _Solver:
 
 
 def _camera_motion(poses: Array, reference: Array, camera: Camera) -> tuple[Array, Array]:
-    """Depth and right of a landmark at each posture, each (3, T), by (1, a, w) at the reference."""
+    """Depth and right of a landmark at each pose, each (3, T), by (1, a, w) at the reference."""
     turn = poses[:, 2] - reference[2]
     c, s = np.cos(reference[2]), np.sin(reference[2])
     x, y = poses[:, 0] - reference[0], poses[:, 1] - reference[1]

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.localizing.recall import lookalikes, recall_all
-from agent.mission import WhereAmI
-from agent.motion_primitives import NO_ANSWER, MotionPrimitives
-from agent.observation import Command
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Node, NodeId
-from hybridmap.pose import PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, View
-from registration.recognition import Recognition
-from vision.sift import Features
+from mapweave.agent.localization.place_recognition import lookalikes, recognise_places
+from mapweave.agent.mission import WhereAmI
+from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
+from mapweave.registration.recognition import Recognition
+from mapweave.vision.sift import Features
 
 RIVAL = 0.5
 """Another node of the own map with this share of the best one's inliers has a say too,"""
@@ -44,7 +44,7 @@ class Candidate:
 
     Attributes:
         node: of whichever robot's map.
-        node_from_robot: posture.
+        node_from_robot: pose.
         recognized: how the own map knows it; None if the fleet does.
         distance_known: False if how far the node is away is not known (a photograph of unknown scale).
     """
@@ -80,7 +80,7 @@ class OwnMap:
 
     def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> Candidates:
         """Nodes that a view shows, of an image with these features."""
-        recalled = recall_all(self.map, view, self._rng)
+        recalled = recognise_places(self.map, view, self._rng)
         if not recalled:
             return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
         alike = lookalikes(recalled, RIVAL, APART)

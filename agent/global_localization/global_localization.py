@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
-from agent.global_localization.candidates import APART, Candidate, Candidates, FleetMap, OwnMap
-from agent.global_localization.pose_consistency import PoseHypothesis, consistent
-from agent.global_localization.settings import GlobalLocalizationSettings
-from agent.localizing.recall import exact_enough
-from agent.motion_primitives import MotionPrimitives
-from agent.observation import Command, RobotDescription
-from hybridmap.pose import Pose2, wrap_angle
-from vision.sift import Sift
+from mapweave.agent.global_localization.candidates import APART, Candidate, Candidates, FleetMap, OwnMap
+from mapweave.agent.global_localization.pose_consistency import PoseHypothesis, consistent
+from mapweave.agent.global_localization.settings import GlobalLocalizationSettings
+from mapweave.agent.localization.place_recognition import exact_enough
+from mapweave.agent.motion_primitives import MotionPrimitives
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.vision.sift import Sift
 
 STILL = 0.2
 """Seconds that the robot stands still before a look."""
@@ -277,10 +277,10 @@ class GlobalLocalization:
         if believed is None:
             return []
         here = self._motion.odom_from_robot.heading
-        postures = [n.map_from_robot.mean for n in self._own.map.nodes.values() if len(n.landmarks) >= RICH]
+        poses = [n.map_from_robot.mean for n in self._own.map.nodes.values() if len(n.landmarks) >= RICH]
         turns = [
             wrap_angle(there.heading - believed.heading)
-            for there in postures
+            for there in poses
             if believed.distance(there) <= NEARBY
         ]
         chosen: list[float] = []

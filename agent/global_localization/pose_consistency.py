@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hybridmap.pose import Pose2
+from mapweave.hybridmap.pose import Pose2
 
 
 @dataclass(frozen=True)

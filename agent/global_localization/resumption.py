@@ -6,14 +6,14 @@ from collections import deque
 
 import numpy as np
 
-from agent.global_localization.candidates import OwnMap, RecognizedNode
-from agent.global_localization.global_localization import GlobalLocalization
-from agent.global_localization.settings import GlobalLocalizationSettings, ResumptionSettings
-from agent.motion_primitives import Behaviour, MotionPrimitives
-from agent.observation import Command, Observation, RobotDescription
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.pose import Array, Pose2
-from vision.sift import Sift
+from mapweave.agent.global_localization.candidates import OwnMap, RecognizedNode
+from mapweave.agent.global_localization.global_localization import GlobalLocalization
+from mapweave.agent.global_localization.settings import GlobalLocalizationSettings, ResumptionSettings
+from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.vision.sift import Sift
 
 REMEMBERED = 600
 """Readings of the rangers that are kept for the floor, the latest."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from agent.global_localization.pose_consistency import ConsistencySettings
+from mapweave.agent.global_localization.pose_consistency import ConsistencySettings
 
 
 @dataclass(frozen=True)

@@ -7,23 +7,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agent.ekf.report import Health
-from agent.mapping.cartographer import Cartographer, CartographerSettings
-from agent.mapping.placed import HERE
-from agent.mapping.track_settings import TrackingSettings
-from agent.mapping.tracking import Tracking
-from agent.mapping.view import View
-from agent.mapping.wayside import Wayside, WaysideSettings
-from agent.observation import Observation, RobotDescription
-from agent.surveying.surveyor import Traverse
-from agent.vision.report import TrackReport
-from hybridmap.change import ChangeBody
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, Node
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from registration.recognition import Recognition
-from vision.lens import Lens
-from vision.sift import Features, Sift, SiftSettings
+from mapweave.agent.edge_measurement.traverse import Traverse
+from mapweave.agent.ekf.update_report import Health
+from mapweave.agent.mapping.anchored_keyframe import HERE
+from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder, KeyframeBuilderSettings
+from mapweave.agent.mapping.tracking import Tracking
+from mapweave.agent.mapping.tracking_settings import TrackingSettings
+from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder, TrajectoryRecorderSettings
+from mapweave.agent.mapping.view import View
+from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.vision.track_quality import TrackQuality
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.registration.recognition import Recognition
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Features, Sift, SiftSettings
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ class MapperSettings:
 
     sift: SiftSettings = field(default_factory=SiftSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
-    cartographer: CartographerSettings = field(default_factory=CartographerSettings)
-    wayside: WaysideSettings = field(default_factory=WaysideSettings)
+    cartographer: KeyframeBuilderSettings = field(default_factory=KeyframeBuilderSettings)
+    wayside: TrajectoryRecorderSettings = field(default_factory=TrajectoryRecorderSettings)
     depths_per_height: float = 8.0
 
 
 class Mapper:
     """Cuts a drive into episodes. Each begins at a view, the *anchor*, and ends at the next.
 
-    The filter's posture is relative to the anchor, with zero covariance there (the paper's P_0^r = 0). So
+    The filter's pose is relative to the anchor, with zero covariance there (the paper's P_0^r = 0). So
     its covariance at the next anchor is that of the edge between the two nodes.
 
     Attributes:
@@ -72,8 +72,10 @@ class Mapper:
         self._lens = Lens(description.camera, description.distortion)
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings.tracking)
-        self._cartographer = Cartographer(map_id, description, settings.cartographer, contents, next_number)
-        self._wayside = Wayside(description, settings.wayside)
+        self._cartographer = KeyframeBuilder(
+            map_id, description, settings.cartographer, contents, next_number
+        )
+        self._wayside = TrajectoryRecorder(description, settings.wayside)
         self._anchor: View | None = None
         self._leaves: list[View] = []
 
@@ -110,7 +112,7 @@ class Mapper:
 
     @property
     def health(self) -> str:
-        """What is wrong with the estimate of the posture, in words; empty if nothing is.
+        """What is wrong with the estimate of the pose, in words; empty if nothing is.
 
         That depths are unknown before the robot has moved goes without saying.
         """
@@ -119,12 +121,12 @@ class Mapper:
 
     @property
     def anchor_from_robot(self) -> Pose2:
-        """Posture since the anchor view."""
+        """Pose since the anchor view."""
         return self._tracking.pose.mean
 
     @property
     def map_from_robot(self) -> PoseGaussian:
-        """Posture in the agent's map."""
+        """Pose in the agent's map."""
         return self._cartographer.map_from_anchor @ self._tracking.pose
 
     @property
@@ -133,7 +135,7 @@ class Mapper:
         return len(self._tracking.ids)
 
     @property
-    def track_report(self) -> TrackReport:
+    def track_report(self) -> TrackQuality:
         """Age of the tracks, how well they agree with the filter, and how much of the image they cover."""
         return self._tracking.report
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.pose import Array, Pose2
 
 
 class TrackHistory:
-    """Pixels of tracks with the postures from which they were seen.
+    """Pixels of tracks with the poses from which they were seen.
 
     A sighting is kept when the robot has moved enough since the last one: standing still adds nothing.
     """
@@ -53,7 +53,7 @@ class TrackHistory:
             ids: (N,) tracks.
 
         Returns:
-            Postures (T, 3) [x m, y m, heading rad] in the anchor's frame, and pixels (T, N, 2), NaN where
+            Poses (T, 3) [x m, y m, heading rad] in the anchor's frame, and pixels (T, N, 2), NaN where
             a track was not seen.
         """
         pixels = np.full((len(self._poses), len(ids), 2), np.nan)

@@ -9,25 +9,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.landmarks import LandmarkEstimates
-from agent.ekf.mapping import MappingFilter
-from agent.ekf.report import Health
-from agent.ekf.triangulation import triangulate
-from agent.mapping.continuity import Continuity, Sight, relit, turned
-from agent.mapping.dispute import Dispute
-from agent.mapping.track_history import TrackHistory
-from agent.mapping.track_settings import TrackingSettings
-from agent.mapping.unheld import Unheld
-from agent.mapping.view import View, associate, even_choice
-from agent.observation import Observation, Odometry, RobotDescription
-from agent.vision.hidden import Hidden
-from agent.vision.report import TrackReport
-from agent.vision.strikes import Strikes
-from agent.vision.template import Templates
-from agent.vision.tracker import Tracker
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from vision.lens import Lens
-from vision.sift import Features
+from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
+from mapweave.agent.ekf.mapping_filter import MappingFilter
+from mapweave.agent.ekf.triangulation import triangulate
+from mapweave.agent.ekf.update_report import Health
+from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit, turned
+from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
+from mapweave.agent.mapping.prediction_offset import PredictionOffset
+from mapweave.agent.mapping.track_history import TrackHistory
+from mapweave.agent.mapping.tracking_settings import TrackingSettings
+from mapweave.agent.mapping.view import View, associate, even_choice
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.agent.vision.occluded_tracks import OccludedTracks
+from mapweave.agent.vision.rejection_counter import RejectionCounter
+from mapweave.agent.vision.template import Templates
+from mapweave.agent.vision.track_quality import TrackQuality
+from mapweave.agent.vision.tracker import Tracker
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Features
 
 
 class LostTracks(NamedTuple):
@@ -62,19 +62,19 @@ class Tracking:
         self._camera, self._lens = description.camera, lens
         self._settings = settings
         self._tracker = Tracker(lens, settings.tracker)
-        self._hidden = Hidden(settings.hidden)
-        self._unheld = Unheld()
+        self._hidden = OccludedTracks(settings.hidden)
+        self._unheld = PredictionOffset()
         own = replace(settings.filter, side_slip=description.side_slip)
         self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
         # Two images are compared by points that live for one step: nothing to hold them to.
         once = replace(settings.tracker, anchored=False)
-        self._continuity = Continuity(lens, description.camera, once, settings.continuity)
+        self._continuity = KidnapDetector(lens, description.camera, once, settings.continuity)
         self.strange = self.blank = self.missing = 0
-        self._dispute = Dispute(settings.dispute)
+        self._dispute = OdometryConsistency(settings.dispute)
         self._believed: NDArray[np.uint8] | None = None
         self._since_believed = Pose2()
         self._misses_px: Array = np.zeros((0, 2))
-        self._strikes = Strikes(settings.strikes)
+        self._strikes = RejectionCounter(settings.strikes)
         self._unused: int | None = None
         self._expected_depth = 1.0
         self._next_track = 1
@@ -90,10 +90,10 @@ class Tracking:
         return self._tracker.pixels
 
     @property
-    def report(self) -> TrackReport:
+    def report(self) -> TrackQuality:
         """What the tracks are worth after the last image that was believed."""
         tracker = self._tracker
-        return TrackReport.of(self._camera, tracker.pixels, tracker.ages, tracker.held, self._misses_px)
+        return TrackQuality.of(self._camera, tracker.pixels, tracker.ages, tracker.held, self._misses_px)
 
     @property
     def pose(self) -> PoseGaussian:
@@ -102,7 +102,7 @@ class Tracking:
 
     @property
     def health(self) -> tuple[Health, str]:
-        """What holds the posture up, and in words what is wrong; empty if nothing is."""
+        """What holds the pose up, and in words what is wrong; empty if nothing is."""
         told = self._filter.health
         if self.missing or self.strange or self.blank:
             return told
@@ -211,12 +211,15 @@ class Tracking:
             self._tracker.track(image, self._expected())
         else:
             sight = self._see(image, believed)
-            if sight is not Sight.SAME and self._see(relit(image, believed), believed) is Sight.SAME:
+            if (
+                sight is not FrameOverlap.SAME
+                and self._see(relit(image, believed), believed) is FrameOverlap.SAME
+            ):
                 # The next image will be in the same light as this one really is.
                 self._tracker.relight(image)
-            elif sight is not Sight.SAME:
-                self.strange += sight is Sight.STRANGE
-                self.blank += sight is Sight.BLANK
+            elif sight is not FrameOverlap.SAME:
+                self.strange += sight is FrameOverlap.STRANGE
+                self.blank += sight is FrameOverlap.BLANK
                 return None
         self.strange = self.blank = 0
         self._believed, self._since_believed = image, Pose2()
@@ -243,7 +246,7 @@ class Tracking:
     def _held(self, alive: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(N,) which tracks the filter holds. A landmark that is gone is taken out of it, and stays out.
 
-        What it has taught is in the posture already.
+        What it has taught is in the pose already.
         """
         self._filter.remove(self._filter.ids[~np.isin(self._filter.ids, alive)])
         return np.isin(self._tracker.ids, self._filter.ids)
@@ -313,7 +316,7 @@ class Tracking:
             return False
         return int(image.min()) < int(image.max())
 
-    def _see(self, image: NDArray[np.uint8], believed: NDArray[np.uint8]) -> Sight:
+    def _see(self, image: NDArray[np.uint8], believed: NDArray[np.uint8]) -> FrameOverlap:
         """Follow the tracks into an image; if it does not continue the one before, they stay behind."""
         tracker, expected = copy.copy(self._tracker), self._expected()
         tracker.track(image, expected)
@@ -321,7 +324,7 @@ class Tracking:
         found[np.isin(self._tracker.ids, tracker.ids)] = tracker.pixels
         turn = self._since_believed.heading
         sight = self._continuity.compare(believed, image, turn, expected, found)
-        if sight is Sight.SAME:
+        if sight is FrameOverlap.SAME:
             self._tracker = tracker
         return sight
 

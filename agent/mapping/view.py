@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, PoseGaussian
-from vision.sift import Features
+from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.vision.sift import Features
 
 
 @dataclass(eq=False)
@@ -17,7 +17,7 @@ class View:
 
     Attributes:
         stamp_ns: when it was taken.
-        anchor_from_view: posture relative to the anchor view; identity for the anchor itself.
+        anchor_from_view: pose relative to the anchor view; identity for the anchor itself.
         features: its features.
         tracks: (N,) id of the track of each feature, -1 where it has none.
         proximity: (K,) m, free distances from the robot's edge at that time.

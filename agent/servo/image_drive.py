@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, RobotDescription
-from agent.servo.follow import clip
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.servo.leg_controller import clip
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 Each law is the same feedback in another chart of the circle: chart 1 drives forward to the goal from behind,
 charts 2 to 5 drive backward to it from ahead, around either side and turning either way. All five have their
-equilibrium at the goal posture. In its own chart every law closes the same loop,
+equilibrium at the goal pose. In its own chart every law closes the same loop,
 
     rho' = -rho cos^2(b),   phi~' = sin(2 b) / 2,   b' = -lambda b - sinc(2 b) phi~      (b = beta~)
 
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
 
 BETA_SHIFT: Array = np.array([0.0, -1.0, -1.0, 1.0, 1.0]) * math.pi
 """(5,) rad, beta~_i = beta + BETA_SHIFT[i]."""
@@ -87,7 +87,7 @@ def saturate(forward: float, turn: float, max_forward: float, max_turn: float) -
 
 
 def law_paths(laws: NDArray[np.intp], rho: Array, phi_tilde: Array, beta_tilde: Array) -> Array:
-    """Postures of chart coordinates.
+    """Poses of chart coordinates.
 
     Args:
         laws: (L,) law of each path, 0 to 4.

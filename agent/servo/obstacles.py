@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.pose import Array, Pose2
 
 
 class ObstacleMemory:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.servo.field import Field
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.servo.field_of_view import FieldOfView
+from mapweave.hybridmap.pose import Array, Pose2
 
 TURN_STEP = 0.05
 """rad between two samples of a turn on the spot."""
@@ -47,7 +47,7 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A way to the goal posture.
+    """A way to the goal pose.
 
     Attributes:
         start: where it begins, in goal; the heading's branch is that of the legs.
@@ -66,13 +66,13 @@ class Plan:
         """Driven, m."""
         return sum(leg.length for leg in self.legs)
 
-    def postures(self) -> Array:
+    def poses(self) -> Array:
         """(M, 3) x m, y m, heading rad, in goal: the way, densely, with the last turn to heading 0."""
         return sample(self.start, self.legs)
 
 
 def sample(start: Pose2, legs: Sequence[Leg]) -> Array:
-    """(M, 3) dense postures from a start along legs to the goal's heading (the turn of it nearest)."""
+    """(M, 3) dense poses from a start along legs to the goal's heading (the turn of it nearest)."""
     parts = []
     here = start.vector
     for leg in legs:
@@ -115,7 +115,7 @@ class Price:
 class Surroundings:
     """Where the robot may stand: enough landmarks in view, and clear of obstacles."""
 
-    def __init__(self, field: Field, obstacles_in_goal: NDArray[Any], clearance: float) -> None:
+    def __init__(self, field: FieldOfView, obstacles_in_goal: NDArray[Any], clearance: float) -> None:
         """Join a field of view and obstacles.
 
         Args:
@@ -127,20 +127,20 @@ class Surroundings:
         self.obstacles = np.asarray(obstacles_in_goal, dtype=np.float64).reshape(-1, 2)
         self.clearance = clearance
 
-    def distance(self, postures: NDArray[Any]) -> Array:
+    def distance(self, poses: NDArray[Any]) -> Array:
         """(...) m from the nearest obstacle point; infinite without any."""
         if not len(self.obstacles):
-            return np.full(np.shape(postures)[:-1], np.inf)
-        dx = postures[..., 0, None] - self.obstacles[:, 0]
-        dy = postures[..., 1, None] - self.obstacles[:, 1]
+            return np.full(np.shape(poses)[:-1], np.inf)
+        dx = poses[..., 0, None] - self.obstacles[:, 0]
+        dy = poses[..., 1, None] - self.obstacles[:, 1]
         distance: Array = np.sqrt((dx * dx + dy * dy).min(axis=-1))
         return distance
 
-    def allowed(self, postures: NDArray[Any], margin: float) -> NDArray[np.bool_]:
-        """(...) whether postures (..., 3) in goal keep both constraints."""
-        fine: NDArray[np.bool_] = self.field.slack(postures) >= margin
+    def allowed(self, poses: NDArray[Any], margin: float) -> NDArray[np.bool_]:
+        """(...) whether poses (..., 3) in goal keep both constraints."""
+        fine: NDArray[np.bool_] = self.field.slack(poses) >= margin
         if len(self.obstacles):
-            fine &= self.distance(postures) >= self.clearance
+            fine &= self.distance(poses) >= self.clearance
         return fine
 
     def admits(self, way: NDArray[Any], margin: float) -> bool:
@@ -156,7 +156,7 @@ class Surroundings:
 
 
 def arc(pose: Pose2, forward: float, turn: float, seconds: float, count: int = 4) -> Array:
-    """(count, 3) postures from a pose on, under constant speeds (m/s, rad/s)."""
+    """(count, 3) poses from a pose on, under constant speeds (m/s, rad/s)."""
     times = np.linspace(0.0, seconds, count)
     turned = turn * times
     chord = forward * times * np.sinc(0.5 * turned / math.pi)

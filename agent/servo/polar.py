@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 TURN = 2.0 * math.pi
 
@@ -29,7 +29,7 @@ class Polar:
     beta: float
 
     def pose(self) -> Pose2:
-        """The posture `goal_from_robot` with these coordinates."""
+        """The pose `goal_from_robot` with these coordinates."""
         heading = wrap_angle(math.pi + self.phi - self.beta)
         return Pose2(self.rho * math.cos(self.phi), self.rho * math.sin(self.phi), heading)
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, RobotDescription
-from hybridmap.pose import Array
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.hybridmap.pose import Array
 
 _MARGIN = 0.045
 """m, room that is kept between the footprint and what the rangers see."""

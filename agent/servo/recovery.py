@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.observation import Command
-from agent.servo.field import Field
-from agent.servo.follow import Limits, clip
-from agent.servo.plan import Surroundings
-from agent.servo.settings import ServoSettings
-from agent.servo.step import State
-from hybridmap.pose import Pose2
+from mapweave.agent.observation import Command
+from mapweave.agent.servo.field_of_view import FieldOfView
+from mapweave.agent.servo.leg_controller import Limits, clip
+from mapweave.agent.servo.plan import Surroundings
+from mapweave.agent.servo.servo_step import State
+from mapweave.agent.servo.settings import ServoSettings
+from mapweave.hybridmap.pose import Pose2
 
 _OFFSETS = np.linspace(-0.8, 0.8, 33)
 """rad, turns on the spot that are looked at."""
@@ -28,12 +28,12 @@ class Recovery:
         """Enough is in view again: the next retreat may be as long as this one could have been."""
         self._retreat_from = None
 
-    def command(self, pose: Pose2, field: Field, around: Surroundings) -> tuple[Command, State, str]:
+    def command(self, pose: Pose2, field: FieldOfView, around: Surroundings) -> tuple[Command, State, str]:
         """What to do at `goal_from_robot` with too few landmarks in view."""
         settings = self._settings
         count = len(_OFFSETS)
-        postures = np.column_stack([np.full(count, pose.x), np.full(count, pose.y), pose.heading + _OFFSETS])
-        fine = np.flatnonzero(field.slack(postures) >= 2.0 * settings.least_margin)
+        poses = np.column_stack([np.full(count, pose.x), np.full(count, pose.y), pose.heading + _OFFSETS])
+        fine = np.flatnonzero(field.slack(poses) >= 2.0 * settings.least_margin)
         if len(fine):
             offset = float(_OFFSETS[fine[np.abs(_OFFSETS[fine]).argmin()]])
             turn = clip(settings.turn_gain * offset, self._limits.turn)

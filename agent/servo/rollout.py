@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.servo.laws import LAWS, charts, law_paths
-from agent.servo.polar import Polar
-from hybridmap.pose import Array
+from mapweave.agent.servo.laws import LAWS, charts, law_paths
+from mapweave.agent.servo.polar import Polar
+from mapweave.hybridmap.pose import Array
 
 _STEPS: Array = np.concatenate([np.full(24, 0.06), np.full(24, 0.25)])
 """(T-1,) s of the unsaturated laws; saturation changes the time, not the path. rho falls by up to e^-7.4."""
@@ -21,20 +21,20 @@ class Rollouts:
     """Where the five laws would lead.
 
     Attributes:
-        postures: (5, T, 3) x m, y m, heading rad (unwrapped), in goal; constant after a path has parked.
+        poses: (5, T, 3) x m, y m, heading rad (unwrapped), in goal; constant after a path has parked.
         parked: (5,) whether the path ends in the dead zone.
         lengths: (5,) m driven.
         turns: (5,) rad turned in all, with the last turn on the spot to heading 0.
     """
 
-    postures: Array
+    poses: Array
     parked: NDArray[np.bool_]
     lengths: Array
     turns: Array
 
 
 def roll_out(polar: Polar, lambda_: float, dead_zone: float) -> Rollouts:
-    """Integrate all five laws from a posture until the dead zone.
+    """Integrate all five laws from a pose until the dead zone.
 
     phi~ and beta~ of every law follow one autonomous system (see laws.py), integrated by the midpoint rule;
     rho is the exponential of the integral of -cos^2(beta~).
@@ -64,12 +64,12 @@ def roll_out(polar: Polar, lambda_: float, dead_zone: float) -> Rollouts:
     columns = np.arange(LAWS)
     for values in (rho, phis, betas):
         np.copyto(values, values[last, columns], where=after)
-    postures = law_paths(columns, rho, phis, betas)
-    steps = np.diff(postures, axis=1)
+    poses = law_paths(columns, rho, phis, betas)
+    steps = np.diff(poses, axis=1)
     lengths = np.hypot(steps[..., 0], steps[..., 1]).sum(axis=1)
-    final = np.mod(postures[:, -1, 2] + math.pi, 2.0 * math.pi) - math.pi
+    final = np.mod(poses[:, -1, 2] + math.pi, 2.0 * math.pi) - math.pi
     turns = np.abs(steps[..., 2]).sum(axis=1) + np.abs(final)
-    return Rollouts(postures, parked, lengths, turns)
+    return Rollouts(poses, parked, lengths, turns)
 
 
 def _rates(phi: Array, beta: Array, lambda_: float) -> tuple[Array, Array]:

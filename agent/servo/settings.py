@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from agent.servo.plan import Price
+from mapweave.agent.servo.plan import Price
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, RobotDescription
-from agent.servo.follow import LegFollower, Limits, clip
-from agent.servo.laws import control, saturate
-from agent.servo.obstacles import ObstacleMemory
-from agent.servo.plan import Plan, Surroundings, arc, sample
-from agent.servo.polar import Polar, continued, polar_of
-from agent.servo.recovery import Recovery
-from agent.servo.rollout import roll_out
-from agent.servo.settings import ServoSettings
-from agent.servo.sight import Sight
-from agent.servo.step import ServoStep, State
-from agent.servo.way import needs_thought, quick_plan, thorough_plan
-from hybridmap.pose import Pose2, wrap_angle
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.servo.laws import control, saturate
+from mapweave.agent.servo.leg_controller import LegController, Limits, clip
+from mapweave.agent.servo.obstacles import ObstacleMemory
+from mapweave.agent.servo.plan import Plan, Surroundings, arc, sample
+from mapweave.agent.servo.planner import needs_thought, quick_plan, thorough_plan
+from mapweave.agent.servo.polar import Polar, continued, polar_of
+from mapweave.agent.servo.recovery import Recovery
+from mapweave.agent.servo.rollout import roll_out
+from mapweave.agent.servo.servo_step import ServoStep, State
+from mapweave.agent.servo.settings import ServoSettings
+from mapweave.agent.servo.visibility import Visibility
+from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 
 class Servo:
@@ -58,13 +58,13 @@ class Servo:
             Whether a way is known already; if not, `command` makes a longer search with the robot at rest.
         """
         self.switches = 0
-        self._sight = Sight(self._description.camera, self.settings)
+        self._sight = Visibility(self._description.camera, self.settings)
         self._memory = ObstacleMemory()
         self._law: int | None = None
         self._polar = Polar(0.0, 0.0, 0.0)  # continued from tick to tick while a law is at work
         self._plan: Plan | None = None
         self._leg = 0
-        self._follower: LegFollower | None = None
+        self._follower: LegController | None = None
         self._broken_laws = 0
         self._in_dead_zone = False
         self._settled = 0
@@ -147,7 +147,7 @@ class Servo:
         if self._law is not None:
             self._polar = continued(pose, self._polar)
             rollouts = roll_out(self._polar, self.settings.lambda_, self.settings.dead_zone)
-            way = rollouts.postures[self._law]
+            way = rollouts.poses[self._law]
             if not (rollouts.parked[self._law] and around.admits(way, hard)):
                 self._law = None
                 self._broken_laws += 1
@@ -205,7 +205,7 @@ class Servo:
         for law in np.argsort(costs, kind="stable").tolist():
             if costs[law] > limit:
                 return None
-            if rollouts.parked[law] and around.admits(rollouts.postures[law], margin):
+            if rollouts.parked[law] and around.admits(rollouts.poses[law], margin):
                 return int(law)
         return None
 
@@ -260,7 +260,7 @@ class Servo:
             leg = plan.legs[self._leg]
             if self._follower is None:
                 last = self._leg == len(plan.legs) - 1
-                self._follower = LegFollower(leg, last, self.settings, self._limits)
+                self._follower = LegController(leg, last, self.settings, self._limits)
             command = self._follower.command(pose)
             if command is not None:
                 name = f"leg {self._leg + 1} of {len(plan.legs)}"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.vision.strikes import Strikes
-from agent.vision.tracker import Tracker, TrackerSettings
-from hybridmap.pose import Array
-from vision.lens import Lens
-from vision.sift import Features
+from mapweave.agent.vision.rejection_counter import RejectionCounter
+from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.hybridmap.pose import Array
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Features
 
 
 class NodeTracks:
@@ -36,7 +36,7 @@ class NodeTracks:
         """
         self._tracker = Tracker(lens, settings)
         self._tracker.track(image)
-        self._strikes = Strikes(strikes)
+        self._strikes = RejectionCounter(strikes)
         self.renew(features, pairs)
 
     @property

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
 
 Floats = NDArray[np.float32]
 

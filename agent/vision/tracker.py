@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.vision.template import TemplateMatcher, Templates, TemplateSettings
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array
-from vision.lens import Lens
+from mapweave.agent.vision.template import TemplateMatcher, Templates, TemplateSettings
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array
+from mapweave.vision.lens import Lens
 
 EIGENVALUE_UNIT = 1024.0
 """OpenCV's Lucas-Kanade measures gradients in units of 1/32 grey/px."""

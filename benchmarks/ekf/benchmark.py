@@ -28,25 +28,10 @@ from rich.table import Table
 from scipy.stats import chi2
 
 from benchmarks.ekf_speed.benchmark import measure, one_thread
-from synthetic.localization_run import (
-    FEW,
-    Place,
-    Start,
-    try_drives,
-    try_start,
-)
-from synthetic.mapping_error import (
-    error,
-    filter_error,
-    follow,
-    landmark_nees,
-    left_out,
-)
+from synthetic.localization_run import FEW, Place, Start, try_drives, try_start
+from synthetic.mapping_error import error, filter_error, follow, landmark_nees, left_out
 from synthetic.mapping_optimum import batch_optimum
-from synthetic.mapping_run import (
-    SHAPES,
-    draw_run,
-)
+from synthetic.mapping_run import SHAPES, draw_run
 from synthetic.track_faults import spoil
 
 _STARTS = 10
@@ -59,7 +44,7 @@ class Trial:
 
     Attributes:
         ratio: error over the batch optimum's.
-        nees_pose: of the last posture, 3 degrees of freedom.
+        nees_pose: of the last pose, 3 degrees of freedom.
         nees_landmark: mean over the landmarks, in the camera's (a, b, w), 3 degrees of freedom each.
         outlier_ratio: error with spoiled tracks over that without, on the good ones.
         left_out: landmarks that these errors leave out: let go by the filter, or at infinity to it.

@@ -22,16 +22,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from agent.ekf.mapping import FilterSettings, MappingFilter
-from agent.observation import Odometry
 from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
-from hybridmap.pose import Array
-from synthetic.mapping_run import (
-    AXLE,
-    WHEEL_NOISE,
-    MappingRun,
-    draw_run,
-)
+from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Array
+from synthetic.mapping_run import AXLE, WHEEL_NOISE, MappingRun, draw_run
 
 SIZES = (30, 100)
 _BELIEVE_ALL = 1.0 - 1e-15

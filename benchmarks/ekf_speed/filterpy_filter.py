@@ -1,8 +1,8 @@
 """The mapping filter's model in FilterPy: the rival in speed, and a second implementation to agree with.
 
-State [x, y, heading, (a, b, w) of each landmark] as in agent.ekf.moving_state, as a user of FilterPy would
-write it: dense F, Q and H in numpy, all landmarks at once, no gates, no step linearised twice. The formulas
-are written here anew and share no code with agent.ekf.
+State [x, y, heading, (a, b, w) of each landmark] as in mapweave.agent.ekf.mapping_state, as a user of
+FilterPy would write it: dense F, Q and H in numpy, all landmarks at once, no gates, no step linearised
+twice. The formulas are written here anew and share no code with mapweave.agent.ekf.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from agent.observation import Odometry
-from hybridmap.camera import Camera
-from hybridmap.pose import Array
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
 
 
 class FilterPyMapping(ExtendedKalmanFilter):  # type: ignore[misc]
-    """FilterPy's extended Kalman filter over [posture (3), landmarks (n x 3)].
+    """FilterPy's extended Kalman filter over [pose (3), landmarks (n x 3)].
 
     Attributes:
         x: (3 + 3n,) state.
@@ -121,8 +121,8 @@ class FilterPyMapping(ExtendedKalmanFilter):  # type: ignore[misc]
         self.F[:3, :3] = [[1, 0, -u1 * sm], [0, 1, u1 * cm], [0, 0, 1]]
         rows = self._entry[:, None] + np.arange(3)
         self.F[rows[:, :, None], rows[:, None, :]] = blocks
-        posture_by_u = np.array([[cm, -u1 * sm / 2], [sm, u1 * cm / 2], [0, 1]])
-        return np.concatenate([posture_by_u, rays_by_u.reshape(-1, 2)])
+        pose_by_u = np.array([[cm, -u1 * sm / 2], [sm, u1 * cm / 2], [0, 1]])
+        return np.concatenate([pose_by_u, rays_by_u.reshape(-1, 2)])
 
     def _wheel_covariance(self, odometry: Odometry) -> Array:
         """(2, 2) covariance of (u1 m, u2 rad), from two wheels that err independently."""

@@ -4,7 +4,7 @@
 
 Every filter gets the same runs as in benchmarks.ekf: 50 s at 10 Hz in four shapes, 30 landmarks, wheels that
 slip, no wrong tracks. Its error is told as a ratio to that of the batch optimum. NEES (3 degrees of freedom,
-of the posture and of a landmark in the filter's own coordinates) is averaged over the runs that have not
+of the pose and of a landmark in the filter's own coordinates) is averaged over the runs that have not
 diverged: to diverge is to be ten times as far off as the optimum, or to end without a number.
 """
 
@@ -24,16 +24,11 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
-from agent.ekf.mapping import FilterSettings
 from benchmarks.ekf_speed.benchmark import one_thread
 from benchmarks.ekf_variants.coordinates import Points, Rays
 from benchmarks.ekf_variants.textbook import Choice, TextbookFilter
-from synthetic.mapping_error import (
-    error,
-    filter_error,
-    follow,
-    landmark_nees,
-)
+from mapweave.agent.ekf.mapping_filter import FilterSettings
+from synthetic.mapping_error import error, filter_error, follow, landmark_nees
 from synthetic.mapping_optimum import batch_optimum
 from synthetic.mapping_run import SHAPES, MappingRun, draw_run
 
@@ -66,7 +61,7 @@ class Outcome:
 
     Attributes:
         ratio: error over the batch optimum's; infinite if the filter ended without a number.
-        nees_pose: of the last posture.
+        nees_pose: of the last pose.
         nees_landmark: mean over the landmarks.
     """
 
@@ -86,7 +81,7 @@ def try_textbook(run: MappingRun, choice: Choice, best: float) -> Outcome:
                 filter_.step(odometry, pixels)
             off = error(run, np.arange(len(run.points)), filter_.pose_vector, filter_.points_in_anchor())
             last = run.poses[-1]
-            nees = filter_.posture_nees(last), filter_.landmark_nees(run.points, last)
+            nees = filter_.pose_nees(last), filter_.landmark_nees(run.points, last)
         except np.linalg.LinAlgError:
             return lost
     return Outcome(off / best, *nees) if math.isfinite(off) else lost
@@ -144,8 +139,8 @@ def main() -> None:
     figures = {name: summary([trial[name] for trial in trials]) for name in trials[0]}
     interval = [float(chi2.ppf(q, 3 * len(trials)) / len(trials)) for q in (0.025, 0.975)]
     title = f"{len(trials)} runs; a consistent filter's NEES: {interval[0]:.2f} to {interval[1]:.2f}"
-    table = Table("filter", "median", "p90", "posture", "marks", "diverged", title=title)
-    table.caption = "error over the optimum's: median, p90; NEES: posture, landmarks"
+    table = Table("filter", "median", "p90", "pose", "marks", "diverged", title=title)
+    table.caption = "error over the optimum's: median, p90; NEES: pose, landmarks"
     for name, row in figures.items():
         told = [f"{row[key]:.3g}" if row[key] >= 10 else f"{row[key]:.2f}" for key in list(row)[:4]]
         table.add_row(name, *told, f"{100 * row['diverged']:.0f} %")

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
 
 Numbers = NDArray[Any]
 """Real, or complex on the way of a derivative."""
@@ -58,8 +58,8 @@ class Rays:
         return vectors[:, [0, 1, 3]] / vectors[:, 2:3]
 
 
-def from_posture(vectors: Numbers, pose_vector: Numbers, mount_forward: float) -> Numbers:
-    """Homogeneous vectors (N, 4) as the camera sees them after the robot has moved to a posture (3,)."""
+def from_pose(vectors: Numbers, pose_vector: Numbers, mount_forward: float) -> Numbers:
+    """Homogeneous vectors (N, 4) as the camera sees them after the robot has moved to a pose (3,)."""
     x, y, heading = pose_vector
     c, s = np.cos(heading), np.sin(heading)
     right, down, ahead, scale = vectors.T

@@ -10,18 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Odometry
 from benchmarks.ekf_variants.coordinates import (
     Coordinates,
     Numbers,
     Points,
     Rays,
-    from_posture,
+    from_pose,
     in_robot,
     jacobian,
     of_robot,
 )
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Array, Pose2
 from synthetic.mapping_run import AXLE, WHEEL_NOISE, MappingRun
 
 Mask = NDArray[np.bool_]
@@ -44,7 +44,7 @@ class Choice:
             first pixel. Else the first pixel corrects them.
         iterations: linearisations of an update.
         first_estimates: whether all derivatives are taken at first estimates (Huang, Mourikis and
-            Roumeliotis 2010): landmarks where they started, postures where they were predicted.
+            Roumeliotis 2010): landmarks where they started, poses where they were predicted.
         relinearisations: how often a step is linearised again at what the image says it was.
     """
 
@@ -60,7 +60,7 @@ class Choice:
 
 
 class TextbookFilter:
-    """EKF over [posture (3), landmarks (n x 3)].
+    """EKF over [pose (3), landmarks (n x 3)].
 
     Attributes:
         pose_vector: (3,) [x m, y m, heading rad] since the anchor.
@@ -119,8 +119,8 @@ class TextbookFilter:
         points = in_robot(self.choice.coordinates.lift(self.landmarks), self._camera)
         return Pose2.from_vector(self.pose_vector).apply(points) if self.choice.moving else points
 
-    def posture_nees(self, true: Pose2) -> float:
-        """Squared Mahalanobis distance of the true posture, 3 degrees of freedom."""
+    def pose_nees(self, true: Pose2) -> float:
+        """Squared Mahalanobis distance of the true pose, 3 degrees of freedom."""
         off = self.pose_vector - true.vector
         return float(off @ np.linalg.solve(self.covariance[:3, :3], off))
 
@@ -129,7 +129,7 @@ class TextbookFilter:
 
         Args:
             points: (n, 3) m, where they are in the first robot frame.
-            true: posture.
+            true: pose.
         """
         points = true.inverse().apply(points) if self.choice.moving else points
         off = self.landmarks - self.choice.coordinates.drop(of_robot(points, self._camera))
@@ -194,15 +194,15 @@ class TextbookFilter:
         The derivative of the position by the heading is the way from the reference turned by 90 degrees.
         """
         pose_vector = _moved(self.pose_vector, at)
-        by_posture = np.eye(3)
-        by_posture[0, 2], by_posture[1, 2] = -(pose_vector - reference)[1], (pose_vector - reference)[0]
-        posture_by_input = jacobian(lambda u: _moved(self.pose_vector, u), at)
+        by_pose = np.eye(3)
+        by_pose[0, 2], by_pose[1, 2] = -(pose_vector - reference)[1], (pose_vector - reference)[0]
+        pose_by_input = jacobian(lambda u: _moved(self.pose_vector, u), at)
         landmarks, n = self._carried(self.landmarks, at), len(self.landmarks)
         by_landmark = jacobian(lambda z: self._carried(z, at), self.landmarks)
         landmarks_by_input = jacobian(lambda u: self._carried(self.landmarks, u), at)
-        self._by_input = np.concatenate([posture_by_input, landmarks_by_input.reshape(3 * n, 2)])
+        self._by_input = np.concatenate([pose_by_input, landmarks_by_input.reshape(3 * n, 2)])
         self.transition = np.zeros_like(self.covariance)
-        self.transition[:3, :3] = by_posture
+        self.transition[:3, :3] = by_pose
         index = 3 + np.arange(3 * n).reshape(n, 3)
         self.transition[index[:, :, None], index[:, None, :]] = by_landmark
         rest = self._by_input @ (measured - at)
@@ -215,13 +215,13 @@ class TextbookFilter:
         if not self.choice.moving:
             return landmarks
         vectors, there = self.choice.coordinates.lift(landmarks), _moved(np.zeros(3), u)
-        return self.choice.coordinates.drop(from_posture(vectors, there, self._camera.mount_forward))
+        return self.choice.coordinates.drop(from_pose(vectors, there, self._camera.mount_forward))
 
     def _slopes(self, pose_vector: Numbers, landmarks: Numbers) -> Numbers:
         """(N, 2) where landmarks are expected, (pixel - principal point) / focal length."""
         vectors = self.choice.coordinates.lift(landmarks)
         if not self.choice.moving:
-            vectors = from_posture(vectors, pose_vector, self._camera.mount_forward)
+            vectors = from_pose(vectors, pose_vector, self._camera.mount_forward)
         return np.asarray(vectors[:, :2] / vectors[:, 2:3])
 
 
@@ -233,6 +233,6 @@ def wheel_covariance(u: Array) -> Array:
 
 
 def _moved(pose_vector: Numbers, u: Numbers) -> Numbers:
-    """A posture after a step (u1, u2) of the wheels."""
+    """A pose after a step (u1, u2) of the wheels."""
     middle = pose_vector[2] + 0.5 * u[1]
     return np.asarray(pose_vector + np.stack([u[0] * np.cos(middle), u[0] * np.sin(middle), u[1]]))

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, Pose2
-from mapweave.scoring import crossed
-from sim.floorplan import FloorPlan
+from mapweave.evaluation.map_score import crossed
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.floorplan import FloorPlan
 
 SQUARE = 0.2
 """Side of a square of floor, m."""
@@ -27,7 +27,7 @@ class Look:
 
     Attributes:
         at: simulated time of its image, s.
-        world_from_robot: true posture then.
+        world_from_robot: true pose then.
         semi_aperture: half the horizontal field of view, rad.
     """
 

@@ -32,18 +32,18 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from agent.exploring.exploration import ExplorerSettings
-from agent.pipeline import PipelineSettings
 from benchmarks.explore.area import Look, MappedFloor, mapped_floor
 from benchmarks.explore.start import office
-from hybridmap.errors import MapweaveError
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeKind, NodeId
-from hybridmap.pose import Pose2
-from mapweave.scoring import score_map
-from mapweave.trial.fleet import TICKS_PER_SECOND, Stage
-from mapweave.trial.local_fleet import LocalFleet
-from wire.mapfile import unpack_map_file
+from mapweave.agent.exploration.settings import ExplorerSettings
+from mapweave.agent.pipeline import PipelineSettings
+from mapweave.evaluation.map_score import score_map
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import EdgeKind, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.fleet import TICKS_PER_SECOND, Stage
+from mapweave.scenarios.local_fleet import LocalFleet
+from mapweave.storage.map_file import unpack_map_file
 
 STRATEGIES = {
     "random": ExplorerSettings(wander=True, ask=False),
@@ -109,7 +109,7 @@ def _judged(stage: Stage, fleet: LocalFleet) -> Exploration:
             for node, pose in zip(nodes, poses, strict=True)
         ]
     links = [edge for edge in whole.edges.values() if edge.kind is EdgeKind.MERGED]
-    score = score_map({node: (c, p.mean) for node, (c, p) in merged.postures.items()}, links, truth)
+    score = score_map({node: (c, p.mean) for node, (c, p) in merged.poses.items()}, links, truth)
     robots = fleet.control.status().robots.values()
     return Exploration(
         floor=mapped_floor(fleet.control.plan(), looks),

@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Pose2
-from mapweave.scoring import crossed
-from mapweave.trial.scenario import Scenario, load_scenario, scenario_path
-from sim.floorplan import FloorPlan, random_pose
+from mapweave.evaluation.map_score import crossed
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.scenario import Scenario, load_scenario, scenario_path
+from mapweave.sim.floorplan import FloorPlan, random_pose
 
 CLEARANCE = 0.4
 """Of a robot's middle from walls and furniture, m."""
 APART, NEAR = 0.9, 2.5
 """Robots stand at least and at most so far from each other and from the first, m."""
 PLACES, TRIES = 20, 200
-"""Places that are tried for a fleet, and postures at each."""
+"""Places that are tried for a fleet, and poses at each."""
 
 
 def office(rooms: int, robots: int, seed: int, spread: bool) -> Scenario:

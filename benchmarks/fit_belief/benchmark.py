@@ -1,6 +1,6 @@
 """Fits how probable a recognised place is, and shows on other buildings whether it holds.
 
-The fit goes into mapserver.relocalizing.belief.
+The fit goes into mapweave.mapserver.relocalization.calibration.
 
     python -m benchmarks.fit_belief [--seeds N ...] [--check N ...] [--nodes N] [--queries N] [--json]
 
@@ -19,33 +19,22 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.relocalize.places import (
-    Place,
-    joined,
-    mapped,
-    mapped_sites,
-)
-from benchmarks.relocalize.queries import (
-    KINDS,
-    Query,
-    known,
-    nowhere,
-    twins,
-)
+from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
+from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
 from benchmarks.relocalize.score import RIGHT_DEG, RIGHT_M, errors
-from hybridmap.node import NodeId
-from hybridmap.pose import Array
-from mapserver.places.placeindex import PlaceIndex
-from mapserver.relocalizing.belief import COEFFICIENTS, Support, probabilities
-from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
-from mapserver.relocalizing.seenplaces import supported
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Array
+from mapweave.mapserver.relocalization.calibration import COEFFICIENTS, HypothesisSupport, probabilities
+from mapweave.mapserver.relocalization.place_hypotheses import supported
+from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
 PULL = 1.0
 """Of each weight to zero, as if by so many views."""
 BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
 
 
-Seen = list[tuple[list[Support], list[bool]]]
+Seen = list[tuple[list[HypothesisSupport], list[bool]]]
 """The places that were recognised in each view, and whether the robot was there."""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import skimage.data
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
 
 Image = NDArray[np.uint8]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
-from sim.scene import cross
-from sim.world import PanelSet, World
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.scene import cross
+from mapweave.sim.world import PanelSet, World
 
 NEAREST = 0.03
 """As near as the simulator draws, m."""

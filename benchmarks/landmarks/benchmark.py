@@ -13,7 +13,7 @@ matcher) has on the same pairs; `pairs_matched_ratio` the pairs with at least 15
 those of SIFT in floats.
 
 Then, in simulated places, how often a view from up to half a metre and 20 degrees away is recognised, and its
-posture right within 0.25 m and 5 degrees, over what the node may cost (`--places 0` leaves it out).
+pose right within 0.25 m and 5 degrees, over what the node may cost (`--places 0` leaves it out).
 """
 
 from __future__ import annotations
@@ -38,15 +38,8 @@ from rich.table import Table
 
 from benchmarks.landmarks.curve import LABELS, draw, recall_curve
 from benchmarks.landmarks.pairs import Pair, folder_pairs, known_pairs
-from benchmarks.landmarks.rivals import (
-    MOST,
-    Packed,
-    features,
-    keep_all,
-    matched,
-    pack,
-)
-from hybridmap.errors import InvalidFile
+from benchmarks.landmarks.rivals import MOST, Packed, features, keep_all, matched, pack
+from mapweave.hybridmap.errors import InvalidFile
 
 LEAST_RIGHT = 15
 """Right matches that make a pair count as matched."""

@@ -17,15 +17,15 @@ from rich.progress import track
 
 from benchmarks.landmarks.places import SimulatedPlace
 from benchmarks.landmarks.rivals import DEPTH_FLOOR
-from hybridmap.camera import Camera
-from hybridmap.grid import settle
-from hybridmap.node import Landmarks, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.query import View
-from registration.recognition import Recognition, examine_view
-from registration.selection import FIXED_BYTES, SelectionSettings, choose, worth
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.quantization import settle
+from mapweave.hybridmap.query import View
+from mapweave.registration.recognition import Recognition, examine_view
+from mapweave.registration.selection import FIXED_BYTES, SelectionSettings, choose, worth
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 BUDGETS = (700, 850, 1000, 1200, 1500, 2000, 2500, 3000)
 QUERIES = 4

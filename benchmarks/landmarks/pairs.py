@@ -13,18 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.images.known_warps import (
-    HELD_OUT,
-    Image,
-    load,
-    shrunk,
-    warp,
-)
+from benchmarks.images.known_warps import HELD_OUT, Image, load, shrunk, warp
 from benchmarks.images.printed_matter import printed_page
 from benchmarks.landmarks.places import SimulatedPlace
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidFile
-from hybridmap.pose import Array
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.pose import Array
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 RIGHT_PX = 3.0
@@ -108,7 +102,7 @@ def _by_number(path: Path) -> list[str | int]:
 
 
 def known_pairs(seed: int, count: int) -> Iterator[Pair]:
-    """Half of them held-out images and pages under known warps, half simulated rooms from two postures."""
+    """Half of them held-out images and pages under known warps, half simulated rooms from two poses."""
     rng = np.random.default_rng([seed, 1])
     images = [load(name) for name in HELD_OUT] + [printed_page(rng) for _ in HELD_OUT]
     for number in range(count):

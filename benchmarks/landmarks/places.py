@@ -1,4 +1,4 @@
-"""Places in simulated buildings: pictures from postures around them, and where everything in them is."""
+"""Places in simulated buildings: pictures from poses around them, and where everything in them is."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.observation import RobotDescription
 from benchmarks.images.surface_points import Surfaces
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
-from sim.camera import CAMERAS
-from sim.imager import Imager
-from sim.scene import Scene
-from sim.texture import Image
-from sim.world import PanelSet
-from sim.worlds.catalog import make_world
-from vision.lens import Lens
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.camera import CAMERAS
+from mapweave.sim.imager import Imager
+from mapweave.sim.scene import Scene
+from mapweave.sim.texture import Image
+from mapweave.sim.world import PanelSet
+from mapweave.sim.worlds.catalog import make_world
+from mapweave.vision.lens import Lens
 
 WORLDS = ("office", "arena", "warehouse", "corridor")
 CLEARANCE = 0.3
 NEAR, TURNED = 0.5, math.radians(20.0)
-"""Other postures are up to so far from the place, m forth or aside and rad."""
+"""Other poses are up to so far from the place, m forth or aside and rad."""
 LEAST_DEPTH = 0.8
 """m; a robot closer than this before a wall sees next to nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPlace:
-    """A posture in a building, and one camera.
+    """A pose in a building, and one camera.
 
     Attributes:
         camera: intrinsics and mount.
@@ -64,12 +64,12 @@ class SimulatedPlace:
         return RobotDescription(self.camera)
 
     def nearby(self, rng: np.random.Generator) -> Pose2:
-        """Another posture, seen from the place."""
+        """Another pose, seen from the place."""
         ahead, aside = rng.uniform(-NEAR, NEAR, 2)
         return Pose2(float(ahead), float(aside), float(rng.uniform(-TURNED, TURNED)))
 
     def picture(self, at: Pose2 | None = None) -> Image:
-        """(H, W) grey, from the place or from a posture beside it, with lens, noise and exposure."""
+        """(H, W) grey, from the place or from a pose beside it, with lens, noise and exposure."""
         pose = self.pose @ (at or Pose2())
         rotation = np.eye(3)
         rotation[:2, :2] = pose.rotation

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 from benchmarks.images.known_warps import Image
 from benchmarks.landmarks.pairs import Pair
-from hybridmap.camera import Camera
-from hybridmap.change import Change, NodePut
-from hybridmap.descriptor import decode, encode, root_sift, rounding_noise
-from hybridmap.grid import settle
-from hybridmap.node import Landmarks, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.ranges import Ranges
-from registration.matching import MatchSettings, match_vectors
-from registration.selection import FIXED_BYTES
-from vision.lens import Lens
-from vision.sift import Sift
-from wire.codec import decode_change, encode_change
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.descriptor import decode, encode, root_sift, rounding_noise
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.quantization import settle
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.registration.matching import MatchSettings, match_vectors
+from mapweave.registration.selection import FIXED_BYTES
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+from mapweave.wire.codec import decode_change, encode_change
 
 FRAMING = 80
 """Bytes that Zenoh adds to a node: its key, and 16 bytes beside it."""
@@ -92,11 +92,11 @@ def pack(pixels: Array, sift: NDArray[np.float32], pair: Pair, rng: np.random.Ge
         pixels.astype(np.float32), encode(sift), depths.astype(np.float32), sigmas.astype(np.float32)
     )
     landmarks, _ = settle(every, pair.camera)
-    posture = PoseGaussian.from_sigmas(Pose2(*rng.normal(0, 3, 3)), 0.03, 0.02)
+    pose = PoseGaussian.from_sigmas(Pose2(*rng.normal(0, 3, 3)), 0.03, 0.02)
     ranges = Ranges(rng.uniform(-3, 3, 16), rng.uniform(0.2, 3, 16), 3.0)
     node_id, stamp = NodeId("robot-0", 1, 1234), 1_700_000_000_123_456_789
-    node = Node(node_id, stamp, posture, pair.camera, landmarks, "utc", 0.16, ranges)
-    bare = Node(node_id, stamp, posture, pair.camera, landmarks.take(np.zeros(0, int)), "utc", 0.16, ranges)
+    node = Node(node_id, stamp, pose, pair.camera, landmarks, "utc", 0.16, ranges)
+    bare = Node(node_id, stamp, pose, pair.camera, landmarks.take(np.zeros(0, int)), "utc", 0.16, ranges)
     change = Change(node_id.map, 100_000, stamp, NodePut(node))
     data = encode_change(change)
     encode_ms, decode_ms = _least_ms(lambda: encode_change(change)), _least_ms(lambda: decode_change(data))

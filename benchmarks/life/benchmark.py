@@ -28,17 +28,17 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.life.house import House
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.query import Certainty, View
-from hybridmap.superseded import Superseded
-from mapserver.living import LivingPlaces
-from mapserver.merging.merger import Merger
-from mapserver.places.placeindex import PlaceIndex
-from mapserver.relocalizing.relocalization import Relocalizer
-from mapserver.routes import Router
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty, View
+from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver.active_nodes import ActiveNodes
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.routes import Router
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.world import take_map, take_view
 
 CLOSE, CLOSE_TURN = 0.25, math.radians(8.0)
@@ -120,8 +120,8 @@ def run(
         merged = merger.merged()
         spent, old = time.process_time() - taken, len(merged.superseded)
         node_ms = 1e3 * (taken - began) / len(nodes)
-        curve.append(Drive(len(merged.postures) - old, old, len(merged.components), node_ms, spent))
-        first_nodes = first_nodes or frozenset(merged.postures)
+        curve.append(Drive(len(merged.poses) - old, old, len(merged.components), node_ms, spent))
+        first_nodes = first_nodes or frozenset(merged.poses)
         console.print(f"drive {epoch}: {curve[-1].nodes} nodes, {old} superseded, merged in {spent:.1f} s")
     views = [house.look(rng) for _ in range(queries)]
     stood = [truth[sorted(truth)[int(k)]] for k in rng.choice(len(truth), queries)]
@@ -129,7 +129,7 @@ def run(
     figures: dict[str, float | list[float]] = {
         "nodes_first": curve[0].nodes,
         "nodes_after": curve[-1].nodes,
-        "nodes_in_all": len(merged.postures),
+        "nodes_in_all": len(merged.poses),
         "growth": round(curve[-1].nodes / curve[0].nodes, 3),
         "curve": [one.nodes for one in curve],
         "node_ms": [round(one.node_ms, 2) for one in curve],
@@ -159,7 +159,7 @@ def answered(
     shown = replace(merged, superseded=dict.fromkeys(hidden, UNTOLD))
     index = PlaceIndex()
     index.extend(node for one in merger.maps.values() for node in one.nodes.values() if node.id not in hidden)
-    places = LivingPlaces(index, merger.node, shown)
+    places = ActiveNodes(index, merger.node, shown)
     relocalizer = Relocalizer(places, places.node, merged)
     right = wrong = 0
     for view, world_from_robot in views:
@@ -175,7 +175,7 @@ def answered(
 def routes_found(merged: MergedMap, rng: np.random.Generator) -> float:
     """Share of pairs of living nodes of one component between which there is a way over living nodes."""
     router = Router(merged)
-    living = [node for node in sorted(merged.postures) if node not in merged.superseded]
+    living = [node for node in sorted(merged.poses) if node not in merged.superseded]
     found = tried = 0
     for _ in range(ROUTES):
         start, goal = (living[int(k)] for k in rng.choice(len(living), 2))

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
-from hybridmap.query import View
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.query import View
 from synthetic.world import World, room, take_view
 
 ROOMS = ((0.0, 0.0, 5.0, 4.0), (5.2, 0.0, 5.0, 4.0))

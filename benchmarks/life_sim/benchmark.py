@@ -29,23 +29,17 @@ from rich.table import Table
 from benchmarks.images.surface_points import Surfaces
 from benchmarks.life.benchmark import answered
 from benchmarks.relocalize.pictures import Photographer, Wish
-from benchmarks.relocalize.places import (
-    LEAST_LANDMARKS,
-    WAY_HEADING,
-    WAY_XY,
-    lookouts,
-    placed,
-)
+from benchmarks.relocalize.places import LEAST_LANDMARKS, WAY_HEADING, WAY_XY, lookouts, placed
 from benchmarks.relocalize.queries import beside
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.query import View
-from mapserver.merging.merger import Merger
-from merge.graph.merged import MergedMap
-from registration.selection import choose
-from sim.world import World
-from sim.worlds.catalog import make_world
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.registration.selection import choose
+from mapweave.sim.world import World
+from mapweave.sim.worlds.catalog import make_world
 
 SHARE = 0.33
 """Of the furniture that is moved."""
@@ -243,8 +237,8 @@ def main() -> None:
     console.print(table)
     last = curve[-1]
     figures: dict[str, object] = {
-        "nodes": len(merged.postures),
-        "living": len(merged.postures) - len(merged.superseded),
+        "nodes": len(merged.poses),
+        "living": len(merged.poses) - len(merged.superseded),
         "components": len(merged.components),
         "moved_faded": [_share(one.moved_faded, one.moved) for one in curve],
         "shown_twice_faded": [_share(one.seen_faded, one.seen) for one in curve],

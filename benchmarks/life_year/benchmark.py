@@ -2,7 +2,7 @@
 
     python -m benchmarks.life_year [--drives N] [--seed N] [--false SHARE] [--nodes N] [--alone] [--json]
 
-Only postures are drawn and links, true and false (`synthetic.drives`); a merge follows every drive.
+Only poses are drawn and links, true and false (`synthetic.drives`); a merge follows every drive.
 Side by side: what was decided stands, as on the map server, and everything is decided with every drive. Told
 are seconds of the processor a merge, links that the two do not have in common, false links that are believed,
 and how far living nodes are from the truth. With `--alone` only the first is run.
@@ -22,14 +22,14 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.ruling import Rulings
-from mapweave.scoring import align
-from merge.graph.merged import MergedMap
-from merge.graph.verdicts import Verdicts
-from merge.islands import Islands
+from mapweave.evaluation.map_score import align
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.islands import Islands
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verdicts import Verdicts
 from synthetic.drives import Drive, DriveSettings, drives
 from synthetic.fleet import FleetSettings
 
@@ -65,7 +65,7 @@ class Merging:
             self._verdicts.put(link.pair, link)
             touched |= {link.a.map, link.b.map}
         began = time.process_time()
-        self.merged = self._islands.merge(self._maps, self._verdicts, touched, Rulings())
+        self.merged = self._islands.merge(self._maps, self._verdicts, touched, ManualConstraints())
         self.seconds.append(time.process_time() - began)
 
 

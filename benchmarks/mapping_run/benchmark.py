@@ -4,9 +4,9 @@
 
 50 s at 10 Hz back and forth before a wall: rendered pictures, SIFT features, Lucas-Kanade tracks and the
 mapping EKF, as a robot runs them. First the paper's line; the same again while somebody walks past; then an
-arc and a weave. Each run is compared with the simulator's posture and with the wheels alone, and each
+arc and a weave. Each run is compared with the simulator's pose and with the wheels alone, and each
 landmark, as it was known last, with where the ray of its first pixel meets the world. Pictures of the line
-lie in DIR, those of the other runs in folders below it: fig7 posture, fig8 encoders, landmarks, map, view.
+lie in DIR, those of the other runs in folders below it: fig7 pose, fig8 encoders, landmarks, map, view.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rich.table import Table
 from benchmarks.mapping_run.figures import draw
 from benchmarks.mapping_run.scene import drive
 from benchmarks.mapping_run.score import Figures, figures
-from hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 
 RUNS = {"line": ("line", False), "person": ("line", True), "arc": ("arc", False), "weave": ("weave", False)}
 """Shape of the drive, and whether somebody walks past, by name of the run."""

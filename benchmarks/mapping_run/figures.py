@@ -15,7 +15,7 @@ from matplotlib.patches import Ellipse, Polygon
 
 from benchmarks.mapping_run.scene import MappingDrive
 from benchmarks.mapping_run.score import LastKnown, track_errors
-from hybridmap.pose import Array, wrap_angle
+from mapweave.hybridmap.pose import Array, wrap_angle
 
 ESTIMATE, TRUTH, WHEELS, GREEN, PERSON = "#1f77b4", "#222222", "#d95f02", "#2a9d4b", "#f3d9d6"
 COLOURS = ("#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0")
@@ -26,7 +26,7 @@ TRAIL = 40
 def draw(run: MappingDrive, out: Path) -> tuple[Path, ...]:
     """Write all pictures of a run into a folder that is there; returns their names."""
     pictures = {
-        "fig7.png": _draw_posture, "fig8.png": _draw_encoders, "landmarks.png": _draw_landmarks,
+        "fig7.png": _draw_pose, "fig8.png": _draw_encoders, "landmarks.png": _draw_landmarks,
         "map.png": _draw_map, "view.png": _draw_view,
     }  # fmt: skip
     for name, picture in pictures.items():
@@ -43,14 +43,14 @@ def _sheet(run: MappingDrive, title: str, path: Path, size: tuple[float, float])
     figure.savefig(path, format="png")
 
 
-def _draw_posture(run: MappingDrive, path: Path) -> None:
+def _draw_pose(run: MappingDrive, path: Path) -> None:
     """Figure 7: positions and orientation over time; below, the errors with what the filter expects."""
     t = run.seconds
     true = np.array([m.true.vector for m in run.moments])
     wheels = np.array([m.wheels.vector for m in run.moments])
     mean = np.array([m.pose.mean.vector for m in run.moments])
     sigmas = np.array([_sigmas_in_anchor(m.pose.covariance, m.pose.mean.heading) for m in run.moments])
-    with _sheet(run, "the robot's posture since the anchor (Figure 7)", path, (13, 6.5)) as figure:
+    with _sheet(run, "the robot's pose since the anchor (Figure 7)", path, (13, 6.5)) as figure:
         axes = figure.subplots(2, 3, sharex=True, height_ratios=(2, 1))
         names = (("x ahead", "m", 1.0, "mm", 1e3), ("y left", "m", 1.0, "mm", 1e3),
                  ("heading", "deg", math.degrees(1.0), "deg", math.degrees(1.0)))  # fmt: skip
@@ -205,7 +205,7 @@ def _shade(run: MappingDrive, at: Any) -> None:
 
 
 def _sigmas_in_anchor(covariance: Array, heading: float) -> Array:
-    """(3,) standard deviations in the anchor's frame of a posture perturbed in its own."""
+    """(3,) standard deviations in the anchor's frame of a pose perturbed in its own."""
     turn = np.eye(3)
     turn[:2, :2] = [[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]
     return np.sqrt(np.diag(turn @ covariance @ turn.T))

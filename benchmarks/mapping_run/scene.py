@@ -1,8 +1,8 @@
 """A simulated mapping run: a robot looks at a wall, drives back and forth, and follows what it sees.
 
 The camera's pictures are rendered, features are SIFT's, tracks Lucas-Kanade's and the estimates those of
-`agent.mapping.tracking`, all as a robot runs them; the drive closes its loop on the estimate. Truth is
-written down beside it, and used for the start alone: a robot that shall look at something must stand
+`mapweave.agent.mapping.tracking`, all as a robot runs them; the drive closes its loop on the estimate. Truth
+is written down beside it, and used for the start alone: a robot that shall look at something must stand
 before it.
 """
 
@@ -16,27 +16,27 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.landmarks import LandmarkEstimates
-from agent.ekf.mapping import FilterSettings
-from agent.exploring.exploration import ExplorerSettings
-from agent.mapping.mapper import MapperSettings
-from agent.mapping.placed import HERE
-from agent.mapping.tracking import Tracking
-from agent.mapping.view import View
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from agent.servo.image_drive import ImageDrive, ImageDriveSettings
 from benchmarks.images.surface_points import Surfaces
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from sim.events import Walk
-from sim.places import is_clear
-from sim.robots import RobotSetup
-from sim.simulation import Simulation
-from sim.world import World
-from sim.worlds.catalog import make_world
+from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
+from mapweave.agent.ekf.mapping_filter import FilterSettings
+from mapweave.agent.exploration.settings import ExplorerSettings
+from mapweave.agent.mapping.anchored_keyframe import HERE
+from mapweave.agent.mapping.mapper import MapperSettings
+from mapweave.agent.mapping.tracking import Tracking
+from mapweave.agent.mapping.view import View
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.servo.image_drive import ImageDrive, ImageDriveSettings
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.sim.events import Walk
+from mapweave.sim.placement import is_clear
+from mapweave.sim.robots import RobotSetup
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
+from mapweave.sim.worlds.catalog import make_world
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 from synthetic.mapping_run import speeds
-from vision.lens import Lens
-from vision.sift import Sift
 
 NAME = "r0"
 SPEED = 0.15
@@ -136,7 +136,7 @@ def drive(
 
     Args:
         seed: of the world, the start, wheels, slip and the camera's noise.
-        kind: of world, see sim.worlds.catalog.
+        kind: of world, see mapweave.sim.worlds.catalog.
         shape: of the drive, one of synthetic.mapping_run.SHAPES.
         steps: ticks.
         person: whether somebody walks past.

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.ekf.anchored import rays_of_points
-from agent.ekf.landmarks import LandmarkEstimates
 from benchmarks.mapping_run.scene import MappingDrive, Moment
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.agent.ekf.inverse_depth import rays_of_points
+from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 NEAR, FAR = 0.1, 0.4
 """A robot is back at the anchor within this, and far from it beyond that, m."""

@@ -46,24 +46,12 @@ from rich.table import Table
 
 from benchmarks.merge.robots import kept_links
 from benchmarks.merge.scale import scale
-from hybridmap.errors import InvalidValue, MapweaveError
-from mapweave.g2o import G2oGraph, read_g2o
+from mapweave.formats.g2o import G2oGraph, read_g2o
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from synthetic.city import HEADING_SIGMAS, draw_grid
 from synthetic.fleet import FleetSettings, draw_fleet
-from synthetic.merge_rivals import (
-    MAPWEAVE,
-    RIVALS,
-    error,
-    joined_falsely,
-    oracle,
-    precision_recall,
-)
-from synthetic.pose_graph import (
-    batch_optimum,
-    chi2_of,
-    factors_of,
-    split,
-)
+from synthetic.merge_rivals import MAPWEAVE, RIVALS, error, joined_falsely, oracle, precision_recall
+from synthetic.pose_graph import batch_optimum, chi2_of, factors_of, split
 
 SHARES = (0, 50, 80, 90)
 """Of false links, per cent."""

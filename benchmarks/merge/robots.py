@@ -13,9 +13,9 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from hybridmap.errors import InvalidFile
-from hybridmap.pose import Array
-from merge.belief.cliques import best_clique
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.pose import Array
+from mapweave.merge.outlier_rejection.max_clique import best_clique
 
 GATE = 22.46
 """Chi-square with 6 degrees of freedom of a loop through two links: 99.9 %, as in the plane."""
@@ -23,7 +23,7 @@ GATE = 22.46
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A relative posture in space with the covariance of its perturbation on the right, (6, 6)."""
+    """A relative pose in space with the covariance of its perturbation on the right, (6, 6)."""
 
     a: int
     b: int

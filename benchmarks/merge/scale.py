@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 from rich.progress import Progress, TaskID
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.errors import InvalidValue
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from mapserver.merging.merger import Merger
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.building import Building
 
 NODES_A_MAP = 100

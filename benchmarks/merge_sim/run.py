@@ -20,18 +20,18 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.merge_sim.views import views_shared
-from hybridmap.errors import MapweaveError
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeKind, MapId, NodeId
-from hybridmap.pose import Array, Pose2
-from mapweave.scoring import FALSE_LINK, FALSE_LINK_TURN, align, is_false, posture_error
-from mapweave.trial.recording import Recording
-from mapweave.trial.run import TrialOptions, run_trial
-from mapweave.trial.scenario import Scenario, load_scenario, scenario_path
-from mapweave.trial.score import node_truth
-from merge.graph.links import Link
-from merge.graph.verification import verify
-from sim.world import PanelSet
+from mapweave.evaluation.map_score import FALSE_LINK, FALSE_LINK_TURN, align, is_false, pose_error
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.verification import verify
+from mapweave.scenarios.recording import Recording
+from mapweave.scenarios.run import TrialOptions, run_trial
+from mapweave.scenarios.scenario import Scenario, load_scenario, scenario_path
+from mapweave.scenarios.score import node_truth
+from mapweave.sim.world import PanelSet
 
 VIEW = 0.5
 """Two images share a view if each shows at least this share of what the other one shows."""
@@ -109,10 +109,7 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
         links=figures.links,
         false_links=figures.false_links,
         false_merges=false_merges(
-            {
-                node: (component, posture.mean)
-                for node, (component, posture) in recording.merged.postures.items()
-            },
+            {node: (component, pose.mean) for node, (component, pose) in recording.merged.poses.items()},
             truth,
         ),
         shared_views=len(views),
@@ -150,7 +147,7 @@ def shared_views(
     return {frozenset(pair) for pair in pairs if pair[0].map != pair[1].map}
 
 
-def false_merges(postures: Mapping[NodeId, tuple[int, Pose2]], truth: Mapping[NodeId, Pose2]) -> int:
+def false_merges(poses: Mapping[NodeId, tuple[int, Pose2]], truth: Mapping[NodeId, Pose2]) -> int:
     """How many pairs of maps are joined wrongly.
 
     The part of a map in a component is laid over the truth by itself. Two maps in one component are joined
@@ -158,19 +155,19 @@ def false_merges(postures: Mapping[NodeId, tuple[int, Pose2]], truth: Mapping[No
     than 0.5 m or 15 degrees: the median of both maps' nodes decides.
 
     Args:
-        postures: component and merged posture of each node.
+        poses: component and merged pose of each node.
         truth: `world_from_robot` of each.
     """
     parts: dict[int, dict[MapId, list[NodeId]]] = {}
-    for node, (component, _) in sorted(postures.items()):
+    for node, (component, _) in sorted(poses.items()):
         if node in truth:
             parts.setdefault(component, {}).setdefault(node.map, []).append(node)
     wrong: set[tuple[MapId, MapId]] = set()
     for maps in parts.values():
-        laid = {one: _world_from_merged(nodes, postures, truth) for one, nodes in maps.items()}
+        laid = {one: _world_from_merged(nodes, poses, truth) for one, nodes in maps.items()}
         for one, other in combinations(sorted(maps), 2):
             off = [
-                posture_error(laid[one] @ postures[node][1], laid[other] @ postures[node][1])
+                pose_error(laid[one] @ poses[node][1], laid[other] @ poses[node][1])
                 for node in (*maps[one], *maps[other])
             ]
             metres, turn = np.median(np.array(off), axis=0)
@@ -181,12 +178,12 @@ def false_merges(postures: Mapping[NodeId, tuple[int, Pose2]], truth: Mapping[No
 
 def _world_from_merged(
     nodes: Sequence[NodeId],
-    postures: Mapping[NodeId, tuple[int, Pose2]],
+    poses: Mapping[NodeId, tuple[int, Pose2]],
     truth: Mapping[NodeId, Pose2],
 ) -> Pose2:
     if len(nodes) == 1:
-        return truth[nodes[0]] @ postures[nodes[0]][1].inverse()
-    estimated: Array = np.array([[postures[n][1].x, postures[n][1].y] for n in nodes])
+        return truth[nodes[0]] @ poses[nodes[0]][1].inverse()
+    estimated: Array = np.array([[poses[n][1].x, poses[n][1].y] for n in nodes])
     return align(estimated, np.array([[truth[n].x, truth[n].y] for n in nodes]))
 
 

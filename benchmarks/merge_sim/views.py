@@ -15,9 +15,9 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
-from sim.world import PanelSet
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.world import PanelSet
 
 COLUMNS, ROWS = 16, 12
 """Rays through each image."""

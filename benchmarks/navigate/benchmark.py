@@ -3,7 +3,7 @@
     python -m benchmarks.navigate [--seed N] [--out DIR] [--runs N] [--rooms N] [--map-time S] [--json]
 
 One robot explores an office from nothing. Then, with the map on its disk and its server's, it is put down
-again and again at random postures from which no image was taken, and sent to a random node at least four
+again and again at random poses from which no image was taken, and sent to a random node at least four
 edges away. Agent, server and messages are the fleet's own, in one process; images are rendered, wheels slip.
 Errors are against where the goal's image was truly taken. A drive succeeds if the robot says within 240 s
 that it has arrived, is then within 5 cm and 5 degrees, and has touched nothing. The shortest way is that of a
@@ -37,9 +37,9 @@ from benchmarks.navigate.map import Figures, map_figures
 from benchmarks.navigate.office import TRUTH, Mapped, Office
 from benchmarks.navigate.pictures import draw
 from benchmarks.navigate.plots import draw_plot
-from hybridmap.errors import InvalidValue, MapweaveError
-from sim.floorplan import FloorPlan
-from sim.robots import RobotSetup
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.robots import RobotSetup
 
 WIDTH = 140
 """Of what is printed into a file or a pipe, characters."""

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.mission import GoTo, Idle
-from agent.pipeline import Status
 from benchmarks.navigate.office import ROBOT, Office
 from benchmarks.navigate.plots import Plot
-from hybridmap.pose import Array, wrap_angle
+from mapweave.agent.mission import GoTo, Idle
+from mapweave.agent.pipeline import Status
+from mapweave.hybridmap.pose import Array, wrap_angle
 
 PATIENCE = 240.0
 """A drive that takes longer has failed, simulated s."""

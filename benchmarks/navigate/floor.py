@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from hybridmap.pose import Array, Pose2
-from sim.floorplan import FloorPlan
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.floorplan import FloorPlan
 
 AWAY = 0.25
-"""A posture counts as standing on the free floor this near to one of its cells, m."""
+"""A pose counts as standing on the free floor this near to one of its cells, m."""
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 """Steps in rows and columns; with the ways back sixteen, so that a path is at most 3 % too long."""
 

@@ -7,10 +7,10 @@ import statistics
 import numpy as np
 
 from benchmarks.navigate.office import Mapped
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeKind
-from mapweave.scoring import score_map
-from wire.mapfile import MapFile
+from mapweave.evaluation.map_score import score_map
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import EdgeKind
+from mapweave.storage.map_file import MapFile
 
 Figures = dict[str, float | int | None]
 
@@ -46,5 +46,5 @@ def map_figures(before: MapFile, after: MapFile, mapped: Mapped) -> Figures:
 
 
 def _error(merged: MapFile, mapped: Mapped) -> float:
-    places = {node: (component, posture.mean) for node, (component, posture) in merged.postures.items()}
+    places = {node: (component, pose.mean) for node, (component, pose) in merged.poses.items()}
     return score_map(places, [], mapped.truth).ate

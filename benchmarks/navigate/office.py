@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.fleet import encode_mission
-from agent.mission import Explore, Mission
-from agent.pipeline import PipelineSettings
-from agent.report import AgentReport
-from hybridmap.errors import InvalidFile, NotConnected
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2
-from mapweave.trial.fleet import SERVER, TICKS_PER_SECOND, Stage
-from mapweave.trial.local_fleet import LocalFleet
-from mapweave.trial.reports import Reports
-from mapweave.trial.scenario import load_scenario, scenario_path
-from wire.mapfile import MapFile, unpack_map_file
+from mapweave.agent.fleet_client import encode_mission
+from mapweave.agent.mission import Explore, Mission
+from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.status_message import AgentStatus
+from mapweave.hybridmap.errors import InvalidFile, NotConnected
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Stage
+from mapweave.scenarios.local_fleet import LocalFleet
+from mapweave.scenarios.reports import Reports
+from mapweave.scenarios.scenario import load_scenario, scenario_path
+from mapweave.storage.map_file import MapFile, unpack_map_file
 
 ROBOT = "r0"
 TRUTH = "truth.json"
@@ -78,7 +78,7 @@ class Office:
         if not replies or replies[0].error:
             raise NotConnected(f"the robot did not take its mission: {replies[0].error if replies else ''}")
 
-    def advance(self, seconds: float) -> AgentReport:
+    def advance(self, seconds: float) -> AgentStatus:
         """Let simulated time pass; returns what the robot says then."""
         self.ticks += max(1, round(seconds * TICKS_PER_SECOND))
         self._fleet.advance(self.ticks)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from benchmarks.navigate.drives import Outcome
 from benchmarks.navigate.office import ROBOT, Mapped
-from mapweave.picture import Drive, MapPicture, draw_map, outline_of
-from sim.floorplan import FloorPlan
+from mapweave.drawing.map_picture import Drive, MapPicture, draw_map, outline_of
+from mapweave.sim.floorplan import FloorPlan
 
 MOST = 6
 """Drives whose views are shown: failures first, then the first ones."""
@@ -70,8 +70,8 @@ def _draw_ways(outcomes: Sequence[Outcome], mapped: Mapped, plan: FloorPlan, pat
     reached = sum(one.success for one in outcomes)
     draw_map(
         MapPicture(
-            title=f"{reached} of {len(outcomes)} drives of {ROBOT} from unmapped postures end at their goals",
-            postures=mapped.truth,
+            title=f"{reached} of {len(outcomes)} drives of {ROBOT} from unmapped poses end at their goals",
+            poses=mapped.truth,
             edges=tuple(mapped.nodes.edges.values()),
             outline=outline_of(plan),
             drives=drives,

@@ -10,17 +10,17 @@ import numpy as np
 
 from benchmarks.navigate.floor import Floor
 from benchmarks.navigate.office import Mapped
-from hybridmap.errors import InvalidValue
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, wrap_angle
-from mapweave.scoring import crossed
-from mapweave.trial.kidnapping import CLEARANCE, LEAST_LANDMARKS, NEAR
-from sim.floorplan import FloorPlan
+from mapweave.evaluation.map_score import crossed
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.scenarios.kidnap_planning import CLEARANCE, LEAST_LANDMARKS, NEAR
+from mapweave.sim.floorplan import FloorPlan
 
 LEAST_EDGES = 4
 """Between the node next to the start and the goal."""
 UNMAPPED, UNMAPPED_TURN = 0.15, math.radians(15.0)
-"""A posture this far from that of every node, in m or rad, is one that no image was taken from."""
+"""A pose this far from that of every node, in m or rad, is one that no image was taken from."""
 TRIES = 2000
 
 
@@ -44,7 +44,7 @@ class Plot:
 
 
 def draw_plot(mapped: Mapped, plan: FloorPlan, floor: Floor, rng: np.random.Generator) -> Plot:
-    """Draw a start at an unmapped posture near some node, and a goal with a view at least four edges away.
+    """Draw a start at an unmapped pose near some node, and a goal with a view at least four edges away.
 
     Args:
         mapped: nodes, edges and where they truly are.

@@ -31,7 +31,7 @@ from rich.table import Table
 from benchmarks.parking.figures import draw_figures
 from benchmarks.parking.run import Outcome, park
 from benchmarks.parking.scene import Scene
-from hybridmap.errors import MapweaveError
+from mapweave.hybridmap.errors import MapweaveError
 
 DEALT = 0x57A7
 """Separates the draws of starts from those of scenes."""

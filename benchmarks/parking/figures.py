@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agent.navigating.follower import Progress
 from benchmarks.parking.run import LEAST_VISIBLE, Outcome, Record
 from benchmarks.parking.scene import Scene
+from mapweave.agent.navigation.route_follower import RouteProgress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -126,7 +126,9 @@ def _drawn(pixels: Any) -> list[int]:
 
 def _shade(ax: Axes, record: Record) -> None:
     """Grey where the robot does not servo yet: it finds itself, or drives to where it sees the goal."""
-    servoing = np.array([doing.startswith((Progress.PARKING, Progress.ARRIVED)) for doing in record.doing])
+    servoing = np.array(
+        [doing.startswith((RouteProgress.PARKING, RouteProgress.ARRIVED)) for doing in record.doing]
+    )
     edges = np.flatnonzero(np.diff(np.concatenate([[True], servoing, [True]]).astype(int)))
     for begin, end in edges.reshape(-1, 2):
         ax.axvspan(TICK * begin, TICK * end, color="#f0f0f0", zorder=0)

@@ -8,15 +8,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from agent.mission import Answer
-from agent.navigating.follower import Progress
-from agent.navigating.navigator import Navigator
-from agent.servo.proximity import guard
 from benchmarks.parking.scene import ROBOT, Scene
-from hybridmap.pose import Array, Pose2, wrap_angle
-from sim.simulation import Simulation
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.agent.mission import Answer
+from mapweave.agent.navigation.navigator import Navigator
+from mapweave.agent.navigation.route_follower import RouteProgress
+from mapweave.agent.servo.proximity import guard
+from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.sim.simulation import Simulation
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 TIME_LIMIT = 60.0
 """s from being put down."""
@@ -109,7 +109,7 @@ def park(scene: Scene, start: Pose2, shortest: float, seed: int) -> Outcome:
         off, collisions = _true(scene, simulation), simulation.collisions(ROBOT)
     believed = record.believed[-1]
     error_m, error = math.hypot(off.x, off.y), abs(wrap_angle(off.heading))
-    parking = [doing.startswith(Progress.PARKING) for doing in record.doing]
+    parking = [doing.startswith(RouteProgress.PARKING) for doing in record.doing]
     violations = sum(p and n < LEAST_VISIBLE for p, n in zip(parking, record.seen, strict=True))
     complaints = [] if navigator.arrived else [f"not parked after {TIME_LIMIT:g} s: {record.doing[-1]}"]
     if navigator.arrived and (error_m > POSITION or error > HEADING):
@@ -156,6 +156,8 @@ def _note(record: Record, scene: Scene, true: Pose2, navigator: Navigator) -> No
 
 def _switches(doing: list[str]) -> int:
     """How often the law or the leg that drives has changed, by what the robot says."""
-    drives = [words.split(":", 1)[1].split(",")[0] for words in doing if words.startswith(Progress.PARKING)]
+    drives = [
+        words.split(":", 1)[1].split(",")[0] for words in doing if words.startswith(RouteProgress.PARKING)
+    ]
     drives = [words.replace("turning to ", "") for words in drives if "law" in words or "leg" in words]
     return sum(a != b for a, b in pairwise(drives))

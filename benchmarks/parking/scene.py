@@ -11,24 +11,24 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.exploring.exploration import Phase
-from agent.mission import Answer, Explore, Question, WhereAmI, WhichWay
-from agent.pipeline import Pipeline
 from benchmarks.servo.planner import shortest_length
 from benchmarks.servo.world import CAMERA as PLANNER_CAMERA
 from benchmarks.servo.world import Task
-from hybridmap.change import NodePut
-from hybridmap.errors import MapweaveError
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, Node
-from hybridmap.pose import Pose2
-from mapserver.merging.merger import Merger
-from mapserver.relocalizing.relocalization import Relocalizer
-from mapserver.routes import Router
-from sim.floorplan import FloorPlan
-from sim.places import is_clear
-from sim.simulation import Simulation
-from sim.worlds.catalog import make_world
+from mapweave.agent.exploration.settings import Phase
+from mapweave.agent.mission import Answer, Explore, Question, WhereAmI, WhichWay
+from mapweave.agent.pipeline import Pipeline
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.routes import Router
+from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.placement import is_clear
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.worlds.catalog import make_world
 
 ROBOT = "r0"
 NEAREST_VIEW, FARTHEST_VIEW = 1.5, 5.0
@@ -122,11 +122,11 @@ class Scene:
         raise NoGoal("no start behind the goal sees six of its landmarks")
 
     def seen(self, goal_from_robot: Pose2) -> int:
-        """How many of the goal's landmarks are in the image at a posture, as far as geometry tells."""
+        """How many of the goal's landmarks are in the image at a pose, as far as geometry tells."""
         return int(self.in_view(goal_from_robot).sum())
 
     def in_view(self, goal_from_robot: Pose2) -> NDArray[np.bool_]:
-        """(N,) which of the goal's landmarks are in the image at a posture."""
+        """(N,) which of the goal's landmarks are in the image at a pose."""
         camera = self.goal.camera
         pixels = camera.project(goal_from_robot.inverse().apply(self.goal.points_in_robot))
         return camera.contains(pixels)

@@ -5,7 +5,7 @@
 A thousand places are real: simulated buildings (offices, a warehouse, a ring corridor, rooms with twins)
 looked at with the robot's camera and eyes and made into nodes as uncertain as a robot's. Beyond these, places
 are made of real views of other buildings (benchmarks.relocalize.distractors). Asked are views near mapped
-postures, then disturbed ones, views of twin rooms, and views of buildings that nobody has mapped: to the last
+poses, then disturbed ones, views of twin rooms, and views of buildings that nobody has mapped: to the last
 two "here" is always a false answer. The ceiling compares views with every node by whole SIFT descriptors,
 up to 10 000 nodes (of a larger fleet the first so many), every so manyth view where that is much; what the
 index has lost is told of the very same views. A bag of visual words answers the same questions through the
@@ -44,15 +44,10 @@ from rich.table import Table
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.peer import WordIndex
 from benchmarks.relocalize.queries import KINDS
-from benchmarks.relocalize.score import (
-    figures,
-    recall_by_kind,
-    spent,
-    wrong_by_kind,
-)
-from hybridmap.node import Node
-from mapserver.places.placeindex import PlaceIndex
-from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
+from benchmarks.relocalize.score import figures, recall_by_kind, spent, wrong_by_kind
+from mapweave.hybridmap.node import Node
+from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
 REAL = 1000
 """Places that are real, at most."""

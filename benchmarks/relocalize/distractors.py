@@ -23,9 +23,9 @@ from benchmarks.relocalize.places import (
     photographed,
     placed,
 )
-from hybridmap.descriptor import decode, quantise
-from hybridmap.node import Landmarks, Node, NodeId
-from registration.matching import match
+from mapweave.hybridmap.descriptor import decode, quantise
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.registration.matching import match
 
 AGENT = "d"
 """Of all distractors."""

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from benchmarks.relocalize.places import Place
 from benchmarks.relocalize.queries import Query
 from benchmarks.relocalize.score import Reply
-from hybridmap.descriptor import root_sift
-from hybridmap.query import RelocalizeAnswer
-from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
-from mapserver.relocalizing.seenplaces import Sighting, is_lonely
-from registration.matching import match_vectors, squared_distances
-from registration.recognition import Recognition, RecognitionSettings, examine_matches
+from mapweave.hybridmap.descriptor import root_sift
+from mapweave.hybridmap.query import RelocalizeAnswer
+from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, is_lonely
+from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.registration.matching import match_vectors, squared_distances
+from mapweave.registration.recognition import Recognition, RecognitionSettings, examine_matches
 
 AT_MOST = 10_000
 """Nodes; of a larger fleet so many are compared, all that are real among them."""
@@ -69,7 +69,7 @@ class Exhaustive:
             verdict = examine_matches(place.node, view, pairs, self._settings, rng)
             if isinstance(verdict, Recognition):
                 lonely = is_lonely(place.node, view, verdict)
-                sightings.append(Sighting(place.node.id, verdict, lonely=lonely))
+                sightings.append(NodeMatch(place.node.id, verdict, lonely=lonely))
         most = np.argsort(-counts, kind="stable")[:RIVALS].tolist()
         ranked = [(self._place_of(k).node.id, float(counts[k])) for k in most]
         return self._relocalizer.conclude(view, sightings, ranked)

@@ -11,37 +11,15 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.relocalize.distractors import AGENT, gather
-from benchmarks.relocalize.exhaustive import (
-    AT_MOST,
-    Exhaustive,
-    asked_of,
-    lost,
-)
+from benchmarks.relocalize.exhaustive import AT_MOST, Exhaustive, asked_of, lost
 from benchmarks.relocalize.peer import Vocabulary
-from benchmarks.relocalize.places import (
-    Place,
-    joined,
-    mapped,
-    mapped_sites,
-)
-from benchmarks.relocalize.queries import (
-    KINDS,
-    Query,
-    known,
-    nowhere,
-    twins,
-)
-from benchmarks.relocalize.score import (
-    Reply,
-    ask,
-    judged,
-    share,
-    spent,
-)
-from hybridmap.descriptor import decode
-from hybridmap.node import Node, NodeId
-from mapserver.places.placeindex import PlaceIndex
-from mapserver.relocalizing.relocalization import Relocalizer
+from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
+from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
+from benchmarks.relocalize.score import Reply, ask, judged, share, spent
+from mapweave.hybridmap.descriptor import decode
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
 DONORS = 800
 """Views behind the places that are not real."""

@@ -15,9 +15,9 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
-from hybridmap.descriptor import decode
-from hybridmap.node import Node, NodeId
-from hybridmap.query import View
+from mapweave.hybridmap.descriptor import decode
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.query import View
 
 BRANCHES, LEVELS = 24, 3
 """13 824 words."""
@@ -78,7 +78,7 @@ class Vocabulary:
 
 
 class WordIndex:
-    """Nodes by tf-idf; answers like mapserver.places.placeindex.PlaceIndex."""
+    """Nodes by tf-idf; answers like mapweave.mapserver.retrieval.place_index.PlaceIndex."""
 
     def __init__(
         self, nodes: Iterable[Node], vocabulary: Vocabulary, progress: Callable[[], None] = lambda: None

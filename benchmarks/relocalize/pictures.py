@@ -21,24 +21,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import agent.vision
-import sim
 from benchmarks.images import surface_points as mapping_truth
 from benchmarks.images.surface_points import Surfaces
-from hybridmap.camera import Camera
-from hybridmap.descriptor import encode
-from hybridmap.pose import Pose2
-from hybridmap.query import View
-from sim.actors import FIGURES, figure_panels
-from sim.camera import CAMERAS
-from sim.imager import Imager
-from sim.robots import RobotSetup
-from sim.scene import Scene
-from sim.stage import upright
-from sim.texture import Image
-from sim.world import PanelSet, World
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave import sim, vision
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.descriptor import encode
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import View
+from mapweave.sim.actors import FIGURES, figure_panels
+from mapweave.sim.camera import CAMERAS
+from mapweave.sim.imager import Imager
+from mapweave.sim.robots import RobotSetup
+from mapweave.sim.scene import Scene
+from mapweave.sim.stage import upright
+from mapweave.sim.texture import Image
+from mapweave.sim.world import PanelSet, World
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 FOLDER = Path(tempfile.gettempdir()) / "mapweave-relocalize"
 VERSION = 1
@@ -119,7 +118,7 @@ class Photographer:
         Args:
             world: as it is furnished now.
             seed: of the camera's noise.
-            camera: one of sim.camera.CAMERAS.
+            camera: one of mapweave.sim.camera.CAMERAS.
         """
         self._world, self._seed = world, tuple(seed)
         self._setup = CAMERAS[camera]
@@ -244,7 +243,7 @@ def _unpack(wishes: Sequence[Wish], kept: Any) -> list[Picture]:
 def _sources() -> str:
     """Digest of all that makes a picture: simulator, eyes, truth, and the version of this file."""
     digest = hashlib.sha256(bytes([VERSION]))
-    folders = [Path(package.__path__[0]) for package in (sim, agent.vision)]
+    folders = [Path(package.__path__[0]) for package in (sim, vision)]
     files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
     for path in [*files, Path(mapping_truth.__file__)]:
         digest.update(path.read_bytes())

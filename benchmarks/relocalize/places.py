@@ -10,20 +10,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.relocalize.pictures import (
-    Photographer,
-    Picture,
-    Wish,
-    taken,
-)
-from hybridmap.grid import settle
-from hybridmap.node import Landmarks, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from merge.graph.component import solve_graph
-from merge.graph.factors import Measurement
-from merge.graph.merged import MergedMap, Placement
-from sim.world import World
-from sim.worlds.catalog import make_world
+from benchmarks.relocalize.pictures import Photographer, Picture, Wish, taken
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.quantization import settle
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.sim.world import World
+from mapweave.sim.worlds.catalog import make_world
 
 CLEARANCE = 0.22
 """Middles of robots are so far from walls, m."""
@@ -34,7 +29,7 @@ SEEN_AGAIN = 0.85
 DEPTH_SHARE = 0.02
 """What the filter leaves of a depth's uncertainty, as a share of the depth; then a robot adds a floor."""
 DEPTH_FLOOR = (0.01, 0.015)
-"""m, and share of the depth, see agent.mapping.cartographer."""
+"""m, and share of the depth, see mapweave.agent.mapping.keyframe_builder."""
 COMMON_SCALE = 0.01
 """Depths of one node are wrong together by this share, as the wheels of its drive are."""
 SPARE = 1.4
@@ -221,23 +216,23 @@ def placed(picture: Picture, node_id: NodeId, site: int, rng: np.random.Generato
         picture.pixels[known], picture.view.codes[known], depths.astype(np.float32), sigmas.astype(np.float32)
     )
     landmarks, order = settle(landmarks, picture.camera)
-    posture = PoseGaussian.from_sigmas(picture.world_from_robot, 0.01, 0.01)
-    node = Node(node_id, node_id.number * 1_000_000_000, posture, picture.camera, landmarks)
+    pose = PoseGaussian.from_sigmas(picture.world_from_robot, 0.01, 0.01)
+    node = Node(node_id, node_id.number * 1_000_000_000, pose, picture.camera, landmarks)
     return Place(node, picture.world_from_robot, site, picture.sift[known][order])
 
 
 def joined(places: Sequence[Place], seed: int) -> MergedMap:
     """The merged map of the places: a graph for each building, of ways and turns measured as robots do."""
-    graphs, postures = [], dict[NodeId, Placement]()
+    graphs, poses = [], dict[NodeId, Placement]()
     for number in sorted({place.site for place in places}):
         rng = np.random.default_rng([seed, 0x10B, number])
         here = [place for place in places if place.site == number]
         graph = solve_graph(here[0].node.id, Pose2(), _ways(here, rng))
         graphs.append(graph)
-        for node, posture in graph.postures().items():
-            postures[node] = Placement(len(graphs) - 1, posture)
+        for node, pose in graph.poses().items():
+            poses[node] = Placement(len(graphs) - 1, pose)
     components = tuple(frozenset(graph.nodes) for graph in graphs)
-    return MergedMap({}, (), (), components, postures, tuple(graphs))
+    return MergedMap({}, (), (), components, poses, tuple(graphs))
 
 
 def _ways(here: Sequence[Place], rng: np.random.Generator) -> list[Measurement]:
@@ -250,6 +245,6 @@ def _ways(here: Sequence[Place], rng: np.random.Generator) -> list[Measurement]:
             true = here[other].world_from_node.inverse() @ here[k].world_from_node
             sigma = 0.004 + WAY_XY * math.hypot(true.x, true.y)
             noise = rng.normal(0, 1, 3) * [sigma, sigma, WAY_HEADING]
-            posture = PoseGaussian.from_sigmas(true @ Pose2.from_vector(noise), sigma, WAY_HEADING)
-            measured.append(Measurement(here[other].node.id, here[k].node.id, posture))
+            pose = PoseGaussian.from_sigmas(true @ Pose2.from_vector(noise), sigma, WAY_HEADING)
+            measured.append(Measurement(here[other].node.id, here[k].node.id, pose))
     return measured

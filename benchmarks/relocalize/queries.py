@@ -8,26 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.relocalize.pictures import (
-    Disturbance,
-    Photographer,
-    Picture,
-    Wish,
-    taken,
-)
-from benchmarks.relocalize.places import (
-    CLEARANCE,
-    Place,
-    Progress,
-    Site,
-    photographed,
-    unknown_sites,
-)
-from hybridmap.pose import Pose2
-from sim.world import World
+from benchmarks.relocalize.pictures import Disturbance, Photographer, Picture, Wish, taken
+from benchmarks.relocalize.places import CLEARANCE, Place, Progress, Site, photographed, unknown_sites
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.world import World
 
 NEAR, NEAR_TURN = 0.3, math.radians(10.0)
-"""m and rad: most that a view is off the posture that was mapped."""
+"""m and rad: most that a view is off the pose that was mapped."""
 FAR, FAR_TURN = 0.5, math.radians(20.0)
 """Exactly so far off."""
 MOVED = 0.5

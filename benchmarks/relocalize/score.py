@@ -11,9 +11,9 @@ import numpy as np
 
 from benchmarks.relocalize.places import Place
 from benchmarks.relocalize.queries import Query
-from hybridmap.node import NodeId
-from hybridmap.pose import Array, PoseGaussian, wrap_angle
-from hybridmap.query import Certainty, RelocalizeAnswer, View
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Array, PoseGaussian, wrap_angle
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 
 RIGHT_M, RIGHT_DEG = 0.25, 5.0
 """A place is recalled if it is told that well."""
@@ -104,7 +104,7 @@ def judged(query: Query, told: RelocalizeAnswer, truth: Mapping[NodeId, Place]) 
 
 
 def errors(query: Query, place: Place | None, node_from_robot: PoseGaussian) -> tuple[float, float]:
-    """How far a posture at a place is off, m and degrees; infinite in another building."""
+    """How far a pose at a place is off, m and degrees; infinite in another building."""
     if place is None or place.site != query.site:
         return math.inf, math.inf
     true = place.world_from_node.inverse() @ query.picture.world_from_robot

@@ -32,25 +32,20 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, wrap_angle
-from hybridmap.query import View
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from mapweave.trial.children import Children, free_port
-from synthetic.world import (
-    World,
-    room,
-    take_map,
-    take_view,
-)
-from wire.bus_settings import BusSettings
-from wire.codec import encode_change
-from wire.keys import Keys
-from wire.log_messages import decode_record
-from wire.messages import RouteRequest, decode_relocalize_answer, encode_route_request, encode_view
-from wire.zenoh_bus import ZenohBus
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.scenarios.children import Children, free_port
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
+from mapweave.wire.messages import RouteRequest, decode_relocalize_answer, encode_route_request, encode_view
+from mapweave.wire.zenoh_bus import ZenohBus
+from synthetic.world import World, room, take_map, take_view
 
 FLEET = "load"
 ROOM_NODES = 20
@@ -102,8 +97,8 @@ class Building:
         ids = sorted(self.truth)
         node = ids[rng.integers(len(ids))]
         offset = Pose2.from_vector(rng.normal(0, [0.12, 0.12, 0.1]))
-        posture = self.truth[node] @ offset
-        return take_view(self.rooms[node.map], posture, rng)[0], node.map, posture
+        pose = self.truth[node] @ offset
+        return take_view(self.rooms[node.map], pose, rng)[0], node.map, pose
 
 
 @dataclass

@@ -20,13 +20,13 @@ import numpy as np
 
 from benchmarks.relocalize.distractors import Distractors
 from benchmarks.relocalize.places import Place
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.grid import snap
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from wire.codec import encode_change
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.quantization import snap
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.codec import encode_change
 
 ROBOT_NODES = 500
 """Nodes of each robot that is made up."""
@@ -80,9 +80,9 @@ def _robot(distractors: Distractors, numbers: range) -> list[bytes]:
     at, nodes = Pose2(), []
     for k, number in enumerate(numbers):
         node = distractors.node(number)
-        posture = PoseGaussian.from_sigmas(at, *SIGMA)
+        pose = PoseGaussian.from_sigmas(at, *SIGMA)
         landmarks = snap(node.landmarks, node.camera)
-        nodes.append(replace(node, id=NodeId(*map_id, k + 1), map_from_robot=posture, landmarks=landmarks))
+        nodes.append(replace(node, id=NodeId(*map_id, k + 1), map_from_robot=pose, landmarks=landmarks))
         at = at @ Pose2(STEP, 0.0, float(rng.uniform(-TURN, TURN)))
     bodies = enumerate(_surveyed(nodes), 1)
     return [encode_change(Change(map_id, k, 0, body)) for k, body in bodies]

@@ -27,15 +27,8 @@ from rich.table import Table
 
 from benchmarks.servo.planner import shortest_length
 from benchmarks.servo.rivals import CONTROLLERS
-from benchmarks.servo.world import (
-    LEAST_VISIBLE,
-    ROBOT,
-    PoseFilter,
-    Task,
-    Unicycle,
-    draw_task,
-)
-from hybridmap.pose import wrap_angle
+from benchmarks.servo.world import LEAST_VISIBLE, ROBOT, PoseFilter, Task, Unicycle, draw_task
+from mapweave.hybridmap.pose import wrap_angle
 
 _TIME_LIMIT = 60.0
 _POSITION, _HEADING = 0.01, math.radians(1.0)

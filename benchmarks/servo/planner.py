@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from benchmarks.servo.world import LEAST_VISIBLE, Task, in_view
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
 
 _REACH = 6
 _TURN_PRICE = 1e-4
@@ -34,8 +34,8 @@ def shortest_length(task: Task, cell: float = 0.05) -> float | None:
     return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
 
 
-def _fine(postures: Array, task: Task) -> NDArray[np.bool_]:
-    seen: NDArray[np.bool_] = in_view(postures, task.points).sum(axis=-1) >= LEAST_VISIBLE
+def _fine(poses: Array, task: Task) -> NDArray[np.bool_]:
+    seen: NDArray[np.bool_] = in_view(poses, task.points).sum(axis=-1) >= LEAST_VISIBLE
     return seen
 
 
@@ -49,7 +49,7 @@ def _directions() -> tuple[NDArray[np.intp], Array]:
 
 
 def _lattice_path(task: Task, cell: float) -> Array | None:
-    """(M, 3) x m, y m, heading rad: lattice postures from start to goal, start and goal themselves exact."""
+    """(M, 3) x m, y m, heading rad: lattice poses from start to goal, start and goal themselves exact."""
     steps, headings = _directions()
     start = task.start
     behind, ahead = np.array([1.5, 0.8]), np.array([1.0, 0.8])

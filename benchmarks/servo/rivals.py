@@ -9,12 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command
-from agent.servo.laws import control, lyapunov, saturate
-from agent.servo.polar import continued, polar_of
-from agent.servo.supervisor import Servo
 from benchmarks.servo.world import LEAST_VISIBLE, ROBOT, SEMI_APERTURE
-from hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.agent.observation import Command
+from mapweave.agent.servo.laws import control, lyapunov, saturate
+from mapweave.agent.servo.polar import continued, polar_of
+from mapweave.agent.servo.supervisor import Servo
+from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 _DEAD_ZONE = 0.006
 _HEADING_TOLERANCE = 0.008
@@ -36,7 +36,7 @@ class Controller(Protocol):
 
 
 class Ours:
-    """agent.servo.supervisor.Servo, as the robot uses it."""
+    """mapweave.agent.servo.supervisor.Servo, as the robot uses it."""
 
     def __init__(self, goal_from_robot: Pose2, points: Array) -> None:
         """Start it."""

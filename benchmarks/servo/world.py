@@ -1,6 +1,6 @@
 """The world of the servo benchmark: an exact unicycle, landmarks, a camera with pixel noise, a pose filter.
 
-Nothing of agent.servo is used here: what is in view is judged by this module alone.
+Nothing of mapweave.agent.servo is used here: what is in view is judged by this module alone.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.observation import Command, RobotDescription
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
 
 SEMI_APERTURE = math.radians(30.0)
 LEAST_VISIBLE = 4
@@ -26,9 +26,9 @@ _FINE = 10
 """Integration steps a tick; visibility is judged at each."""
 
 
-def in_view(postures: Array, points: Array) -> NDArray[np.bool_]:
-    """(..., N) whether landmarks (N, 3) are in the image at postures (..., 3), both in goal."""
-    x, y, heading = (postures[..., k, None] for k in range(3))
+def in_view(poses: Array, points: Array) -> NDArray[np.bool_]:
+    """(..., N) whether landmarks (N, 3) are in the image at poses (..., 3), both in goal."""
+    x, y, heading = (poses[..., k, None] for k in range(3))
     dx, dy = points[:, 0] - x, points[:, 1] - y
     depth = np.cos(heading) * dx + np.sin(heading) * dy
     aside = np.cos(heading) * dy - np.sin(heading) * dx
@@ -99,7 +99,7 @@ class Unicycle:
 
 
 class PoseFilter:
-    """Estimates the robot's posture in goal from noisy wheels and noisy pixels of the known landmarks."""
+    """Estimates the robot's pose in goal from noisy wheels and noisy pixels of the known landmarks."""
 
     def __init__(self, task: Task, rng: np.random.Generator, believed: Array | None = None) -> None:
         """Begin with a rough guess, as after a relocalization; the first images mend it.

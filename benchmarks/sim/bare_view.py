@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2
-from sim.physics import Physics
-from sim.world import World
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.physics import Physics
+from mapweave.sim.world import World
 
 NEAR, FAR = 0.03, 60.0
 

@@ -26,24 +26,24 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from agent.ekf.mapping import MappingFilter
-from agent.fleet import FleetLink
-from agent.pipeline import PipelineSettings
-from agent.sharing.replication import Replicator
-from agent.vision.tracker import Tracker
 from benchmarks.sim.bare_view import BareView
-from mapweave.trial.fleet import TICKS_PER_SECOND, Fleet, Stage
-from mapweave.trial.local_fleet import LocalFleet
-from mapweave.trial.process_fleet import ProcessFleet
-from mapweave.trial.scenario import load_scenario, scenario_path
-from sim.camera import WEBCAM
-from sim.imager import Imager
-from sim.renderer import Renderer
-from sim.scene import Scene
-from sim.simulation import Simulation
-from sim.world import PanelSet
-from sim.worlds.catalog import make_world
-from vision.sift import Sift
+from mapweave.agent.ekf.mapping_filter import MappingFilter
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.agent.vision.tracker import Tracker
+from mapweave.scenarios.fleet import TICKS_PER_SECOND, Fleet, Stage
+from mapweave.scenarios.local_fleet import LocalFleet
+from mapweave.scenarios.process_fleet import ProcessFleet
+from mapweave.scenarios.scenario import load_scenario, scenario_path
+from mapweave.sim.camera import WEBCAM
+from mapweave.sim.imager import Imager
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.scene import Scene
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import PanelSet
+from mapweave.sim.worlds.catalog import make_world
+from mapweave.vision.sift import Sift
 
 PARTS: dict[str, tuple[tuple[type[Any], tuple[str, ...]], ...]] = {
     "render": ((Imager, ("picture",)),),
@@ -52,7 +52,7 @@ PARTS: dict[str, tuple[tuple[type[Any], tuple[str, ...]], ...]] = {
     "filter": ((MappingFilter, ("predict", "update", "add", "landmarks", "converged")),),
     "bus": (
         (Replicator, ("submit", "flush", "wait_acknowledged")),
-        (FleetLink, ("report", "answers", "ask")),
+        (FleetClient, ("report", "answers", "ask")),
     ),
 }
 """Whose calls count for a part. None of them calls one of another part."""

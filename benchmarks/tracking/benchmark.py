@@ -30,11 +30,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from agent.vision.tracker import Tracker, TrackerSettings
 from benchmarks.tracking.scenes import Drive, drives
-from hybridmap.pose import Array
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.hybridmap.pose import Array
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 AGES = (1, 10, 20, 40, 80, 159)
 WRONG_PX = 3.0
@@ -43,7 +43,7 @@ LEAST_FRAMES = 12
 
 
 class Follower(Protocol):
-    """What follows points: agent.vision.tracker.Tracker, or a rival."""
+    """What follows points: mapweave.agent.vision.tracker.Tracker, or a rival."""
 
     ids: NDArray[np.int64]
     raw: Array

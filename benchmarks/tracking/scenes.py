@@ -16,17 +16,17 @@ import numpy as np
 import skimage.data
 from numpy.typing import NDArray
 
-from agent.observation import RobotDescription
 from benchmarks.images.surface_points import Surfaces
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
-from sim.camera import CAMERAS, WEBCAM
-from sim.imager import Imager
-from sim.renderer import CAMERA_FROM_ROBOT
-from sim.scene import Scene
-from sim.texture import Image
-from sim.world import PanelSet
-from sim.worlds.catalog import make_world
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.camera import CAMERAS, WEBCAM
+from mapweave.sim.imager import Imager
+from mapweave.sim.renderer import CAMERA_FROM_ROBOT
+from mapweave.sim.scene import Scene
+from mapweave.sim.texture import Image
+from mapweave.sim.world import PanelSet
+from mapweave.sim.worlds.catalog import make_world
 
 TICK = 0.1
 PHOTOGRAPHS = ("astronaut", "coffee", "camera", "brick", "chelsea", "coins")
@@ -116,7 +116,7 @@ def wall_to_image(picture: Image, depth: float, slant: float, pose: Pose2) -> Ar
     """(3, 3) homography from the pixels of a picture to those of a robot's image.
 
     Args:
-        picture: whose middle hangs straight ahead of the first posture, as high as the camera.
+        picture: whose middle hangs straight ahead of the first pose, as high as the camera.
         depth: of its middle there, m.
         slant: of the wall, rad; 0 is square to the first view.
         pose: `first_from_robot`.

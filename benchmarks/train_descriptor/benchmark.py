@@ -21,19 +21,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-import hybridmap
-from benchmarks.images.known_warps import (
-    HELD_OUT,
-    TRAINED_ON,
-    Image,
-    load,
-    warp,
-)
+from benchmarks.images.known_warps import HELD_OUT, TRAINED_ON, Image, load, warp
 from benchmarks.images.printed_matter import printed_page
 from benchmarks.tracking.scenes import room_drive
-from hybridmap.descriptor import project, quantise, root_sift
-from hybridmap.grid import CELLS, CELLS_PER_E, DEPTH_LEAST, SHARE_LEAST, SHARES_PER_E
-from hybridmap.landmark_tables import (
+from mapweave import hybridmap
+from mapweave.hybridmap.descriptor import project, quantise, root_sift
+from mapweave.hybridmap.landmark_tables import (
     DIMENSIONS,
     FILE,
     SYMBOLS,
@@ -42,7 +35,8 @@ from hybridmap.landmark_tables import (
     LandmarkTables,
     landmark_tables,
 )
-from hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.quantization import CELLS, CELLS_PER_E, DEPTH_LEAST, SHARE_LEAST, SHARES_PER_E
 
 SEED = 20090628
 PRINTED_PAGES = 12

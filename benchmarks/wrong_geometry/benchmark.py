@@ -13,8 +13,8 @@ import argparse
 import json
 from itertools import product
 
-from hybridmap.pose import Pose2
-from hybridmap.query import View
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import View
 from synthetic.wrong_geometry import ODD, SCENES, Fault, draw_fleet, lost_views, outcome
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.query import RelocalizeAnswer
+from mapweave.hybridmap.query import RelocalizeAnswer
 
 
 def answer_record(answer: RelocalizeAnswer) -> dict[str, Any]:

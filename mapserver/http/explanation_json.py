@@ -8,10 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.explanation import Explanation, Hop, MapsExplanation, PairExplanation, RouteExplanation
-from hybridmap.history import Happening
-from hybridmap.pose import PoseGaussian
-from hybridmap.ruling import Ruling
+from mapweave.hybridmap.explanation import (
+    Explanation,
+    Hop,
+    MapsExplanation,
+    PairExplanation,
+    RouteExplanation,
+)
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.pose import PoseGaussian
 
 
 def explanation_record(told: Explanation) -> dict[str, Any]:
@@ -94,7 +100,7 @@ def route_values(told: RouteExplanation) -> dict[str, Any]:
     }
 
 
-def history_record(happenings: Iterable[Happening]) -> dict[str, Any]:
+def history_record(happenings: Iterable[MapEvent]) -> dict[str, Any]:
     """What has happened, for `json.dumps`: `history`, each with `stamp_ns`, `time` (UTC), `kind`, `words`."""
     return {
         "history": [
@@ -126,11 +132,11 @@ def _hop(hop: Hop) -> dict[str, Any]:
     }
 
 
-def _gaussian(posture: PoseGaussian) -> dict[str, Any]:
-    return {"mean": posture.mean.vector.tolist(), "covariance": posture.covariance.tolist()}
+def _gaussian(pose: PoseGaussian) -> dict[str, Any]:
+    return {"mean": pose.mean.vector.tolist(), "covariance": pose.covariance.tolist()}
 
 
-def _ruling_values(ruling: Ruling) -> dict[str, Any]:
+def _ruling_values(ruling: ManualConstraint) -> dict[str, Any]:
     return {
         "ends": [str(end) for end in ruling.ends],
         "apart": ruling.apart,

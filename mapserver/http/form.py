@@ -8,8 +8,8 @@ from typing import Any
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-from hybridmap.errors import InvalidValue
-from mapserver.http.photo import Photo
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.mapserver.http.photo import Photo
 
 MOST_PARTS = 32
 LONGEST_FIELD = 4096

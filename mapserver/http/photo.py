@@ -10,12 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.query import View
-from storage.image_file import check_cost, decode_grey
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.query import View
+from mapweave.storage.image_file import check_cost, decode_grey
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 LONG_SIDE = 1024
 """Larger images are made so small, px: a robot's image shows things no larger than that."""

@@ -15,8 +15,8 @@ from starlette.datastructures import Headers
 from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from hybridmap.errors import InvalidValue
-from mapserver.http.serving import json_bytes
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.mapserver.http.serving import json_bytes
 
 
 class SameSite:

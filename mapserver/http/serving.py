@@ -24,7 +24,7 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from hybridmap.errors import NotConnected
+from mapweave.hybridmap.errors import NotConnected
 
 MAX_HEAD_BYTES = 16384
 """Of a request: its first line and headers."""

@@ -32,18 +32,18 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
-from hybridmap.explanation import Explanation
-from hybridmap.history import Happening
-from hybridmap.query import RelocalizeAnswer, View
-from hybridmap.ruling import EXAMPLE, read_ends
-from mapserver.http.answer_json import answer_record
-from mapserver.http.explanation_json import explanation_record, history_record
-from mapserver.http.form import read_photo
-from mapserver.http.same_site import SameSite
-from mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
-from wire.explanation_messages import ExplainRequest
-from wire.log_messages import Scalar
+from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
+from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.manual_constraint import EXAMPLE, read_ends
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.query import RelocalizeAnswer, View
+from mapweave.mapserver.http.answer_json import answer_record
+from mapweave.mapserver.http.explanation_json import explanation_record, history_record
+from mapweave.mapserver.http.form import read_photo
+from mapweave.mapserver.http.same_site import SameSite
+from mapweave.mapserver.http.serving import LINGER, HttpThread, Limits, json_bytes
+from mapweave.wire.explanation_messages import ExplainRequest
+from mapweave.wire.log_messages import Scalar
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class Answering(Protocol):
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does."""
 
-    def history(self) -> tuple[Happening, ...]:
+    def history(self) -> tuple[MapEvent, ...]:
         """What has happened."""
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hybridmap.node import MapId
-from mapserver.log.entry import Applied, Entry
-from mapserver.log.integrity import Gap
-from wire.log_messages import MAX_REFUSALS, MAX_ROWS, LogRequest, Refusal
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.integrity import Gap
+from mapweave.wire.log_messages import MAX_REFUSALS, MAX_ROWS, LogRequest, Refusal
 
 NEVER = float("inf")
 
@@ -35,7 +35,7 @@ class AgentLog:
 
     Attributes:
         map: whose.
-        log_id: which, see wire.log_messages.Mark.
+        log_id: which, see mapweave.wire.log_messages.Mark.
         settings: when to pull.
         watermark: every change up to this one is settled.
         newest: the highest sequence number that was heard of.

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hybridmap.change import Change
-from hybridmap.errors import InvalidMessage
-from hybridmap.node import MapId
-from wire.codec import decode_body, element_of, unwrap_body
-from wire.log_messages import Refusal
+from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.node import MapId
+from mapweave.wire.codec import decode_body, element_of, unwrap_body
+from mapweave.wire.log_messages import Refusal
 
 
 @dataclass(frozen=True, slots=True)

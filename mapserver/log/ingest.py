@@ -18,17 +18,17 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from hybridmap.change import Change
-from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
-from hybridmap.node import MapId, check_name
-from mapserver.log.agent_log import NEVER, AgentLog, PullSettings
-from mapserver.log.entry import Entry
-from mapserver.log.ingest_counters import IngestCounters
-from mapserver.log.store import Store
-from wire.bus import Bus, Closing, Reply, Request, Sample
-from wire.codec import MAX_CHANGE_BYTES
-from wire.keys import Keys
-from wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, Refusal
+from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
+from mapweave.hybridmap.node import MapId, check_name
+from mapweave.mapserver.log.agent_log import NEVER, AgentLog, PullSettings
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.ingest_counters import IngestCounters
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.bus import Bus, Closing, Reply, Request, Sample
+from mapweave.wire.codec import MAX_CHANGE_BYTES
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, Refusal
 
 log = logging.getLogger(__name__)
 

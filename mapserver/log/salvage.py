@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybridmap.change import ChangeBody
-from hybridmap.errors import InvalidFile, InvalidMessage
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
-from mapserver.log.integrity import checksum
-from wire.codec import decode_body
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.integrity import checksum
+from mapweave.wire.codec import decode_body
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from hybridmap.node import MapId, NodeId
-from mapserver.log.entry import Applied, Entry, Position, Traffic
-from mapserver.log.integrity import SCHEMA, Gap, insert, repair
-from wire.codec import decode_body, element_of, unwrap_body
-from wire.database import Database
-from wire.log_messages import Refusal
+from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
+from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
+from mapweave.storage.database import Database
+from mapweave.wire.codec import decode_body, element_of, unwrap_body
+from mapweave.wire.log_messages import Refusal
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class Store:
     """All logs in one SQLite file. Its methods may be called from any thread.
 
     Attributes:
-        id: drawn by chance when the store was made, see wire.log_messages.Ack.
+        id: drawn by chance when the store was made, see mapweave.wire.log_messages.Ack.
     """
 
     def __init__(self, path: Path) -> None:

@@ -9,31 +9,35 @@ from itertools import islice
 
 import numpy as np
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
-from hybridmap.errors import InvalidValue
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
-from hybridmap.reach_book import ReachBook
-from hybridmap.ruling import Rulings
-from mapserver.merging.findings import Findings, Recollection, print_of
-from mapserver.merging.isolation import Isolation, leave_out, reason_of
-from mapserver.merging.merger_counters import MergerCounters
-from mapserver.merging.succession import Succession
-from mapserver.places.placeindex import PlaceIndex, bounded
-from mapserver.relocalizing.lookalikes import LookAlikes
-from merge.belief.contradiction import Contradictions
-from merge.graph.candidates import CandidateSettings, Pair
-from merge.graph.links import Link, RefusedLink, refuse
-from merge.graph.merged import MergedMap, WrongGeometry
-from merge.graph.pairs import PairTable
-from merge.graph.verdicts import MapPair, Verdict, Verdicts
-from merge.graph.verification import VerificationSettings, verify
-from merge.islands import Islands
-from merge.life.fading import Fader, FadingSettings
-from merge.life.renewal import RenewalSettings, Renewer
-from merge.merging import MergeSettings
-from registration.recognition import RecognitionSettings
-from wire.posture_codec import MAX_POSITION
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
+from mapweave.mapserver.merging.merger_counters import MergerCounters
+from mapweave.mapserver.merging.superseded_nodes import SupersededNodes
+from mapweave.mapserver.merging.verification_cache import (
+    CachedVerifications,
+    VerificationCache,
+    fingerprint_of,
+)
+from mapweave.mapserver.relocalization.alias_cache import AliasCache
+from mapweave.mapserver.retrieval.place_index import PlaceIndex, bounded
+from mapweave.merge.islands import Islands
+from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemovalSettings, LandmarkRemover
+from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, NodeSupersedingSettings
+from mapweave.merge.merging import MergeSettings
+from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
+from mapweave.merge.pose_graph.candidates import CandidateSettings, Pair
+from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
+from mapweave.merge.pose_graph.merged_map import MergedMap, WrongGeometry
+from mapweave.merge.pose_graph.pairs import PairTable
+from mapweave.merge.pose_graph.verdicts import MapPair, Verdict, Verdicts
+from mapweave.merge.pose_graph.verification import VerificationSettings, verify
+from mapweave.registration.recognition import RecognitionSettings
+from mapweave.wire.pose_codec import MAX_POSITION
 
 log = logging.getLogger(__name__)
 
@@ -53,25 +57,25 @@ class MergerSettings:
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     merging: MergeSettings = field(default_factory=MergeSettings)
-    renewal: RenewalSettings = field(default_factory=RenewalSettings)
-    fading: FadingSettings = field(default_factory=FadingSettings)
+    renewal: NodeSupersedingSettings = field(default_factory=NodeSupersedingSettings)
+    fading: LandmarkRemovalSettings = field(default_factory=LandmarkRemovalSettings)
 
 
 class Pipeline:
     """From maps to a merged map: the merge, renewal and fading, with what each knows from the last one."""
 
-    def __init__(self, settings: MergerSettings, reaches: ReachBook) -> None:
+    def __init__(self, settings: MergerSettings, reaches: ReachabilityCache) -> None:
         """Nothing is merged yet."""
         self.islands = Islands(settings.merging)
-        self._renewer = Renewer(settings.renewal, settings.verification, reaches)
-        self._fader = Fader(settings.fading)
+        self._renewer = NodeSuperseder(settings.renewal, settings.verification, reaches)
+        self._fader = LandmarkRemover(settings.fading)
 
     def merged(
         self,
         maps: Mapping[MapId, HybridMap],
         verdicts: Verdicts,
         touched: set[MapId],
-        rulings: Rulings,
+        rulings: ManualConstraints,
     ) -> MergedMap:
         """See `Islands.merge`.
 
@@ -104,15 +108,15 @@ class Merger:
         """
         # An index in which there is nothing yet is one.
         self.index = PlaceIndex() if index is None else index
-        self.alike = LookAlikes(RecognitionSettings())
+        self.alike = AliasCache(RecognitionSettings())
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
-        self.reaches = ReachBook()
+        self.reaches = ReachabilityCache()
         self.settings = settings or MergerSettings()
-        self._before: Recollection | None = None
+        self._before: CachedVerifications | None = None
         self._prints: dict[NodeId, tuple[Node, bytes]] = {}
         self._pairs = PairTable(self.settings.candidates)
-        self._succession = Succession(self.index, self._pairs, self.node)
+        self._succession = SupersededNodes(self.index, self._pairs, self.node)
         self._uncompared: dict[NodeId, None] = {}
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._verdicts = Verdicts()
@@ -120,13 +124,13 @@ class Merger:
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
         merging = self.settings.merging
-        self._contradictions = Contradictions(merging.consistency, merging.strain)
+        self._contradictions = WrongGeometrySearch(merging.consistency, merging.strain)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}
         self._touched: set[MapId] = set()
         self._changed: set[MapId] = set()
-        self._rulings = Rulings()
+        self._rulings = ManualConstraints()
         self._merged = MergedMap.empty()
         self._dirty = False
 
@@ -146,20 +150,20 @@ class Merger:
         """Whether there are findings of before that no merge has taken over yet."""
         return self._before is not None
 
-    def recollect(self, findings: Findings) -> None:
+    def recollect(self, findings: VerificationCache) -> None:
         """Believe what was found before of nodes that are just as they were; what is not read by then."""
-        self._before = Recollection(findings)
+        self._before = CachedVerifications(findings)
 
-    def findings(self) -> Findings:
+    def findings(self) -> VerificationCache:
         """What was found of all nodes that are compared."""
         before, self._prints = self._prints, {}
         for node_id, node in ((n.id, n) for one in self.maps.values() for n in one.nodes.values()):
             known = before.get(node_id)
             same = known is not None and known[0] is node
-            self._prints[node_id] = known if known and same else (node, print_of(node))
+            self._prints[node_id] = known if known and same else (node, fingerprint_of(node))
         prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._known.items() for b, v in known.items() if a < b}
-        return Findings(prints, self._pairs.overlaps(), verdicts)
+        return VerificationCache(prints, self._pairs.overlaps(), verdicts)
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -212,7 +216,7 @@ class Merger:
         for pair, link in (links or {}).items():
             self._judge(pair, link)
 
-    def rule(self, rulings: Rulings) -> None:
+    def rule(self, rulings: ManualConstraints) -> None:
         """Heed these rulings of people from now on, and no others."""
         ruled = {*rulings.in_force} ^ {*self._rulings.in_force}
         # A map that is retired harms nobody, and is no longer set apart.

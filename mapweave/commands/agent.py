@@ -18,9 +18,9 @@ from mapweave.commands.network import (
 )
 
 if TYPE_CHECKING:
-    from agent.drivers.robot import Robot
-    from agent.synchronization import Synchronization
-    from wire.bus import Bus
+    from mapweave.agent.drivers.robot import Robot
+    from mapweave.agent.synchronization import Synchronization
+    from mapweave.wire.bus import Bus
 
 
 def add_to(commands: Any) -> None:
@@ -60,12 +60,12 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
-    from agent.mission import Carried, Explore, Idle, Mission
-    from hybridmap.errors import InvalidValue
-    from hybridmap.node import check_name
-    from mapweave.agent_process import AgentOptions, run_agent
+    from mapweave.agent.mission import Carried, Explore, Idle, Mission
     from mapweave.commands.map_ends import map_of
-    from wire.keys import check_epoch
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.node import check_name
+    from mapweave.processes.agent import AgentOptions, run_agent
+    from mapweave.wire.keys import check_epoch
 
     name = check_name(arguments.name)
     if arguments.epoch is not None:
@@ -107,12 +107,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _body(arguments: argparse.Namespace, bus: Bus, fleet: str, name: str) -> tuple[Robot, Synchronization]:
     """The body behind Zenoh keys, and what the loop waits for: a simulation may be driven in lock-step."""
-    from agent.drivers.remote import RemoteRobot
-    from agent.synchronization import FreeRunning, Lockstep
+    from mapweave.agent.drivers.remote import RemoteRobot
+    from mapweave.agent.synchronization import FreeRunning, Lockstep
 
     if not arguments.lockstep:
         return RemoteRobot(bus, fleet, name), FreeRunning()
-    from sim.lockstep_robot import LockstepRobot
+    from mapweave.sim.lockstep_robot import LockstepRobot
 
     robot = LockstepRobot(bus, fleet, name)
     return robot, Lockstep(robot.rendezvous)

@@ -69,14 +69,16 @@ def run(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     from mapweave.commands.network import settings_of
-    from mapweave.examination.examine import examine
+    from mapweave.evaluation.relocalization import evaluate_relocalization
     from mapweave.output_folder import check_output
 
     if arguments.out is not None:
         check_output(arguments.out)
     pipeline = settings_of(arguments).pipeline
     console = Console(stderr=True)
-    examination = examine(arguments.folder, arguments.camera, arguments.focal, pipeline, console)
+    examination = evaluate_relocalization(
+        arguments.folder, arguments.camera, arguments.focal, pipeline, console
+    )
     report = examination.report()
     if arguments.out is not None:
         for path in examination.write(arguments.out):
@@ -103,7 +105,7 @@ def run_merge(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     from mapweave.commands.network import settings_of
-    from mapweave.examination.merging import examine_merging
+    from mapweave.evaluation.merging import evaluate_merging
     from mapweave.output_folder import check_output
     from mapweave.settings import merge_settings
 
@@ -112,7 +114,7 @@ def run_merge(arguments: argparse.Namespace) -> int:
     console = Console(stderr=True)
     if arguments.out is not None:
         check_output(arguments.out)
-    examination = examine_merging(arguments.folder, arguments.robots, settings.pipeline, merge, console)
+    examination = evaluate_merging(arguments.folder, arguments.robots, settings.pipeline, merge, console)
     report = examination.report()
     out = arguments.out or Path("out/eval-merge") / examination.name
     for path in examination.write(out):

@@ -7,12 +7,12 @@ import sys
 import time
 from collections.abc import Callable
 
-from hybridmap.errors import InvalidValue, NotConnected
-from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import EXAMPLE, Ends, read_end, read_ends
 from mapweave.commands.network import connect, network_of, settings_of
-from wire.bus import Bus, Reply
-from wire.keys import Keys
+from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.manual_constraint import EXAMPLE, Ends, read_end, read_ends
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.wire.bus import Bus, Reply
+from mapweave.wire.keys import Keys
 
 
 def ends_of(words: list[str]) -> Ends:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
-    from hybridmap.explanation import MapsExplanation, PairExplanation
-    from hybridmap.node import MapId, NodeId
-    from merge.graph.merged import MergedMap
-    from merge.merging import MergeSettings
+    from mapweave.hybridmap.explanation import MapsExplanation, PairExplanation
+    from mapweave.hybridmap.node import MapId, NodeId
+    from mapweave.merge.merging import MergeSettings
+    from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 def add_to(actions: Any) -> None:
@@ -36,13 +36,13 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
-    from hybridmap.errors import InvalidValue
-    from hybridmap.node import MapId, NodeId
-    from hybridmap.ruling import EXAMPLE
-    from mapserver.http.explanation_json import explanation_record
     from mapweave.commands.map_ends import ends_of
-    from mapweave.explained import maps_words, pair_words
+    from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.manual_constraint import EXAMPLE
+    from mapweave.hybridmap.node import MapId, NodeId
+    from mapweave.mapserver.http.explanation_json import explanation_record
 
     if arguments.draw is not None:
         need("viz")
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         pair = explained_nodes(arguments, first, second)
         values, lines = explanation_record(pair), pair_words(pair)
         if arguments.draw is not None:
-            from mapweave.link_picture import draw_link
+            from mapweave.drawing.link_picture import draw_link
 
             draw_link(pair, arguments.draw)
             values["picture"] = str(arguments.draw)
@@ -71,13 +71,13 @@ def run(arguments: argparse.Namespace) -> int:
 def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> PairExplanation:
     """Two nodes of a map file, or of what a server has."""
     from mapweave.commands.map_ends import ask
-    from wire.explanation_messages import ExplainRequest, decode_pair, encode_explain_request
-    from wire.keys import Keys
+    from mapweave.wire.explanation_messages import ExplainRequest, decode_pair, encode_explain_request
+    from mapweave.wire.keys import Keys
 
     if arguments.map is None:
         request = encode_explain_request(ExplainRequest((a, b)))
         return decode_pair(ask(arguments, Keys.any_explain, request)[0].payload)
-    from merge.explaining.explanation import explain_nodes
+    from mapweave.merge.explanation.node_explanation import explain_nodes
 
     merged, settings = _merged(arguments)
     return explain_nodes(merged, a, b, None, settings.consistency)
@@ -88,13 +88,18 @@ def explained_maps(
 ) -> tuple[MapsExplanation, ...]:
     """Two maps of a map file, or of what a server has; each two of them without ends."""
     from mapweave.commands.map_ends import ask
-    from wire.explanation_messages import MAX_MAPS_TOLD, ExplainRequest, decode_maps, encode_explain_request
-    from wire.keys import Keys
+    from mapweave.wire.explanation_messages import (
+        MAX_MAPS_TOLD,
+        ExplainRequest,
+        decode_maps,
+        encode_explain_request,
+    )
+    from mapweave.wire.keys import Keys
 
     if arguments.map is None:
         request = encode_explain_request(ExplainRequest(ends))
         return decode_maps(ask(arguments, Keys.any_explain, request)[0].payload)
-    from merge.explaining.maps import explain_fleet, explain_maps
+    from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 
     merged, _ = _merged(arguments)
     return explain_fleet(merged, MAX_MAPS_TOLD) if ends is None else (explain_maps(merged, *ends),)
@@ -102,10 +107,10 @@ def explained_maps(
 
 def _merged(arguments: argparse.Namespace) -> tuple[MergedMap, MergeSettings]:
     """The merged map of a file, and the settings with which it is explained."""
-    from mapserver.mapfiles import merged_of
     from mapweave.commands.network import settings_of
+    from mapweave.mapserver.map_files import merged_of
     from mapweave.settings import merge_settings
-    from wire.mapfile import read_map_file
+    from mapweave.storage.map_file import read_map_file
 
     settings = merge_settings(settings_of(arguments), arguments.settings)
     return merged_of(read_map_file(arguments.map), settings), settings

@@ -34,16 +34,16 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write, and say what and what not."""
-    from mapserver.mapfiles import merged_of
-    from mapweave.exporting import FORMATS as WRITERS
-    from mapweave.map_part import MapPart
-    from wire.mapfile import read_map_file
+    from mapweave.formats.export import FORMATS as WRITERS
+    from mapweave.formats.map_part import MapPart
+    from mapweave.mapserver.map_files import merged_of
+    from mapweave.storage.map_file import read_map_file
 
     merged = merged_of(read_map_file(arguments.file))
     part = MapPart(merged, arguments.component)
     for path in WRITERS[arguments.to](part, arguments.out):
         print(path)
-    left = len(merged.postures) - len(part.nodes)
+    left = len(merged.poses) - len(part.nodes)
     if left:
         words = f"component {part.component} of {len(merged.components)}: {left} nodes of others are left out"
         print(

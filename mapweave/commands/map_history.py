@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
-    from hybridmap.history import Happening
+    from mapweave.hybridmap.map_event import MapEvent
 
 
 def add_to(actions: Any) -> None:
@@ -33,8 +33,8 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from hybridmap.errors import InvalidValue
-    from mapserver.http.explanation_json import history_record, time_of
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.mapserver.http.explanation_json import history_record, time_of
 
     if arguments.most < 1:
         raise InvalidValue(f"--most {arguments.most}: give 1 or more")
@@ -49,15 +49,15 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _history(arguments: argparse.Namespace) -> tuple[Happening, ...]:
-    from hybridmap.ruling import Rulings
-    from mapserver.ruling_history import with_rulings
+def _history(arguments: argparse.Namespace) -> tuple[MapEvent, ...]:
     from mapweave.commands.map_ends import ask
-    from wire.history_codec import decode_history
-    from wire.keys import Keys
-    from wire.mapfile import read_map_file
+    from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.mapserver.ruling_history import with_rulings
+    from mapweave.storage.map_file import read_map_file
+    from mapweave.wire.history_codec import decode_history
+    from mapweave.wire.keys import Keys
 
     if arguments.map is None:
         return decode_history(ask(arguments, Keys.any_history, b"")[0].payload)
     content = read_map_file(arguments.map)
-    return with_rulings(content.history, Rulings(content.rulings))
+    return with_rulings(content.history, ManualConstraints(content.rulings))

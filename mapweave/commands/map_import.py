@@ -29,9 +29,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Read, optimise, write, say how much better it is."""
     from dataclasses import replace
 
-    from hybridmap.errors import InvalidValue
-    from mapweave.g2o import read_g2o, write_g2o
-    from mapweave.g2o_optimum import optimum_of
+    from mapweave.formats.g2o import read_g2o, write_g2o
+    from mapweave.formats.g2o_optimum import optimum_of
+    from mapweave.hybridmap.errors import InvalidValue
 
     if arguments.out.suffix == ".mapweave":
         raise InvalidValue(

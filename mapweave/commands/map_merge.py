@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybridmap.hybrid_map import HybridMap
-    from hybridmap.node import MapId
-    from hybridmap.ruling import Rulings
-    from merge.graph.merged import MergedMap
-    from merge.merging import MergeSettings
+    from mapweave.hybridmap.hybrid_map import HybridMap
+    from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.hybridmap.node import MapId
+    from mapweave.merge.merging import MergeSettings
+    from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 def add_to(actions: Any) -> None:
@@ -35,14 +35,14 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Merge, write, say what has become of it."""
-    from mapserver.mapfiles import map_file_of
     from mapweave.commands.network import settings_of
-    from mapweave.offline import parts_of
+    from mapweave.mapserver.map_files import map_file_of
+    from mapweave.merge.explanation.component_changes import joinings
+    from mapweave.merge.explanation.map_explanation import explain_fleet
+    from mapweave.offline_merge import parts_of
     from mapweave.settings import merge_settings
-    from merge.explaining.maps import explain_fleet
-    from merge.explaining.parting import joinings
-    from wire.mapfile import read_map_file, write_map_file
-    from wire.whole_file import check_place
+    from mapweave.storage.atomic_file import check_place
+    from mapweave.storage.map_file import read_map_file, write_map_file
 
     check_place(arguments.out)
     settings = merge_settings(settings_of(arguments), arguments.settings)
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         outcome = {
             "out": str(arguments.out),
-            "nodes": len(merged.postures),
+            "nodes": len(merged.poses),
             "maps": [str(one) for one in merged.maps],
             "components": len(merged.components),
             "links": sum(not link.within for link in merged.links),
@@ -73,13 +73,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def merged_with_progress(
-    maps: dict[MapId, HybridMap], rulings: Rulings, settings: MergeSettings | None = None
+    maps: dict[MapId, HybridMap], rulings: ManualConstraints, settings: MergeSettings | None = None
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
     from rich.console import Console
     from rich.progress import Progress
 
-    from mapweave.offline import merge_parts
+    from mapweave.offline_merge import merge_parts
 
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:

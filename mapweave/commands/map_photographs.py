@@ -39,13 +39,13 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, write, hand over."""
-    from agent.drivers.replay import images_in, read_camera
-    from hybridmap.change import NodePut
-    from hybridmap.errors import NotConnected
-    from hybridmap.node import MapId, check_name
+    from mapweave.agent.drivers.replay import images_in, read_camera
+    from mapweave.hybridmap.change import NodePut
+    from mapweave.hybridmap.errors import NotConnected
+    from mapweave.hybridmap.node import MapId, check_name
     from mapweave.photographs import map_of_photographs, send_map
-    from wire.mapfile import MapFile, write_map_file
-    from wire.whole_file import check_place
+    from mapweave.storage.atomic_file import check_place
+    from mapweave.storage.map_file import MapFile, write_map_file
 
     check_place(arguments.out)
     map_id = MapId(check_name(arguments.name or arguments.out.stem), int(time.time()))

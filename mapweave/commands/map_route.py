@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
-    from hybridmap.explanation import RouteExplanation
-    from hybridmap.node import NodeId
+    from mapweave.hybridmap.explanation import RouteExplanation
+    from mapweave.hybridmap.node import NodeId
 
 
 def add_to(actions: Any) -> None:
@@ -41,10 +41,10 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapserver.http.explanation_json import route_values
     from mapweave.commands.map_ends import node_of
-    from mapweave.explained import route_words
+    from mapweave.explanation_text import route_words
     from mapweave.extras import need
+    from mapweave.mapserver.http.explanation_json import route_values
 
     if arguments.draw is not None:
         need("viz")
@@ -66,24 +66,24 @@ def draw_route(arguments: argparse.Namespace, told: RouteExplanation) -> None:
     """Draw a way on the part of the map through which it leads."""
     import numpy as np
 
-    from hybridmap.hybrid_map import HybridMap
     from mapweave.commands.map_ends import ask
-    from mapweave.picture import Drive, MapPicture, draw_map
-    from wire.keys import Keys
-    from wire.mapfile import read_map_file, unpack_map_file
+    from mapweave.drawing.map_picture import Drive, MapPicture, draw_map
+    from mapweave.hybridmap.hybrid_map import HybridMap
+    from mapweave.storage.map_file import read_map_file, unpack_map_file
+    from mapweave.wire.keys import Keys
 
     if arguments.map is None:
         content = unpack_map_file(ask(arguments, Keys.any_server_map, b"")[0].payload)
     else:
         content = read_map_file(arguments.map, "merged")
-    part, _ = content.postures[told.start]
-    postures = {node: p.mean for node, (number, p) in content.postures.items() if number == part}
-    way = [postures[node] for node in (told.start, *(hop.b for hop in told.hops))]
+    part, _ = content.poses[told.start]
+    poses = {node: p.mean for node, (number, p) in content.poses.items() if number == part}
+    way = [poses[node] for node in (told.start, *(hop.b for hop in told.hops))]
     places = np.array([[pose.x, pose.y] for pose in way])
     drive = Drive(places, way[0], way[-1], "the way", begun="start")
     title = f"{told.start} to {told.goal}\n{told.reason}"
     edges = list(HybridMap(content.changes).edges.values())
-    draw_map(MapPicture(title, postures, edges, drives=[drive]), arguments.draw)
+    draw_map(MapPicture(title, poses, edges, drives=[drive]), arguments.draw)
 
 
 def explained_route(
@@ -91,20 +91,20 @@ def explained_route(
 ) -> RouteExplanation:
     """A route through a map file, or through what a server has."""
     from mapweave.commands.map_ends import ask
-    from wire.explanation_messages import ExplainRequest, encode_explain_request
-    from wire.keys import Keys
-    from wire.route_explanation import decode_route_explanation
+    from mapweave.wire.explanation_messages import ExplainRequest, encode_explain_request
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.route_explanation import decode_route_explanation
 
     if arguments.map is None:
         request = ExplainRequest((start, goal), True, blocked)
         replies = ask(arguments, Keys.any_explain, encode_explain_request(request))
         return decode_route_explanation(replies[0].payload)
-    from mapserver.mapfiles import merged_of
-    from mapserver.route_explaining import explain_route
-    from mapserver.routes import Router
     from mapweave.commands.network import settings_of
+    from mapweave.mapserver.map_files import merged_of
+    from mapweave.mapserver.route_explaining import explain_route
+    from mapweave.mapserver.routes import Router
     from mapweave.settings import merge_settings
-    from wire.mapfile import read_map_file
+    from mapweave.storage.map_file import read_map_file
 
     settings = merge_settings(settings_of(arguments), arguments.settings)
     router = Router(merged_of(read_map_file(arguments.map), settings))

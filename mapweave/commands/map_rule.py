@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
-    from hybridmap.ruling import Ends, Ruling
+    from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
 
 
 def add_ruling(parser: argparse.ArgumentParser) -> None:
@@ -31,12 +31,14 @@ def rule(arguments: argparse.Namespace, ends: Ends) -> None:
     Raises:
         MapweaveError: there is nothing to rule, or nobody who would keep it.
     """
-    from hybridmap.errors import InvalidValue
-    from hybridmap.ruling import Ruling
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.manual_constraint import ManualConstraint
 
     if arguments.out is not None and arguments.map is None:
         raise InvalidValue("--out goes with --map: what a server is told it keeps itself")
-    ruling = Ruling(ends, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because)
+    ruling = ManualConstraint(
+        ends, not arguments.undo, arguments.by or _login(), time.time_ns(), arguments.because
+    )
     if arguments.map is None:
         _tell_server(arguments, ruling)
     else:
@@ -51,11 +53,11 @@ def _login() -> str:
         return "somebody"
 
 
-def _tell_server(arguments: argparse.Namespace, ruling: Ruling) -> None:
+def _tell_server(arguments: argparse.Namespace, ruling: ManualConstraint) -> None:
     from mapweave.commands.map_ends import ask
-    from wire.explanation_messages import encode_ruling
-    from wire.keys import Keys
-    from wire.log_messages import decode_record
+    from mapweave.wire.explanation_messages import encode_ruling
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.log_messages import decode_record
 
     for reply in ask(arguments, Keys.any_rule, encode_ruling(ruling)):
         print(decode_record(reply.payload)["said"])
@@ -65,8 +67,8 @@ def _tell_server(arguments: argparse.Namespace, ruling: Ruling) -> None:
 def _settled(arguments: argparse.Namespace) -> None:
     """Wait until the server has merged with it, or the time is over."""
     from mapweave.commands.map_ends import ask
-    from wire.keys import Keys
-    from wire.log_messages import decode_record
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.log_messages import decode_record
 
     end = time.monotonic() + arguments.timeout
     while time.monotonic() < end:
@@ -78,25 +80,25 @@ def _settled(arguments: argparse.Namespace) -> None:
     print("it is kept; the server is still merging, ask `mapweave map explain` later")
 
 
-def _rewrite(arguments: argparse.Namespace, ruling: Ruling) -> None:
-    from hybridmap.ruling import Rulings
-    from mapserver.chronicle import between
-    from mapserver.mapfiles import map_file_of, merged_of
+def _rewrite(arguments: argparse.Namespace, ruling: ManualConstraint) -> None:
     from mapweave.commands.map_merge import merged_with_progress
     from mapweave.commands.network import settings_of
-    from mapweave.offline import parts_of
+    from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.mapserver.map_files import map_file_of, merged_of
+    from mapweave.mapserver.map_history import between
+    from mapweave.merge.manual_constraints import check_manual_constraint
+    from mapweave.offline_merge import parts_of
     from mapweave.settings import merge_settings
-    from merge.undoing import check_ruling
-    from wire.mapfile import read_map_file, write_map_file
-    from wire.whole_file import check_place
+    from mapweave.storage.atomic_file import check_place
+    from mapweave.storage.map_file import read_map_file, write_map_file
 
     check_place(arguments.out or arguments.map)
     settings = merge_settings(settings_of(arguments), arguments.settings)
     content = read_map_file(arguments.map, "merged")
     before = merged_of(content, settings)
-    check_ruling(before, Rulings(content.rulings), ruling)
+    check_manual_constraint(before, ManualConstraints(content.rulings), ruling)
     parts = parts_of({arguments.map: content})
-    merged = merged_with_progress(parts.maps, parts.rulings + Rulings([ruling]), settings)
+    merged = merged_with_progress(parts.maps, parts.rulings + ManualConstraints([ruling]), settings)
     out = arguments.out or arguments.map
     history = (*parts.history, *between(before, merged, ruling.stamp_ns))
     write_map_file(out, map_file_of(merged, history))

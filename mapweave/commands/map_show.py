@@ -31,13 +31,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the summary, draw the picture."""
     import numpy as np
 
-    from hybridmap.errors import InvalidValue
-    from hybridmap.hybrid_map import HybridMap
-    from hybridmap.node import EdgeKind
-    from hybridmap.ruling import Rulings
+    from mapweave.drawing.map_picture import MapPicture, draw_map
     from mapweave.extras import MissingExtra, need
-    from mapweave.picture import MapPicture, draw_map
-    from wire.mapfile import read_map_file
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.hybrid_map import HybridMap
+    from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.hybridmap.node import EdgeKind
+    from mapweave.storage.map_file import read_map_file
 
     if not arguments.no_picture:
         try:
@@ -50,15 +50,15 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.no_picture = True
     content = read_map_file(arguments.file)
     hybrid = HybridMap(content.changes)
-    if content.postures:
+    if content.poses:
         # Components have frames of their own; only one can be drawn without pretending.
         sizes: dict[int, int] = {}
-        for component, _ in content.postures.values():
+        for component, _ in content.poses.values():
             sizes[component] = sizes.get(component, 0) + 1
-        postures = {n: p.mean for n, (c, p) in content.postures.items() if c == arguments.component}
+        poses = {n: p.mean for n, (c, p) in content.poses.items() if c == arguments.component}
     else:
         sizes = {k: len(nodes) for k, nodes in enumerate(hybrid.components())}
-        postures = {n.id: n.map_from_robot.mean for n in hybrid.nodes.values()}
+        poses = {n.id: n.map_from_robot.mean for n in hybrid.nodes.values()}
         # A robot's own map has one frame, whatever hangs together in it.
         arguments.component = 0
     if arguments.component not in sizes and sizes:
@@ -79,24 +79,24 @@ def run(arguments: argparse.Namespace) -> int:
         "edges": kinds,
         "links": sum(e.kind is EdgeKind.MERGED for e in hybrid.edges.values()),
         "refused": sum(pair.edge is not None for pair in content.refused),
-        "rulings": len(Rulings(content.rulings).in_force),
+        "rulings": len(ManualConstraints(content.rulings).in_force),
         "components": len(sizes),
         "landmarks_per_node_median": float(np.median(landmarks)) if landmarks else 0.0,
     }
-    if not arguments.no_picture and postures:
+    if not arguments.no_picture and poses:
         out = arguments.out or arguments.file.with_suffix(".png")
         seen = [
-            postures[n.id].apply(n.points_in_robot[n.landmarks.has_depth, :2])
+            poses[n.id].apply(n.points_in_robot[n.landmarks.has_depth, :2])
             for n in hybrid.nodes.values()
-            if n.id in postures
+            if n.id in poses
         ]
         points = np.concatenate(seen) if seen else np.zeros((0, 2))
         title = content.title
-        if len(postures) < len(hybrid.nodes):
+        if len(poses) < len(hybrid.nodes):
             which = f"component {arguments.component}" if len(sizes) > 1 else "what is in use"
-            title += f"\ndrawn: {which}, {len(postures)} of {len(hybrid.nodes)} nodes"
-            summary["drawn"] = f"{which}, {len(postures)} nodes"
-        draw_map(MapPicture(title, postures, list(hybrid.edges.values()), landmarks=points), out)
+            title += f"\ndrawn: {which}, {len(poses)} of {len(hybrid.nodes)} nodes"
+            summary["drawn"] = f"{which}, {len(poses)} nodes"
+        draw_map(MapPicture(title, poses, list(hybrid.edges.values()), landmarks=points), out)
         summary["picture"] = str(out)
     if arguments.json:
         print(json.dumps(summary))

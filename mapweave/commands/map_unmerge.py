@@ -25,10 +25,10 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Rule, and say what has come of it."""
-    from hybridmap.errors import InvalidValue
-    from hybridmap.node import MapId
     from mapweave.commands.map_ends import ends_of
     from mapweave.commands.map_explain import explained_maps
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.node import MapId
 
     ends = ends_of(arguments.ends)
     first, second = (MapId(end[0], end[1]) for end in ends)

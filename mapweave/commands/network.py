@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mapweave.settings import NetworkSettings, Settings
-    from wire.keys import Keys
-    from wire.zenoh_bus import ZenohBus
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.zenoh_bus import ZenohBus
 
 SOON = 2.0
 """s; a router that is there is found sooner."""
@@ -54,9 +54,9 @@ def network_of(arguments: argparse.Namespace, settings: Settings) -> NetworkSett
 
 def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
     """A client connection; it opens in the background and survives a router that comes and goes."""
-    from wire.bus_settings import BusSettings
-    from wire.keys import Keys
-    from wire.zenoh_bus import ZenohBus
+    from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.zenoh_bus import ZenohBus
 
     return ZenohBus(BusSettings(mode="client", endpoints=network.endpoints)), Keys(network.fleet)
 
@@ -76,10 +76,10 @@ def tell_if_alone(bus: ZenohBus, who: str) -> None:
 
 def stop_on_signals() -> threading.Event:
     """An event that SIGTERM, Ctrl-C and a parent's end set, so that a process can end in order."""
-    from mapweave import lifeline
+    from mapweave.processes import parent_watchdog
 
     stop = threading.Event()
-    lifeline.hold(stop)
+    parent_watchdog.hold(stop)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     return stop

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands.network import add_network, connect, network_of, settings_of
 
 if TYPE_CHECKING:
-    from hybridmap.node import Node, NodeId
-    from hybridmap.query import RelocalizeAnswer
+    from mapweave.hybridmap.node import Node, NodeId
+    from mapweave.hybridmap.query import RelocalizeAnswer
     from mapweave.settings import NetworkSettings
-    from wire.keys import Keys
-    from wire.zenoh_bus import ZenohBus
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.zenoh_bus import ZenohBus
 
 
 def add_to(commands: Any) -> None:
@@ -26,7 +26,7 @@ def add_to(commands: Any) -> None:
         "relocalize",
         help="ask a running server where an image was taken",
         description="Extract an image's features and ask the map server where it was taken. "
-        "Exit status 0: found; 2: unknown, ambiguous, or the place without a posture; 1: could not ask.",
+        "Exit status 0: found; 2: unknown, ambiguous, or the place without a pose; 1: could not ask.",
     )
     parser.add_argument("image", type=Path, help="png, jpg, pgm or bmp")
     parser.add_argument(
@@ -45,15 +45,15 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from agent.drivers.replay import read_camera
-    from hybridmap.errors import DeviceError
-    from hybridmap.query import Certainty
-    from mapserver.http.answer_json import answer_record
-    from mapweave.match_picture import draw_matches
-    from storage.image_file import read_grey
-    from vision.lens import Lens
-    from vision.sift import Sift
-    from wire.messages import decode_relocalize_answer, encode_view
+    from mapweave.agent.drivers.replay import read_camera
+    from mapweave.drawing.match_picture import draw_matches
+    from mapweave.hybridmap.errors import DeviceError
+    from mapweave.hybridmap.query import Certainty
+    from mapweave.mapserver.http.answer_json import answer_record
+    from mapweave.storage.image_file import read_grey
+    from mapweave.vision.lens import Lens
+    from mapweave.vision.sift import Sift
+    from mapweave.wire.messages import decode_relocalize_answer, encode_view
 
     if not arguments.image.exists():
         raise DeviceError(f"{arguments.image}: no such file")
@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
     """Ask until somebody answers; a server that is busy is asked again when it said."""
-    from hybridmap.errors import NotConnected
+    from mapweave.hybridmap.errors import NotConnected
 
     where, end = ", ".join(network.endpoints), time.monotonic() + patience
     if not bus.wait_connected(patience):
@@ -115,8 +115,8 @@ def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, pati
 
 def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, patience: float) -> Node:
     """A node of the merged map: the beginning of the way from itself to itself."""
-    from hybridmap.errors import NotConnected
-    from wire.messages import RouteRequest, decode_route_answer, encode_route_request
+    from mapweave.hybridmap.errors import NotConnected
+    from mapweave.wire.messages import RouteRequest, decode_route_answer, encode_route_request
 
     request = encode_route_request(RouteRequest(node_id, node_id))
     way = decode_route_answer(_ask(bus, network, keys.any_route(), request, patience))

@@ -34,10 +34,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Play the recording to its end."""
     import re
 
-    from agent.drivers.replay import Replay
-    from agent.mission import Carried
-    from hybridmap.node import check_name
-    from mapweave.agent_process import AgentOptions, run_agent
+    from mapweave.agent.drivers.replay import Replay
+    from mapweave.agent.mission import Carried
+    from mapweave.hybridmap.node import check_name
+    from mapweave.processes.agent import AgentOptions, run_agent
 
     robot = Replay(arguments.folder, arguments.robot)
     fallback = re.sub("[^a-z0-9_-]", "-", (arguments.robot or arguments.folder.resolve().name).lower())

@@ -40,13 +40,13 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
-    from hybridmap.node import check_name
-    from mapserver.schedule import LiveSchedule, LockstepSchedule
-    from mapserver.server import MapServer, ServerSettings
+    from mapweave.hybridmap.node import check_name
+    from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
+    from mapweave.mapserver.server import MapServer, ServerSettings
     from mapweave.settings import merge_settings
-    from wire.bus_settings import BusSettings
-    from wire.keys import Keys
-    from wire.zenoh_bus import ZenohBus
+    from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.zenoh_bus import ZenohBus
 
     # Who looks in the morning wants to know when two maps came apart.
     logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     name, keys = check_name(arguments.name or network.server), Keys(network.fleet)
     address = None
     if arguments.http is not None:
-        from mapserver.http.web import Web, parse_address
+        from mapweave.mapserver.http.web import Web, parse_address
 
         address = parse_address(arguments.http)
     stop = stop_on_signals()

@@ -109,7 +109,7 @@ def run_list(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from mapweave.trial.scenario import load_scenario, scenario_names, scenario_path
+    from mapweave.scenarios.scenario import load_scenario, scenario_names, scenario_path
 
     del arguments
     table = Table(box=None, show_header=False)
@@ -126,9 +126,9 @@ def run_one(arguments: argparse.Namespace) -> int:
     need(*TRIAL)
     from rich.console import Console
 
-    from mapweave.trial.run import TrialOptions, run_trial
-    from mapweave.trial.scenario import load_scenario, scenario_path
-    from mapweave.trial.summary import summary_table
+    from mapweave.scenarios.run import TrialOptions, run_trial
+    from mapweave.scenarios.scenario import load_scenario, scenario_path
+    from mapweave.scenarios.summary import summary_table
 
     settings = settings_of(arguments)
     scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
@@ -164,8 +164,8 @@ def run_batch(arguments: argparse.Namespace) -> int:
 
     need(*TRIAL)
     from mapweave.output_folder import check_output
-    from mapweave.trial.batch import BatchOptions, run_batch_of_trials
-    from mapweave.trial.scenario import load_scenario, scenario_path
+    from mapweave.scenarios.batch import BatchOptions, run_batch_of_trials
+    from mapweave.scenarios.scenario import load_scenario, scenario_path
 
     settings = settings_of(arguments)
     scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)
@@ -185,10 +185,10 @@ def run_batch(arguments: argparse.Namespace) -> int:
 
 def run_serve(arguments: argparse.Namespace) -> int:
     """Serve the simulated bodies until told to stop."""
-    from mapweave.sim_process import run_sim
-    from mapweave.trial.scenario import load_scenario, scenario_path
-    from wire.bus_settings import BusSettings
-    from wire.zenoh_bus import ZenohBus
+    from mapweave.processes.simulator import run_sim
+    from mapweave.scenarios.scenario import load_scenario, scenario_path
+    from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.zenoh_bus import ZenohBus
 
     # Whom time waits for, and whose agent is gone.
     logging.basicConfig(format="%(message)s")
@@ -216,7 +216,7 @@ def check_seed(seed: int, argument: str = "--seed") -> int:
     Raises:
         SettingsError: it is negative.
     """
-    from hybridmap.errors import SettingsError
+    from mapweave.hybridmap.errors import SettingsError
 
     if seed < 0:
         raise SettingsError(f"{argument} {seed}: use 0 or more")
@@ -229,7 +229,7 @@ def check_port(port: int) -> None:
     Raises:
         SettingsError: there is no such port.
     """
-    from hybridmap.errors import SettingsError
+    from mapweave.hybridmap.errors import SettingsError
 
     if not 0 <= port <= 65535:
         raise SettingsError(f"--view {port}: a port is 0 to 65535; 0 takes a free one")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import SettingsError
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from mapweave.trial.run import Trial
+from mapweave.scenarios.run import Trial
 
 
 @dataclass

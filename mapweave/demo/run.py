@@ -8,8 +8,8 @@ from pathlib import Path
 
 from mapweave.demo.options import DemoOptions
 from mapweave.demo.report import Report
-from mapweave.trial.run import TrialOptions, run_trial
-from mapweave.trial.scenario import load_scenario, scenario_path
+from mapweave.scenarios.run import TrialOptions, run_trial
+from mapweave.scenarios.scenario import load_scenario, scenario_path
 
 
 def run_demo(options: DemoOptions) -> Report:

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2
-from sim.floorplan import Rectangle
-from sim.surface import TEXELS_PER_METRE
-from sim.texture import Painter, Texture
-from sim.world import Block, Panel, Piece, World, block_panels, upright_panel
-from sim.worlds.design import DARK, Design, Furniture, Poster, Room, Wall, check_design, floor_area
-from sim.worlds.faces import BEFORE, cut_face, nearest_face, room_before
-from sim.worlds.lamps import lamps_of
-from sim.worlds.layout import exact, plan_of
-from sim.worlds.light import Lit, Vector
-from sim.worlds.textures import NOTHING, Textures
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.floorplan import Rectangle
+from mapweave.sim.surface import TEXELS_PER_METRE
+from mapweave.sim.texture import Painter, Texture
+from mapweave.sim.world import Block, Panel, Piece, World, block_panels, upright_panel
+from mapweave.sim.worlds.design import DARK, Design, Furniture, Poster, Room, Wall, check_design, floor_area
+from mapweave.sim.worlds.faces import BEFORE, cut_face, nearest_face, room_before
+from mapweave.sim.worlds.lamps import lamps_of
+from mapweave.sim.worlds.layout import exact, plan_of
+from mapweave.sim.worlds.light import Lit, Vector
+from mapweave.sim.worlds.textures import NOTHING, Textures
 
 TILE = 3.0
 """Floors are laid in pieces at most this long, m."""

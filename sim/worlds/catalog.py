@@ -7,17 +7,17 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from hybridmap.errors import InvalidValue
-from sim.world import World
-from sim.worlds.arena import ArenaParameters, arena
-from sim.worlds.build import build_world
-from sim.worlds.corridor import CorridorParameters, corridor
-from sim.worlds.design import MAX_SEED, Design, within
-from sim.worlds.file import load_world
-from sim.worlds.office import OfficeParameters, office
-from sim.worlds.twins import TwinsParameters, twins
-from sim.worlds.warehouse import WarehouseParameters, warehouse
-from wire.tables import build
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim.world import World
+from mapweave.sim.worlds.arena import ArenaParameters, arena
+from mapweave.sim.worlds.build import build_world
+from mapweave.sim.worlds.corridor import CorridorParameters, corridor
+from mapweave.sim.worlds.design import MAX_SEED, Design, within
+from mapweave.sim.worlds.file import load_world
+from mapweave.sim.worlds.office import OfficeParameters, office
+from mapweave.sim.worlds.twins import TwinsParameters, twins
+from mapweave.sim.worlds.warehouse import WarehouseParameters, warehouse
+from mapweave.storage.settings_file import build
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.errors import InvalidValue
-from sim.worlds.design import THICKNESS, Design, Point, Poster, Room, Wall, within
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim.worlds.design import THICKNESS, Design, Point, Poster, Room, Wall, within
 
 HALF = THICKNESS / 2
 CORNER = 0.25

@@ -1,7 +1,7 @@
 """What a world is before it is built: rooms, walls, furniture and posters by name, place and size.
 
-The kinds of world write a design, a world's file holds one, and `sim.worlds.build` builds it. All sizes are
-in m, in world; x to the east, y to the north.
+The kinds of world write a design, a world's file holds one, and `mapweave.sim.worlds.build` builds it. All
+sizes are in m, in world; x to the east, y to the north.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue
 
 THICKNESS = 0.12
 """Of walls, m."""

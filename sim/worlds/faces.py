@@ -8,8 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array, Pose2
-from sim.floorplan import Rectangle
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.floorplan import Rectangle
 
 SEGMENT = 1.3
 """Walls are papered in pieces at most this wide, m: one filter level of a texture fits a whole piece."""

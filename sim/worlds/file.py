@@ -30,7 +30,7 @@
     bottom = 0.3                      # above the floor
     texture = "photo.jpg"             # a painter's name, or a picture beside this file
 
-All fields are those of the dataclasses in `sim.worlds.design`; what is left out keeps its default.
+All fields are those of the dataclasses in `mapweave.sim.worlds.design`; what is left out keeps its default.
 `docs/worlds.md` lists them together with all textures.
 """
 
@@ -41,11 +41,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from hybridmap.errors import SettingsError
-from sim.world import World
-from sim.worlds.build import build_world
-from sim.worlds.design import Design, Furniture, Poster, Room, Wall
-from wire.tables import build, read_toml
+from mapweave.hybridmap.errors import SettingsError
+from mapweave.sim.world import World
+from mapweave.sim.worlds.build import build_world
+from mapweave.sim.worlds.design import Design, Furniture, Poster, Room, Wall
+from mapweave.storage.settings_file import build, read_toml
 
 ITEMS: dict[str, type[Any]] = {"rooms": Room, "walls": Wall, "furniture": Furniture, "posters": Poster}
 """Lists of a file, and what each of their tables is."""

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.floorplan import FloorPlan, Rectangle
-from sim.furnishing import Site, against_wall, standing
-from sim.worlds.design import Furniture
-from sim.worlds.layout import piece_rectangle
+from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.furnishing import Site, against_wall, standing
+from mapweave.sim.worlds.design import Furniture
+from mapweave.sim.worlds.layout import piece_rectangle
 
 CROWDED = 0.475
 """Centres of furniture are farther apart than this share of their lengths together."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridmap.pose import Array
-from sim.floorplan import FloorPlan, distances_to
-from sim.worlds.design import DARK, Design, Room, floor_area
-from sim.worlds.layout import exact
-from sim.worlds.light import Vector
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.floorplan import FloorPlan, distances_to
+from mapweave.sim.worlds.design import DARK, Design, Room, floor_area
+from mapweave.sim.worlds.layout import exact
+from mapweave.sim.worlds.light import Vector
 
 SPACING = 3.2
 """Lamps hang about this far apart, m."""

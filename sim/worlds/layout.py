@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from hybridmap.pose import Array
-from sim.floorplan import FloorPlan, Rectangle
-from sim.worlds.design import Design, Furniture, Room, Wall
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.worlds.design import Design, Furniture, Room, Wall
 
 QUANTUM = 2.0**-20
 """Panels and lamps are placed to a millionth of a metre: a world moved by whole metres is then drawn the same

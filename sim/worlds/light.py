@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.pose import Array
-from sim.texture import Image, Painter
+from mapweave.hybridmap.pose import Array
+from mapweave.sim.texture import Image, Painter
 
 Vector = tuple[float, float, float]
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.world import World
-from sim.worlds.build import build_world
-from sim.worlds.design import THICKNESS, Design, Furniture, Room, Wall, within
-from sim.worlds.furniture import STOCK, furnish
-from sim.worlds.layout import plan_of
+from mapweave.sim.world import World
+from mapweave.sim.worlds.build import build_world
+from mapweave.sim.worlds.design import THICKNESS, Design, Furniture, Room, Wall, within
+from mapweave.sim.worlds.furniture import STOCK, furnish
+from mapweave.sim.worlds.layout import plan_of
 
 DOOR = 1.0
 """Width of doorways, m."""

@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridmap.errors import InvalidValue
-from sim import print as printed
-from sim import shelving, signage, surface
-from sim.texture import Image, Painter
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim import printed_textures as printed
+from mapweave.sim import shelving, signage, surface
+from mapweave.sim.texture import Image, Painter
 
 MAX_IMAGE_PX = 8192
 """Pictures have at most so many pixels across and down."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.worlds.design import THICKNESS, Design, Point, Room, Wall, within
-from sim.worlds.furniture import STOCK, furnish
-from sim.worlds.layout import plan_of
+from mapweave.sim.worlds.design import THICKNESS, Design, Point, Room, Wall, within
+from mapweave.sim.worlds.furniture import STOCK, furnish
+from mapweave.sim.worlds.layout import plan_of
 
 HALF = THICKNESS / 2
 DOOR = 1.0

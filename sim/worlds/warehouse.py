@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.worlds.design import THICKNESS, Design, Furniture, Poster, Room, Wall, within
-from sim.worlds.furniture import furnish
-from sim.worlds.layout import plan_of
+from mapweave.sim.worlds.design import THICKNESS, Design, Furniture, Poster, Room, Wall, within
+from mapweave.sim.worlds.furniture import furnish
+from mapweave.sim.worlds.layout import plan_of
 
 HALF = THICKNESS / 2
 HEIGHT = 3.2

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import skimage.data
 
-from agent.mapping.mapper import Mapper
-from agent.observation import Observation, Odometry, RobotDescription
-from hybridmap.camera import Camera
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, Node
-from hybridmap.pose import Pose2
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.pose import Pose2
 from synthetic.world import World
 from tests.agent.scripted_fleet import home_map, home_world
 
@@ -57,7 +57,7 @@ class PhotoWalls:
         return image
 
     def observe(self, before: Pose2, now: Pose2, tick: int) -> Observation:
-        """What a robot with perfect wheels senses after moving from one posture to another."""
+        """What a robot with perfect wheels senses after moving from one pose to another."""
         moved = before.inverse() @ now
         forward = float(np.hypot(moved.x, moved.y)) * (1.0 if moved.x >= 0 else -1.0)
         return Observation(tick * 100_000_000, Odometry(forward, moved.heading), self.render(now))

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from agent.observation import Observation, Odometry, RobotDescription
-from agent.pipeline import Pipeline, Step
-from hybridmap.camera import Camera
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2
-from wire.codec import encode_body
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.wire.codec import encode_body
 
 MAP = MapId("r0", 1)
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 24, endpoint=False).tolist())

@@ -8,23 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from agent.mission import Answer, Question
-from agent.navigating.navigator import Navigator, NavigatorSettings
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteLeg, Whereabouts
-from synthetic.world import (
-    CAMERA,
-    World,
-    room,
-    take_map,
-    take_view,
-)
-from vision.lens import Lens
-from vision.sift import Features
+from mapweave.agent.mission import Answer, Question
+from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteLeg, Whereabouts
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Features
+from synthetic.world import CAMERA, World, room, take_map, take_view
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
 BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.mapping.mapper import Mapper, MapperSettings
-from hybridmap.change import Change, NodePut
-from hybridmap.errors import InvalidValue, SettingsError
-from hybridmap.node import MapId, Node
-from wire.codec import decode_body, encode_body, encode_change
-from wire.tables import build
+from mapweave.agent.mapping.mapper import Mapper, MapperSettings
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.node import MapId, Node
+from mapweave.storage.settings_file import build
+from mapweave.wire.codec import decode_body, encode_body, encode_change
 
 FRAMING = 80
 """What the transport adds."""

@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from agent.mission import Answer, Question, WhichWay
-from agent.motion_primitives import NO_ANSWER, MotionPrimitives
-from agent.observation import Observation, Odometry, RobotDescription
-from hybridmap.camera import Camera
-from hybridmap.node import NodeId
-from hybridmap.query import RouteAnswer
+from mapweave.agent.mission import Answer, Question, WhichWay
+from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.query import RouteAnswer
 
 BODY = RobotDescription(Camera(64, 48, 60, 60, 32, 24, 0.3), tick=0.1)
 HERE, THERE = NodeId("r0", 1, 1), NodeId("r1", 1, 1)

@@ -7,16 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agent.mapping import cartographer
-from agent.mapping.cartographer import Cartographer, CartographerSettings
-from agent.mapping.mapper import Mapper
-from agent.observation import Command, RobotDescription
-from hybridmap.camera import Camera
-from hybridmap.change import NodePut
-from hybridmap.node import Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from sim.simulation import Simulation
-from sim.worlds.catalog import make_world
+from mapweave.agent.mapping import keyframe_builder
+from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder, KeyframeBuilderSettings
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.worlds.catalog import make_world
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 
@@ -42,9 +42,9 @@ def test_backing_away_from_a_near_wall_is_no_slip(seed, aside):
     assert worst < 0.02
 
 
-def node(number: int, posture: PoseGaussian) -> Node:
+def node(number: int, pose: PoseGaussian) -> Node:
     empty = Landmarks.empty()
-    return Node(NodeId("r0", 1, number), number, posture, CAMERA, empty)
+    return Node(NodeId("r0", 1, number), number, pose, CAMERA, empty)
 
 
 @pytest.mark.parametrize(("off", "closed"), [(0.0, True), (0.05, True), (0.6, False), (1.8, False)])
@@ -54,10 +54,10 @@ def test_a_loop_must_agree_with_the_way_there(monkeypatch, off, closed):
     earlier = PoseGaussian.from_sigmas(Pose2(2.0, 1.0, -0.7), 0.3, 0.1)
     back = PoseGaussian.from_sigmas(along.mean.inverse() @ Pose2(0.4, 0.1, 0.1), 0.05, 0.02)
     later = earlier @ along @ back
-    made = Cartographer(
+    made = KeyframeBuilder(
         MapId("r0", 1),
         RobotDescription(camera=CAMERA),
-        CartographerSettings(),
+        KeyframeBuilderSettings(),
         [NodePut(node(1, earlier))],
         next_number=2,
     )
@@ -66,6 +66,6 @@ def test_a_loop_must_agree_with_the_way_there(monkeypatch, off, closed):
     recognition = SimpleNamespace(
         node_from_robot=found, pairs=np.zeros((0, 2), np.int64), evidence={"sigma_xy": 0.02, "inliers": 29.0}
     )
-    monkeypatch.setattr(cartographer, "register", lambda *arguments: recognition)
+    monkeypatch.setattr(keyframe_builder, "register", lambda *arguments: recognition)
     edges = made._close_loops(node(5, later))
     assert bool(edges) == closed

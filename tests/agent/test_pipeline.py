@@ -7,16 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from agent.global_localization.pose_consistency import ConsistencySettings
-from agent.global_localization.settings import ResumptionSettings
-from agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
-from agent.observation import Command, Observation, Odometry
-from agent.pipeline import Pipeline, PipelineSettings, Step
-from hybridmap.change import NodePut
-from hybridmap.node import Edge, EdgeKind, NodeId
-from hybridmap.pose import Pose2
+from mapweave.agent.global_localization.pose_consistency import ConsistencySettings
+from mapweave.agent.global_localization.settings import ResumptionSettings
+from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
+from mapweave.agent.observation import Command, Observation, Odometry
+from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.wire.codec import encode_body
 from tests.agent.ranged_body import BEARINGS, BODY, MAP, ROOM, essence, live, on, rangers, still
-from wire.codec import encode_body
 
 # The same again
 
@@ -250,7 +250,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
 
     Args:
         walls: the world.
-        places: postures that it is carried through afterwards.
+        places: poses that it is carried through afterwards.
 
     Returns:
         The pipeline, what was in its map before, and the steps since.

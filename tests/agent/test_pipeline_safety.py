@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from agent.exploring.explorer import Explorer
-from agent.mission import Explore
-from agent.observation import Command
-from agent.pipeline import Pipeline
+from mapweave.agent.exploration.explorer import Explorer
+from mapweave.agent.mission import Explore
+from mapweave.agent.observation import Command
+from mapweave.agent.pipeline import Pipeline
 from tests.agent.ranged_body import BEARINGS, BODY, ROOM, live, on, still
 
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agent.drivers.messages import (
+from mapweave.agent.drivers.messages import (
     AGAIN,
     ENDED,
     StepRequest,
@@ -25,14 +25,14 @@ from agent.drivers.messages import (
     encode_observation,
     encode_step,
 )
-from agent.drivers.remote import ASK_TIMEOUT, PATIENCE, RemoteRobot
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from hybridmap.camera import Camera
-from hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
-from mapweave import sim_process
-from wire.bus import Request
-from wire.keys import Keys
-from wire.memory import MemoryBus, MemoryHub
+from mapweave.agent.drivers.remote import ASK_TIMEOUT, PATIENCE, RemoteRobot
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
+from mapweave.processes import simulator
+from mapweave.wire.bus import Request
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 
 DESCRIPTION = RobotDescription(
     camera=Camera(width=320, height=240, fx=277.1, fy=276.9, cx=159.4, cy=119.6, mount_height=0.3),
@@ -254,7 +254,7 @@ def test_commands_are_clipped_and_travel_with_the_next_step(body: Body, bus: Mem
 def test_silence_and_a_busy_bus_are_asked_again_under_the_same_number(
     body: Body, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("agent.drivers.remote.ASK_TIMEOUT", 0.05)
+    monkeypatch.setattr("mapweave.agent.drivers.remote.ASK_TIMEOUT", 0.05)
     body.answers = [reply, silence, lambda r: r.refuse(f"too busy, {AGAIN}"), reply]
     robot = RemoteRobot(bus, "test", "r0")
     assert robot.sense() is not None
@@ -330,7 +330,7 @@ def test_who_is_stopped_while_it_waits_does_not_say_that_a_simulation_ended(bus:
 
 
 def test_nobody_gives_up_a_simulated_body_that_waits_for_another_robot() -> None:
-    assert sim_process.PATIENCE + ASK_TIMEOUT < PATIENCE
+    assert simulator.PATIENCE + ASK_TIMEOUT < PATIENCE
 
 
 def test_two_bodies_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus) -> None:

@@ -13,13 +13,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agent.drivers.replay import Replay, read_camera
-from agent.mission import Carried
-from agent.observation import Command, Odometry
-from agent.pipeline import Pipeline
-from hybridmap.errors import DeviceError
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2
+from mapweave.agent.drivers.replay import Replay, read_camera
+from mapweave.agent.mission import Carried
+from mapweave.agent.observation import Command, Odometry
+from mapweave.agent.pipeline import Pipeline
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
 
 COUNT = 14
 TURNS = [0.0, *(0.01 * math.sin(k) for k in range(1, COUNT))]

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.mission import Explore, GoTo
-from agent.observation import Command
-from agent.pipeline import Pipeline
-from agent.sharing.journal import Journal
-from agent.sharing.kept import Kept
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, wrap_angle
-from sim.simulation import Simulation
-from sim.world import World
-from sim.worlds.office import make_office
-from wire.codec import encode_body
+from mapweave.agent.mission import Explore, GoTo
+from mapweave.agent.observation import Command
+from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
+from mapweave.sim.worlds.office import make_office
+from mapweave.wire.codec import encode_body
 
 ROBOT = "r0"
 SEED = 3
@@ -51,7 +51,7 @@ class Life:
 
     def born(self) -> None:
         """Start an agent with what is in the journal."""
-        kept = Kept.of(self.journal, self._map)
+        kept = RetainedMap.of(self.journal, self._map)
         self.pipeline = Pipeline(self._map, self.sim.describe(ROBOT), None, kept.contents, kept.next_number)
         self.pipeline.set_mission(Explore())
 
@@ -161,7 +161,7 @@ def test_an_agent_that_was_killed_goes_on_with_its_map(
 
 def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, Pose2]]) -> None:
     life, _ = again
-    kept, now = HybridMap(Kept.of(life.journal, MapId(ROBOT, 1)).contents), life.pipeline.map
+    kept, now = HybridMap(RetainedMap.of(life.journal, MapId(ROBOT, 1)).contents), life.pipeline.map
     assert list(kept.nodes) == list(now.nodes)
     assert list(kept.edges) == list(now.edges)
     for number, node in now.nodes.items():

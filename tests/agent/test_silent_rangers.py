@@ -7,16 +7,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from agent.drivers.messages import decode_observation, encode_observation
-from agent.mission import Carried, Explore, GoTo, Idle
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from agent.pipeline import Pipeline, Step
-from agent.ranger_monitor import RangerMonitor
-from hybridmap.camera import Camera
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2
-from sim.simulation import Simulation
-from sim.worlds.catalog import make_world
+from mapweave.agent.drivers.messages import decode_observation, encode_observation
+from mapweave.agent.mission import Carried, Explore, GoTo, Idle
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.ranger_monitor import RangerMonitor
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.worlds.catalog import make_world
 from tests.agent.ranged_body import BODY, MAP, on, rangers
 
 Broken = Callable[[np.ndarray], np.ndarray]

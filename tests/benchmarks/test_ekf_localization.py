@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from synthetic.localization_run import (
-    FEW,
-    Place,
-    draw_place,
-    drive,
-    try_drives,
-    try_start,
-)
+from synthetic.localization_run import FEW, Place, draw_place, drive, try_drives, try_start
 
 
 def test_a_place_knows_how_far_off_it_is() -> None:
@@ -41,7 +34,7 @@ def test_starts_with_few_landmarks_in_view_are_among_them() -> None:
 
 
 def test_a_start_is_judged_from_its_nineteenth_step_on() -> None:
-    """A map that is wrong by a metre everywhere leaves the posture wrong, whenever it is judged."""
+    """A map that is wrong by a metre everywhere leaves the pose wrong, whenever it is judged."""
     place = draw_place(np.random.default_rng(33))
     wrong = np.random.default_rng(1).normal(size=place.true.shape)
     nowhere = Place(place.true, place.true + wrong, 1e4 * place.covariances)

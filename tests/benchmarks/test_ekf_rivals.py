@@ -6,21 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.ekf_speed import benchmark as ekf_speed
-from benchmarks.ekf_speed.benchmark import (
-    Ours,
-    Theirs,
-    gap,
-    plain,
-    race,
-)
+from benchmarks.ekf_speed.benchmark import Ours, Theirs, gap, plain, race
 from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
-from hybridmap.camera import Camera
-from synthetic.mapping_run import (
-    AXLE,
-    SHAPES,
-    WHEEL_NOISE,
-    draw_run,
-)
+from mapweave.hybridmap.camera import Camera
+from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, draw_run
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.08)
 

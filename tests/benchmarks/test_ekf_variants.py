@@ -9,28 +9,21 @@ import sys
 import numpy as np
 import pytest
 
-from agent.ekf.mapping import FilterSettings
 from benchmarks.ekf_speed.benchmark import Ours, gap, plain
-from benchmarks.ekf_variants.benchmark import (
-    OURS,
-    TEXTBOOK,
-    Outcome,
-    main,
-    summary,
-    try_textbook,
-)
+from benchmarks.ekf_variants.benchmark import OURS, TEXTBOOK, Outcome, main, summary, try_textbook
 from benchmarks.ekf_variants.coordinates import (
     Coordinates,
     Points,
     Rays,
-    from_posture,
+    from_pose,
     in_robot,
     jacobian,
     of_robot,
 )
 from benchmarks.ekf_variants.textbook import Choice, TextbookFilter
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2
+from mapweave.agent.ekf.mapping_filter import FilterSettings
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
 from synthetic.mapping_run import MappingRun, draw_run
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.08)
@@ -50,13 +43,13 @@ def followed(run: MappingRun, choice: Choice) -> TextbookFilter:
 
 @pytest.mark.parametrize("chart", CHARTS)
 def test_a_moved_camera_sees_what_the_camera_model_projects(chart: Coordinates) -> None:
-    """Charts and motion against hybridmap's camera and postures, which share no formula with them."""
+    """Charts and motion against hybridmap's camera and poses, which share no formula with them."""
     rng = np.random.default_rng(1)
     points = AHEAD.back_project(rng.uniform(40, 200, (6, 2)), rng.uniform(2, 5, 6))
     pose = Pose2(0.4, -0.3, 0.2)
     landmarks = chart.drop(of_robot(points, AHEAD))
     assert np.allclose(in_robot(chart.lift(landmarks), AHEAD), points)
-    seen = from_posture(chart.lift(landmarks), pose.vector, AHEAD.mount_forward)
+    seen = from_pose(chart.lift(landmarks), pose.vector, AHEAD.mount_forward)
     pixels = seen[:, :2] / seen[:, 2:3] * (AHEAD.fx, AHEAD.fy) + (AHEAD.cx, AHEAD.cy)
     assert np.allclose(pixels, AHEAD.project(pose.inverse().apply(points)))
 
@@ -67,7 +60,7 @@ def test_complex_steps_are_derivatives(chart: Coordinates) -> None:
     landmarks = np.array([[0.2, -0.1, 1.4], [-0.3, 0.2, 0.6]])
 
     def moved(x: np.ndarray) -> np.ndarray:
-        return chart.drop(from_posture(chart.lift(x), np.array([0.1, -0.05, 0.1]), 0.08))
+        return chart.drop(from_pose(chart.lift(x), np.array([0.1, -0.05, 0.1]), 0.08))
 
     numeric = [(moved(landmarks + d) - moved(landmarks - d)) / 2e-6 for d in 1e-6 * np.eye(3)]
     assert np.abs(jacobian(moved, landmarks) - np.stack(numeric, axis=-1)).max() < 1e-8

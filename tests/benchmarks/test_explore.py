@@ -8,34 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.explore.area import (
-    REACH,
-    SQUARE,
-    Look,
-    MappedFloor,
-    floor_squares,
-    mapped_floor,
-    shows,
-)
-from benchmarks.explore.benchmark import (
-    STRATEGIES,
-    Exploration,
-    figures,
-    measure,
-    table,
-)
+from benchmarks.explore.area import REACH, SQUARE, Look, MappedFloor, floor_squares, mapped_floor, shows
+from benchmarks.explore.benchmark import STRATEGIES, Exploration, figures, measure, table
 from benchmarks.explore.picture import draw
-from benchmarks.explore.start import (
-    APART,
-    NEAR,
-    gathered,
-    office,
-)
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Pose2
-from mapweave.scoring import crossed
-from sim.floorplan import FloorPlan, Rectangle
-from sim.worlds.office import make_office
+from benchmarks.explore.start import APART, NEAR, gathered, office
+from mapweave.evaluation.map_score import crossed
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.worlds.office import make_office
 
 PLAN = FloorPlan(
     rooms=(Rectangle.spanning(0, 0, 8, 4, "hall"),),

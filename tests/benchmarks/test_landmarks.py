@@ -13,15 +13,9 @@ import pytest
 from benchmarks.images.known_warps import load, warp
 from benchmarks.landmarks import benchmark as landmarks
 from benchmarks.landmarks.benchmark import Tally, figures, node_figures
-from benchmarks.landmarks.pairs import (
-    _room_pair,
-    _warped_pair,
-    camera_of,
-    epipolar,
-    folder_pairs,
-)
+from benchmarks.landmarks.pairs import _room_pair, _warped_pair, camera_of, epipolar, folder_pairs
 from benchmarks.landmarks.rivals import Packed, features
-from hybridmap.errors import InvalidFile
+from mapweave.hybridmap.errors import InvalidFile
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:

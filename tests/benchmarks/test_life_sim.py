@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.life_sim.benchmark import Fleet, main
-from hybridmap.node import MapId
-from sim.floorplan import distances_to
+from mapweave.hybridmap.node import MapId
+from mapweave.sim.floorplan import distances_to
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.life_year.benchmark import run
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
 from synthetic.drives import DriveSettings, drives
 from synthetic.fleet import FleetSettings
 

@@ -12,24 +12,18 @@ import cv2
 import numpy as np
 import pytest
 
-from agent.ekf.landmarks import LandmarkEstimates
-from agent.ekf.mapping import FilterSettings
-from agent.observation import Odometry
 from benchmarks.images.surface_points import Surfaces
 from benchmarks.mapping_run.benchmark import main, notes
 from benchmarks.mapping_run.scene import MappingDrive, Moment, drive
-from benchmarks.mapping_run.score import (
-    LastKnown,
-    figures,
-    landmark_nees,
-    reprojection_errors,
-    track_errors,
-)
-from hybridmap.pose import Pose2, PoseGaussian
-from sim.camera import WEBCAM
-from sim.robots import RobotSetup
-from sim.world import Panel
-from sim.worlds.catalog import make_world
+from benchmarks.mapping_run.score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
+from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
+from mapweave.agent.ekf.mapping_filter import FilterSettings
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.sim.camera import WEBCAM
+from mapweave.sim.robots import RobotSetup
+from mapweave.sim.world import Panel
+from mapweave.sim.worlds.catalog import make_world
 
 PICTURES = ("fig7.png", "fig8.png", "landmarks.png", "map.png", "view.png")
 

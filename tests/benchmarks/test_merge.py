@@ -8,18 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.merge.robots import kept_links
-from hybridmap.errors import InvalidFile
-from hybridmap.pose import Pose2
-from mapweave.g2o import G2oEdge, G2oGraph
-from merge.merging import merge_maps
+from mapweave.formats.g2o import G2oEdge, G2oGraph
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.merging import merge_maps
 from synthetic.fleet import FleetSettings, draw_fleet
 from synthetic.merge_rivals import RIVALS, error, oracle
-from synthetic.pose_graph import (
-    batch_optimum,
-    chi2_of,
-    factors_of,
-    split,
-)
+from synthetic.pose_graph import batch_optimum, chi2_of, factors_of, split
 
 SMALL = FleetSettings(robots=3, nodes=25, side=7.0, true_links=15)
 

@@ -5,10 +5,10 @@ import pytest
 from rich.progress import Progress
 
 from benchmarks.merge.scale import at_size, scale
-from hybridmap.change import NodePut
-from hybridmap.errors import InvalidValue
-from merge.graph.links import Link
-from merge.graph.verification import verify
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.verification import verify
 from synthetic.building import Building
 
 

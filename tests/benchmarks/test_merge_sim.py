@@ -10,22 +10,16 @@ import pytest
 from rich.console import Console
 
 from benchmarks.merge_sim import benchmark as merge_sim
-from benchmarks.merge_sim.benchmark import (
-    Failure,
-    figures,
-    measure,
-    outcome,
-    summary,
-)
+from benchmarks.merge_sim.benchmark import Failure, figures, measure, outcome, summary
 from benchmarks.merge_sim.run import Run, false_merges
 from benchmarks.merge_sim.views import lengths, views_shared
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2
-from sim.camera import WEBCAM
-from sim.renderer import Renderer
-from sim.texture import Texture
-from sim.world import PanelSet, World
-from sim.worlds.catalog import make_world
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.camera import WEBCAM
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.texture import Texture
+from mapweave.sim.world import PanelSet, World
+from mapweave.sim.worlds.catalog import make_world
 
 RUN = Run("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 40, 8, 10, 8, 7, 0.7, 150.0, 90.0)
 

@@ -11,29 +11,24 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from agent.mission import GoTo
-from agent.pipeline import Status
-from agent.report import AgentReport
-from agent.tally import Tally
 from benchmarks.navigate.benchmark import main, summary
-from benchmarks.navigate.drives import (
-    PATIENCE,
-    Outcome,
-    _reason,
-    drive,
-)
+from benchmarks.navigate.drives import PATIENCE, Outcome, _reason, drive
 from benchmarks.navigate.floor import Floor
 from benchmarks.navigate.office import Mapped
 from benchmarks.navigate.plots import LEAST_EDGES, Plot, draw_plot
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.errors import InvalidValue
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, wrap_angle
-from mapweave.scoring import crossed
-from sim.control import RobotStatus, SimStatus
-from sim.floorplan import FloorPlan, Rectangle
-from sim.snapshot import Snapshot
+from mapweave.agent.drive_statistics import DriveStatistics
+from mapweave.agent.mission import GoTo
+from mapweave.agent.pipeline import Status
+from mapweave.agent.status_message import AgentStatus
+from mapweave.evaluation.map_score import crossed
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.ground_truth_client import RobotStatus, SimStatus
+from mapweave.sim.snapshot import Snapshot
 from synthetic.world import room, take_map
 
 RADIUS = 0.17
@@ -121,14 +116,14 @@ def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: Floor) -> Non
 def outcome(mapped: Mapped, **other: object) -> Outcome:
     goal = max(mapped.truth)
     plot = Plot(Pose2(0.5, 0.5), goal, mapped.truth[goal], 5, 2.0)
-    status = Status("parked at the goal", "", 10, 0, Pose2(), True, tally=Tally(4, 1, 2, 0))
+    status = Status("parked at the goal", "", 10, 0, Pose2(), True, tally=DriveStatistics(4, 1, 2, 0))
     picture = np.zeros((4, 4), np.uint8)
     one = Outcome(plot, status, "", 1.0, 30.0, 0.004, 0.3, 0, 3.0, (), picture, picture, np.zeros((2, 2)))
     return replace(one, **other)  # type: ignore[arg-type]
 
 
 def test_figures_count_failures_as_such(mapped: Mapped) -> None:
-    away = Status("driving along the route", "", 10, 0, Pose2(), False, tally=Tally(1, 0, 1, 3))
+    away = Status("driving along the route", "", 10, 0, Pose2(), False, tally=DriveStatistics(1, 0, 1, 3))
     outcomes = [
         outcome(mapped),
         outcome(mapped, error_m=0.006, driven=2.2),
@@ -169,7 +164,7 @@ class FakeOffice:
     def kidnap(self, robot: str, pose: Pose2) -> None:
         self.poses[-1] = pose
 
-    def advance(self, seconds: float) -> AgentReport:
+    def advance(self, seconds: float) -> AgentStatus:
         for _ in range(round(10 * seconds)):
             step = 0.01 if self.going and self.ticks - self.begin > 10 else 0.0
             pose = self.poses[-1]
@@ -181,7 +176,7 @@ class FakeOffice:
             "parked" if there else "looking" if lost else "driving", "so far", 5, 0, Pose2(), there,
             fix_node=None if lost else NodeId("r0", 1, 1),
         )  # fmt: skip
-        return AgentReport(status, 0)
+        return AgentStatus(status, 0)
 
     def status(self) -> SimStatus:
         return SimStatus(self.ticks, 0, {"r0": RobotStatus(self.poses[-1], self.collisions, True)})

@@ -8,15 +8,8 @@ import pytest
 
 from benchmarks.parking import benchmark as parking
 from benchmarks.parking.run import LEAST_VISIBLE, park
-from benchmarks.parking.scene import (
-    AHEAD,
-    FARTHEST,
-    LEAST_SEEN,
-    MOST_TURNED,
-    NEAREST,
-    Scene,
-)
-from hybridmap.pose import Pose2
+from benchmarks.parking.scene import AHEAD, FARTHEST, LEAST_SEEN, MOST_TURNED, NEAREST, Scene
+from mapweave.hybridmap.pose import Pose2
 
 
 @pytest.fixture(scope="module")

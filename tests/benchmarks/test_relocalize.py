@@ -13,43 +13,21 @@ from benchmarks.relocalize import pictures as relocalize_pictures
 from benchmarks.relocalize.distractors import Differences, Distractors
 from benchmarks.relocalize.exhaustive import Exhaustive, asked_of, lost
 from benchmarks.relocalize.peer import Vocabulary, WordIndex
-from benchmarks.relocalize.pictures import (
-    Disturbance,
-    Photographer,
-    Picture,
-    Wish,
-    taken,
-)
-from benchmarks.relocalize.places import (
-    Place,
-    placed,
-    spread_out,
-    twin_lookouts,
-)
+from benchmarks.relocalize.pictures import Disturbance, Photographer, Picture, Wish, taken
+from benchmarks.relocalize.places import Place, placed, spread_out, twin_lookouts
 from benchmarks.relocalize.queries import Query, beside
-from benchmarks.relocalize.score import (
-    Reply,
-    ask,
-    figures,
-    judged,
-    spent,
-)
-from hybridmap.descriptor import decode, root_sift
-from hybridmap.node import MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
-from mapserver.places.placeindex import PlaceIndex
-from mapserver.relocalizing.belief import Support
-from mapserver.relocalizing.relocalization import Relocalizer
-from merge.graph.merged import MergedMap
-from registration.matching import MatchSettings, match_vectors
-from sim.worlds.catalog import make_world
-from synthetic.world import (
-    CAMERA,
-    room,
-    take_map,
-    take_view,
-)
+from benchmarks.relocalize.score import Reply, ask, figures, judged, spent
+from mapweave.hybridmap.descriptor import decode, root_sift
+from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
+from mapweave.mapserver.relocalization.calibration import HypothesisSupport
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.registration.matching import MatchSettings, match_vectors
+from mapweave.sim.worlds.catalog import make_world
+from synthetic.world import CAMERA, room, take_map, take_view
 
 
 def picture_of(sift: np.ndarray) -> Picture:
@@ -229,7 +207,7 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
     rng = np.random.default_rng(11)
     weights = np.array([-2.0, 1.2, 1.0, 1.5, 0.4, -2.5])
     supports = [
-        Support(
+        HypothesisSupport(
             int(rng.integers(10, 90)), rng.random(), rng.random(), int(rng.integers(1, 4)), 2 * rng.random()
         )
         for _ in range(8_000)

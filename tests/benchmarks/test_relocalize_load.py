@@ -11,16 +11,11 @@ import numpy as np
 import pytest
 
 from benchmarks.relocalize_load import benchmark as relocalize_load
-from benchmarks.relocalize_load.benchmark import (
-    Building,
-    Tally,
-    figures,
-    is_right,
-)
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, Whereabouts
-from wire.messages import encode_relocalize_answer
+from benchmarks.relocalize_load.benchmark import Building, Tally, figures, is_right
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, Whereabouts
+from mapweave.wire.messages import encode_relocalize_answer
 
 
 def test_figures_by_hand() -> None:

@@ -8,11 +8,11 @@ import numpy as np
 from benchmarks.relocalize.distractors import Differences, Distractors
 from benchmarks.relocalize.places import Place
 from benchmarks.relocalize_start.store import fill
-from hybridmap.change import NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2
-from mapserver.log.store import Store
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.log.store import Store
 from synthetic.world import room, take_map
 
 

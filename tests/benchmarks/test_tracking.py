@@ -10,17 +10,11 @@ import numpy as np
 import pytest
 
 from benchmarks.tracking.benchmark import follow, main
-from benchmarks.tracking.scenes import (
-    TEXEL_PX,
-    Drive,
-    room_drive,
-    wall_drive,
-    wall_to_image,
-)
-from hybridmap.pose import Pose2
-from sim.camera import WEBCAM
-from vision.lens import Lens
-from vision.sift import Sift
+from benchmarks.tracking.scenes import TEXEL_PX, Drive, room_drive, wall_drive, wall_to_image
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.camera import WEBCAM
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

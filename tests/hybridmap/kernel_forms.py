@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from hybridmap.jit import KERNELS
+from mapweave.hybridmap.jit import KERNELS
 
 
 @contextmanager

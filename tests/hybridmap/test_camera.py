@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.node import Landmarks
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import Landmarks
 
 CAMERA = Camera(320, 240, 280.0, 270.0, 161.0, 118.0, mount_height=0.3, mount_forward=0.1)
 

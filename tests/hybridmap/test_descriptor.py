@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import skimage.data
 
-from hybridmap.descriptor import ZERO, decode, encode, project, quantise, root_sift, rounding_noise
-from hybridmap.descriptor_v1 import _tables_v1, renew, restore_v1
-from hybridmap.errors import InvalidFile, InvalidValue
-from hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, landmark_tables
-from registration.matching import match, match_vectors
+from mapweave.hybridmap.descriptor import ZERO, decode, encode, project, quantise, root_sift, rounding_noise
+from mapweave.hybridmap.descriptor_v1 import _tables_v1, renew, restore_v1
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, landmark_tables
+from mapweave.registration.matching import match, match_vectors
 
 
 def fake_sift(n: int, seed: int) -> np.ndarray:

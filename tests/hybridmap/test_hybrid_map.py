@@ -4,10 +4,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from synthetic.world import CAMERA
 
 

@@ -12,7 +12,7 @@ import pytest
 MODULE = """
 from typing import NamedTuple
 import numpy as np
-from hybridmap.jit import Index, Matrix, Vector, compiled, for_each, for_each_pair
+from mapweave.hybridmap.jit import Index, Matrix, Vector, compiled, for_each, for_each_pair
 
 class Scale(NamedTuple):
     by: float

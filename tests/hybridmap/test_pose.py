@@ -1,4 +1,4 @@
-"""Planar postures: group axioms, first order calculus against finite differences and sampling."""
+"""Planar poses: group axioms, first order calculus against finite differences and sampling."""
 
 import math
 
@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Pose2, PoseGaussian, wrap_angle
-from registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
+from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 
 metres = st.floats(-50, 50)
 angles = st.floats(-10, 10)
@@ -126,7 +126,7 @@ def accepted(covariance: np.ndarray) -> bool:
     return True
 
 
-def test_arrays_agree_with_single_postures() -> None:
+def test_arrays_agree_with_single_poses() -> None:
     rng = np.random.default_rng(7)
     one = [
         PoseGaussian(Pose2.from_vector(rng.normal(0, 2, 3)), random_covariance(rng, 0.1)) for _ in range(20)

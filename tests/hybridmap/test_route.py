@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.route import RouteSettings, edge_cost, find_route
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.route import RouteSettings, edge_cost, find_route
 from synthetic.world import CAMERA
 
 
@@ -39,17 +39,17 @@ def random_map(seed: int, n: int = 14, m: int = 22) -> HybridMap:
 def test_costs_no_more_than_dijkstra(seed: int, optimised: bool) -> None:
     one = random_map(seed)
     rng = np.random.default_rng(seed)
-    postures = {i: n.map_from_robot.mean for i, n in one.nodes.items()}
+    poses = {i: n.map_from_robot.mean for i, n in one.nodes.items()}
     if optimised:
-        postures = {i: p @ Pose2(*rng.normal(0, 1.0, 3)) for i, p in postures.items()}
+        poses = {i: p @ Pose2(*rng.normal(0, 1.0, 3)) for i, p in poses.items()}
     penalties = {edge_id: float(rng.uniform(0, 3)) for edge_id in one.edges}
     graph: nx.MultiGraph = nx.MultiGraph()
     for e in one.edges.values():
-        cost = edge_cost(e, postures, True, RouteSettings()) + penalties[e.id]
-        assert cost >= postures[e.a].distance(postures[e.b])
+        cost = edge_cost(e, poses, True, RouteSettings()) + penalties[e.id]
+        assert cost >= poses[e.a].distance(poses[e.b])
         graph.add_edge(e.a, e.b, weight=cost)
     start, goal = NodeId("r0", 1, 0), NodeId("r0", 1, 13)
-    found = find_route(one, start, goal, postures=postures if optimised else None, penalties=penalties)
+    found = find_route(one, start, goal, poses=poses if optimised else None, penalties=penalties)
     if start in graph and goal in graph and nx.has_path(graph, start, goal):
         assert found.cost == pytest.approx(nx.dijkstra_path_length(graph, start, goal))
         assert found.nodes[0] == start and found.nodes[-1] == goal
@@ -124,7 +124,7 @@ def test_reasons() -> None:
     assert find_route(one, nodes[0].id, nodes[0].id).nodes == (nodes[0].id,)
     assert "nothing joins" in find_route(one, nodes[0].id, lonely.id).reason
     assert "not in the map" in find_route(one, nodes[0].id, NodeId("r9", 1, 1)).reason
-    assert "no posture" in find_route(one, nodes[0].id, nodes[1].id, postures={nodes[0].id: Pose2()}).reason
+    assert "no pose" in find_route(one, nodes[0].id, nodes[1].id, poses={nodes[0].id: Pose2()}).reason
 
 
 @settings(max_examples=40, deadline=None)
@@ -140,4 +140,4 @@ def test_closed_edges_are_as_if_they_were_not_there(seed: int) -> None:
     assert (found.nodes, found.edges) == (expected.nodes, expected.edges)
     assert found.cost == pytest.approx(expected.cost)
     if not found.nodes and find_route(one, start, goal).nodes:
-        assert "only ties postures" in found.reason
+        assert "only ties poses" in found.reason

@@ -9,21 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.query import View
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from synthetic.world import (
-    World,
-    room,
-    take_map,
-    take_view,
-)
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.codec import encode_change
+from mapweave.wire.memory import MemoryHub
+from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.played import HandAgent, Server
-from wire.codec import encode_change
-from wire.memory import MemoryHub
 
 ROBOT = MapId("r0", 1)
 
@@ -44,8 +39,8 @@ class MappedRoom:
 
     def view(self, node: NodeId, seed: int = 5) -> View:
         """What is seen a little beside a node."""
-        posture = self.truth[node] @ Pose2(0.1, 0.05, 0.05)
-        return take_view(self.world, posture, np.random.default_rng(seed))[0]
+        pose = self.truth[node] @ Pose2(0.1, 0.05, 0.05)
+        return take_view(self.world, pose, np.random.default_rng(seed))[0]
 
 
 @pytest.fixture(scope="session")

@@ -6,21 +6,21 @@ from itertools import pairwise
 
 import numpy as np
 
-from hybridmap.camera import Camera
-from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.descriptor import quantise
-from hybridmap.errors import InvalidValue
-from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Array, Pose2, PoseGaussian
-from hybridmap.ranges import Ranges
-from hybridmap.wake import Wake
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.wire.codec import decode_body, encode_body
 from synthetic.world import CAMERA, random_vectors
-from wire.codec import decode_body, encode_body
 
 EVIDENCE = ("inliers", "doubles", "matches", "share", "there", "back", "sigma_xy", "log_evidence")
 
 
-def posture(rng: np.random.Generator) -> PoseGaussian:
+def pose(rng: np.random.Generator) -> PoseGaussian:
     """Near or at the end of the world; its covariance nothing, of any rank, or enormous."""
     far = 10.0 ** rng.uniform(-2, 5, 2) * rng.choice([-1, 1], 2)
     near = rng.uniform(-3, 3, 2)
@@ -75,11 +75,13 @@ def ranges(rng: np.random.Generator) -> Ranges:
     return Ranges(rng.uniform(-3.1, 3.1, n), rng.uniform(0, reach, n), reach)
 
 
-def wake(rng: np.random.Generator, seen: Ranges) -> Wake:
+def wake(rng: np.random.Generator, seen: Ranges) -> TrajectorySegment:
     """Where the robot was before and after: anywhere."""
     n = int(rng.integers(1, 20))
     where = rng.uniform(-1, 1, (n, 3)) * [*([float(rng.choice([0.5, 20.0]))] * 2), 3.1]
-    return Wake(np.sort(rng.uniform(-60, 60, n)), where, rng.uniform(0, seen.reach, (n, len(seen))))
+    return TrajectorySegment(
+        np.sort(rng.uniform(-60, 60, n)), where, rng.uniform(0, seen.reach, (n, len(seen)))
+    )
 
 
 def node(rng: np.random.Generator, node_id: NodeId) -> Node:
@@ -88,9 +90,9 @@ def node(rng: np.random.Generator, node_id: NodeId) -> Node:
     seen = ranges(rng) if rng.random() < 0.4 else Ranges()
     stamp = int(rng.choice([0, 2**63 - 1])) if rng.random() < 0.2 else int(rng.integers(1, 10**12))
     return Node(
-        node_id, stamp, posture(rng), of, landmarks(rng, of), str(rng.choice(["", "utc"])),
+        node_id, stamp, pose(rng), of, landmarks(rng, of), str(rng.choice(["", "utc"])),
         float(rng.choice([0.0, 0.2, 100.0])), seen,
-        wake(rng, seen) if len(seen) and rng.random() < 0.6 else Wake(),
+        wake(rng, seen) if len(seen) and rng.random() < 0.6 else TrajectorySegment(),
     )  # fmt: skip
 
 
@@ -101,7 +103,7 @@ def edge(rng: np.random.Generator, edge_id: NodeId, ends: list[NodeId], counts: 
     shared = rng.integers(0, max(most, 1), (int(rng.integers(0, most + 1)), 2))
     names = rng.choice(EVIDENCE, int(rng.integers(0, 5)), replace=False)
     evidence = {str(name): float(10.0 ** rng.uniform(-3, rng.choice([3, 29]))) for name in names}
-    return Edge(edge_id, a, b, posture(rng), EdgeKind(rng.choice(list(EdgeKind))), shared, evidence)
+    return Edge(edge_id, a, b, pose(rng), EdgeKind(rng.choice(list(EdgeKind))), shared, evidence)
 
 
 def content(rng: np.random.Generator, map_id: MapId, others: list[NodeId]) -> list[ChangeBody]:

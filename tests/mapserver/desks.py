@@ -9,22 +9,22 @@ from functools import cache
 import cv2
 import numpy as np
 
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.errors import Busy
-from hybridmap.explanation import Explanation
-from hybridmap.history import Happening
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
-from mapserver.merging.merger import Merger
-from mapserver.route_explaining import explain_route
-from mapserver.routes import Router
-from merge.explaining.explanation import explain_nodes
-from merge.explaining.maps import explain_fleet, explain_maps
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.route_explaining import explain_route
+from mapweave.mapserver.routes import Router
+from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
+from mapweave.merge.explanation.node_explanation import explain_nodes
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.explanation_messages import ExplainRequest
+from mapweave.wire.log_messages import Scalar
 from synthetic.world import room, take_map
-from wire.explanation_messages import ExplainRequest
-from wire.log_messages import Scalar
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.1), 0.02, 0.01)
 ANSWER = RelocalizeAnswer(
@@ -48,12 +48,12 @@ class Desk:
         self.refusal: Exception | None = None
         self.answer = ANSWER
         self.holds: dict[str, Scalar] = {"nodes": 12, "summary": "12 nodes"}
-        self.happenings: tuple[Happening, ...] = ()
+        self.happenings: tuple[MapEvent, ...] = ()
 
     def status(self) -> dict[str, Scalar]:
         return self.holds
 
-    def history(self) -> tuple[Happening, ...]:
+    def history(self) -> tuple[MapEvent, ...]:
         return self.happenings
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hybridmap.change import Change, NodeRetired
-from hybridmap.node import MapId, NodeId
-from mapserver.log.agent_log import PullSettings
-from mapserver.log.ingest import Ingest, IngestSettings
-from mapserver.log.store import Store
-from wire.bus import Request
-from wire.codec import encode_change
-from wire.keys import Keys
-from wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark
-from wire.memory import MemoryBus, MemoryHub
+from mapweave.hybridmap.change import Change, NodeRetired
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.mapserver.log.agent_log import PullSettings
+from mapweave.mapserver.log.ingest import Ingest, IngestSettings
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.bus import Request
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark
+from mapweave.wire.memory import MemoryBus, MemoryHub
 
 KEYS = Keys("fleet")
 MAP = MapId("r0", 3)

@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, EdgePut, NodePut
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from mapserver.blockages import Blockages, BlockageSettings
-from mapserver.merging.merger import Merger
-from mapserver.routes import Router
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.blockages import Blockages, BlockageSettings
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.routes import Router
 from synthetic.world import room, take_map
 
 A, B, C = (NodeId("a", 1, number) for number in (1, 3, 5))

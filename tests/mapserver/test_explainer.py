@@ -12,40 +12,40 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.errors import InvalidValue
-from hybridmap.explanation import MapsExplanation, RouteExplanation, Standing
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.ruling import Ends, Ruling
-from mapserver.desk import Desk, DeskSettings
-from mapserver.explainer import Explainer, RulingBook
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from mapserver.mapfiles import map_file_of, maps_of, merged_of
-from mapserver.merging.merger import Merger
-from mapserver.routes import Router
-from mapserver.schedule import LockstepSchedule
-from mapserver.server import MapServer, ServerSettings
-from merge.belief.consistency import ConsistencySettings
-from merge.graph.merged import MergedMap
-from merge.merging import MergeSettings
-from synthetic.world import room, take_map
-from wire.bus import Reply
-from wire.codec import encode_change
-from wire.explanation_messages import (
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.explanation import MapsExplanation, RouteExplanation, Standing
+from mapweave.hybridmap.manual_constraint import Ends, ManualConstraint
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
+from mapweave.mapserver.explainer import Explainer, RulingBook
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.map_files import map_file_of, maps_of, merged_of
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.routes import Router
+from mapweave.mapserver.schedule import LockstepSchedule
+from mapweave.mapserver.server import MapServer, ServerSettings
+from mapweave.merge.merging import MergeSettings
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
+from mapweave.wire.bus import Reply
+from mapweave.wire.codec import encode_change
+from mapweave.wire.explanation_messages import (
     ExplainRequest,
     decode_maps,
     decode_pair,
     encode_explain_request,
     encode_ruling,
 )
-from wire.keys import Keys
-from wire.log_messages import decode_record
-from wire.mapfile import MapFile, pack_map_file, unpack_map_file
-from wire.memory import MemoryBus, MemoryHub
-from wire.messages import RouteRequest, encode_route_request
-from wire.route_explanation import decode_route_explanation
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import RouteRequest, encode_route_request
+from mapweave.wire.route_explanation import decode_route_explanation
+from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
 KEYS = Keys("fleet")
@@ -101,7 +101,9 @@ class Asker:
         return told
 
     def rule(self, ends: Ends, apart: bool = True) -> Reply:
-        return self.ask(KEYS.rule("s0"), encode_ruling(Ruling(ends, apart, "anna", 10**18, "two kitchens")))
+        return self.ask(
+            KEYS.rule("s0"), encode_ruling(ManualConstraint(ends, apart, "anna", 10**18, "two kitchens"))
+        )
 
     def status(self) -> dict[str, object]:
         return dict(decode_record(self.ask(KEYS.server_status("s0"), b"").payload))
@@ -132,8 +134,8 @@ def same(one: MergedMap, two: MergedMap) -> None:
         (r.pair, r.reason, r.edge) for r in two.refused
     ]
     assert one.components == two.components and one.rulings.made == two.rulings.made
-    for node, place in one.postures.items():
-        other = two.postures[node]
+    for node, place in one.poses.items():
+        other = two.poses[node]
         assert place.component == other.component
         assert np.allclose(
             place.merged_from_robot.mean.vector, other.merged_from_robot.mean.vector, atol=1e-5
@@ -252,7 +254,7 @@ def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
 def test_what_has_faded_is_in_the_file(path: Path) -> None:
     with serving(path) as asker:
         merged = merged_of(asker.merged())
-    node = min(merged.postures)
+    node = min(merged.poses)
     gone = np.arange(len(merged.maps[node.map].nodes[node].landmarks)) % 3 == 0
     content = unpack_map_file(pack_map_file(map_file_of(replace(merged, faded={node: gone}))))
     (again,) = merged_of(content).faded.items()
@@ -269,7 +271,7 @@ def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
     bus, merged = MemoryBus(MemoryHub()), MergedMap.empty()
     with serving(path) as asker:
         merged = merged_of(asker.merged())
-    store, desk, settled = Store(path), Desk(DeskSettings(workers=1)), False
+    store, desk, settled = Store(path), AdmissionControl(AdmissionSettings(workers=1)), False
     answers = SimpleNamespace(merged=merged, router=Router(merged))
     explainer = Explainer(
         bus, KEYS, "s0", lambda: answers, desk, RulingBook(store), lambda rulings: None, lambda: settled,
@@ -306,7 +308,7 @@ def test_witnesses_are_held_to_the_gate_of_the_merge(path: Path) -> None:
 def test_a_ruling_that_cannot_be_read_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = Store(path)
     store.add_ruling(b"rubbish")
-    RulingBook(store).add(Ruling((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
+    RulingBook(store).add(ManualConstraint((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
     assert [ruling.who for ruling in RulingBook(store).rulings.made] == ["anna"]
     assert "a ruling cannot be read" in caplog.text
     store.close()

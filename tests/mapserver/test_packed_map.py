@@ -9,16 +9,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hybridmap.errors import InvalidValue
-from mapserver import packed_map
-from mapserver.server import MapServer
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.mapserver import packed_map
+from mapweave.mapserver.server import MapServer
+from mapweave.storage.map_file import unpack_map_file
+from mapweave.wire.bus import Reply
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import RouteRequest, decode_route_answer, encode_route_request
 from tests.waiting import eventually
-from wire.bus import Reply
-from wire.keys import Keys
-from wire.log_messages import decode_record
-from wire.mapfile import unpack_map_file
-from wire.memory import MemoryBus, MemoryHub
-from wire.messages import RouteRequest, decode_route_answer, encode_route_request
 
 KEYS = Keys("fleet")
 MAP = KEYS.server_map("s0")

@@ -9,22 +9,22 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, EdgePut, NodePut
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.explanation import RouteExplanation
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.reach import RECOGNISED, reach_of
-from hybridmap.ruling import Ruling, Rulings
-from mapserver.http.explanation_json import route_values
-from mapserver.merging.merger import Merger
-from mapserver.route_explaining import explain_route
-from mapserver.routes import Router
-from mapweave.explained import route_words
+from mapweave.explanation_text import route_words
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.explanation import RouteExplanation
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.reachability import RECOGNISED, reachability_of
+from mapweave.mapserver.http.explanation_json import route_values
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.route_explaining import explain_route
+from mapweave.mapserver.routes import Router
+from mapweave.wire.explanation_messages import ExplainRequest, decode_explain_request, encode_explain_request
+from mapweave.wire.packing import pack
+from mapweave.wire.route_explanation import decode_route_explanation, encode_route_explanation
 from synthetic.world import Sensing, room, take_map
-from wire.explanation_messages import ExplainRequest, decode_explain_request, encode_explain_request
-from wire.packing import pack
-from wire.route_explanation import decode_route_explanation, encode_route_explanation
 
 ME, OTHER, FAR = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 SHARP = Sensing(most=150, clutter=5, unknown_depth=0.0, reach=9.0)
@@ -63,11 +63,11 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
     graph: nx.Graph = nx.Graph()
     for edge in whole.edges.values():
         a, b = whole.nodes[edge.a], whole.nodes[edge.b]
-        open_ = edge.kind not in RECOGNISED or reach_of(edge, a, b).drivable
+        open_ = edge.kind not in RECOGNISED or reachability_of(edge, a, b).drivable
         known = graph.get_edge_data(edge.a, edge.b, {"gap": 1})
         graph.add_edge(edge.a, edge.b, gap=min(known["gap"], int(not open_)))
-    for a in merged.postures:
-        for b in merged.postures:
+    for a in merged.poses:
+        for b in merged.poses:
             one = a < b and merged.component_of(a) == merged.component_of(b)
             if one and merged.pose(a).distance(merged.pose(b)) <= router.settings.near:
                 graph.add_edge(a, b, gap=0)
@@ -77,15 +77,15 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
     )
 
 
-def test_what_only_ties_postures_is_named_with_what_it_lacks(router: Router) -> None:
+def test_what_only_ties_poses_is_named_with_what_it_lacks(router: Router) -> None:
     start, goal = nodes_of(ME)[0], nodes_of(OTHER)[2]
     told = explain_route(router, start, goal)
     assert not told.found and not told.hops and told.apart is None
-    assert told.reason.startswith(router.route(start, goal).reason) and "ties postures" in told.reason
+    assert told.reason.startswith(router.route(start, goal).reason) and "ties poses" in told.reason
     assert len(told.gaps) == least_gaps(router, start, goal) == 1
     (gap,) = told.gaps
     assert (gap.a.map, gap.b.map) == (ME, OTHER) and gap.kind == "merged"
-    assert gap.words.startswith("ties postures, not driven: ")
+    assert gap.words.startswith("ties poses, not driven: ")
     assert gap.distance == pytest.approx(router.merged.pose(gap.a).distance(router.merged.pose(gap.b)))
     words = route_words(told)
     assert "there is no way" in words[0] and "what is missing" in words[1] and gap.words in words[2]
@@ -109,7 +109,7 @@ def test_what_is_blocked_is_told_whether_there_is_another_way_or_none(router: Ro
     legs = router.route(one, three, blocked=[(two, one)]).legs
     assert told.found is bool(legs)
     assert all("said to be blocked" in gap.words for gap in told.gaps)
-    whole = [(one, other) for other in router.merged.postures if other != one]
+    whole = [(one, other) for other in router.merged.poses if other != one]
     told = explain_route(router, one, three, blocked=whole)
     assert not told.found and not router.route(one, three, blocked=whole).legs
     assert "is blocked" in told.reason and "said to be blocked" in told.gaps[0].words
@@ -167,7 +167,7 @@ def renumbered(body: NodePut | EdgePut, more: int) -> NodePut | EdgePut:
 
 def test_a_retired_map_says_who_retired_it() -> None:
     merger = fleet()
-    merger.rule(Rulings([Ruling((OTHER, OTHER), True, "anna", 10**18, "burnt down")]))
+    merger.rule(ManualConstraints([ManualConstraint((OTHER, OTHER), True, "anna", 10**18, "burnt down")]))
     told = explain_route(Router(merger.merged()), nodes_of(ME)[0], nodes_of(OTHER)[0])
     assert not told.found and "anna" in told.reason and "burnt down" in told.reason
 

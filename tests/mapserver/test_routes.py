@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, EdgePut, NodePut
-from hybridmap.node import Edge, EdgeKind, MapId, NodeId
-from hybridmap.pose import Pose2
-from mapserver.merging.merger import Merger
-from mapserver.routes import Router
-from merge.explaining.explanation import explain_nodes
-from merge.explaining.maps import explain_maps
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.routes import Router
+from mapweave.merge.explanation.map_explanation import explain_maps
+from mapweave.merge.explanation.node_explanation import explain_nodes
 from synthetic.world import Sensing, room, take_map
 
 ME = MapId("a", 1)
@@ -74,11 +74,11 @@ def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> 
             merger.on_change(Change(map_id, number, 0, body))
         ends.append([node.id for node in nodes])
     merged = merger.merged()
-    assert len(merged.components) == 1 and merged.links, "the postures are tied"
+    assert len(merged.components) == 1 and merged.links, "the poses are tied"
     answer = Router(merged).route(ends[0][0], ends[1][1])
-    assert not answer.legs and "only ties postures" in answer.reason
+    assert not answer.legs and "only ties poses" in answer.reason
     told = explain_nodes(merged, *merged.links[0].pair)
-    assert any("ties postures, not driven" in claim and "2.5 m" in claim for claim in told.claims)
+    assert any("ties poses, not driven" in claim and "2.5 m" in claim for claim in told.claims)
     joined = explain_maps(merged, ME, other)
     assert joined.joined and "none can be driven" in joined.reason
     between = merged.relative(ends[0][1], ends[1][0])

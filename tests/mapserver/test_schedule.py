@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mapserver.schedule import OVERDUE, LiveSchedule, LockstepSchedule, Schedule
+from mapweave.mapserver.schedule import OVERDUE, LiveSchedule, LockstepSchedule, Schedule
 from tests.waiting import eventually
 
 

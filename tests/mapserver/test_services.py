@@ -11,22 +11,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, View
-from mapserver.desk import DeskSettings
-from mapserver.merging.merger import Merger
-from mapserver.places.placeindex import PlaceIndex
-from mapserver.relocalizing.relocalization import Relocalizer
-from mapserver.schedule import LiveSchedule, LockstepSchedule
-from mapserver.server import MapServer, ServerSettings
-from merge.graph.merged import MergedMap
-from synthetic.world import take_node
-from wire.bus import Reply
-from wire.keys import Keys
-from wire.log_messages import decode_record
-from wire.memory import MemoryBus, MemoryHub
-from wire.messages import (
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
+from mapweave.mapserver.admission_control import AdmissionSettings
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
+from mapweave.mapserver.server import MapServer, ServerSettings
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.bus import Reply
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import (
     KnownRequest,
     RouteRequest,
     decode_relocalize_answer,
@@ -35,6 +34,7 @@ from wire.messages import (
     encode_route_request,
     encode_view,
 )
+from synthetic.world import take_node
 
 KEYS = Keys("fleet")
 
@@ -46,7 +46,7 @@ class Served:
         self.room = room
         hub = MemoryHub()
         self.bus, self.asker = MemoryBus(hub), MemoryBus(hub)
-        desk = DeskSettings(workers=2, in_time=0.31, too_late=1e3, first_guess=0.1)
+        desk = AdmissionSettings(workers=2, in_time=0.31, too_late=1e3, first_guess=0.1)
         settings, schedule = ServerSettings(desk=desk), LockstepSchedule() if lockstep else LiveSchedule()
         self.server = MapServer(self.bus, KEYS, room.path, "s0", settings, schedule)
         self.nodes = sorted(room.truth)
@@ -204,8 +204,8 @@ def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
     """Against the same index that nobody else touches."""
     room = mapped_room()
     rng = np.random.default_rng(9)
-    posture = room.truth[min(room.truth)]
-    template = take_node(room.world, NodeId("x", 1, 0), posture, PoseGaussian(Pose2(), np.zeros((3, 3))), rng)
+    pose = room.truth[min(room.truth)]
+    template = take_node(room.world, NodeId("x", 1, 0), pose, PoseGaussian(Pose2(), np.zeros((3, 3))), rng)
     index = PlaceIndex()
     stop = threading.Event()
     view = room.view(min(room.truth))

@@ -16,31 +16,31 @@ import msgpack
 import numpy as np
 import pytest
 
-import merge.belief.memory
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, View
-from hybridmap.ruling import Ruling
-from mapserver.answers import Answers
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from mapserver.merging.findings import Findings
-from mapserver.merging.merger import Merger
-from mapserver.server import MapServer
-from mapserver.upkeep import Upkeep
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.merge_worker import MergeWorker
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.verification_cache import VerificationCache
+from mapweave.mapserver.server import MapServer
+from mapweave.merge.outlier_rejection import decision_cache
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.bus import Reply, Request
+from mapweave.wire.codec import decode_change, encode_body, encode_change, wrap_body
+from mapweave.wire.explanation_messages import encode_ruling
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, decode_record
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import decode_relocalize_answer, encode_view
 from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.contents import content
 from tests.waiting import eventually
-from wire.bus import Reply, Request
-from wire.codec import decode_change, encode_body, encode_change, wrap_body
-from wire.explanation_messages import encode_ruling
-from wire.keys import Keys
-from wire.log_messages import Ack, Head, LogAnswer, LogRequest, decode_record
-from wire.memory import MemoryBus, MemoryHub
-from wire.messages import decode_relocalize_answer, encode_view
 
 KEYS = Keys("fleet")
 SOUND = MapId("r0", 1), MapId("r1", 1)
@@ -100,7 +100,7 @@ def attacks() -> dict[str, list[bytes]]:
     bare = [NodePut(node(k, 0)) for k in (1, 2)]
     one = np.array([1e5, 0.0, 1.0])
     rank_one = np.outer(one, one).astype("<f4")[np.triu_indices(3)].tobytes()
-    posture = np.array([1.0, 0.0, 0.0], "<f4").tobytes() + rank_one
+    pose = np.array([1.0, 0.0, 0.0], "<f4").tobytes() + rank_one
     seen = [NodePut(node(k)) for k in (1, 2)]
     shared = EdgePut(
         Edge(
@@ -110,7 +110,7 @@ def attacks() -> dict[str, list[bytes]]:
     )  # fmt: skip
     fewer = NodePut(node(2, 5))
     return {
-        "a covariance of rank one": [*messages(BAD, [*bare]), edge(p=posture)],
+        "a covariance of rank one": [*messages(BAD, [*bare]), edge(p=pose)],
         "evidence beyond all numbers": [*messages(BAD, [*seen]), edge(w=4, x={"inliers": 9e29})],
         "fewer landmarks than are shared": messages(BAD, [*seen, shared, fewer]),
     }
@@ -199,14 +199,14 @@ def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path: Path) -> No
 
 def fails_with(monkeypatch: pytest.MonkeyPatch, bad: MapId) -> None:
     """Let the merge fail with a map, by a defect that nobody knows yet."""
-    real = merge.belief.memory.fragments_of
+    real = decision_cache.fragments_of
 
     def fails(maps: dict[MapId, HybridMap], *more: Any) -> Any:
         if bad in maps:
             raise ZeroDivisionError("a defect")
         return real(maps, *more)
 
-    monkeypatch.setattr(merge.belief.memory, "fragments_of", fails)
+    monkeypatch.setattr(decision_cache, "fragments_of", fails)
 
 
 def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retired(
@@ -232,7 +232,7 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         assert told(fleet.where()) == places
         # It was said before.
         assert [one.words for one in fleet.server.history()].count(words) == 1
-        retire = Ruling((BAD, BAD), True, "anna", 10**18, "it is mad")
+        retire = ManualConstraint((BAD, BAD), True, "anna", 10**18, "it is mad")
         reply = fleet.ask(KEYS.rule("s0"), encode_ruling(retire))
         assert not reply.error
         assert fleet.server.settle(30)
@@ -240,7 +240,9 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         assert (status["set_apart"], status["links"], status["rulings"]) == (0, links, 1)
         assert status["event"] == "map bad.1 is no longer set apart"
         assert told(fleet.where()) == places
-        never = fleet.ask(KEYS.rule("s0"), encode_ruling(Ruling((MapId("x", 9),) * 2, True, "anna", 1)))
+        never = fleet.ask(
+            KEYS.rule("s0"), encode_ruling(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1))
+        )
         assert "there is no map x.9" in never.error
 
 
@@ -258,7 +260,9 @@ def test_a_map_can_be_retired_when_nothing_can_be_merged(
         patch.setattr(Merger, "apart", fails)
         with serving(path) as fleet:
             assert not fleet.status()["nodes"]
-            reply = fleet.ask(KEYS.rule("s0"), encode_ruling(Ruling((BAD, BAD), True, "anna", 10**18)))
+            reply = fleet.ask(
+                KEYS.rule("s0"), encode_ruling(ManualConstraint((BAD, BAD), True, "anna", 10**18))
+            )
             assert not reply.error, reply.error
     with serving(path) as fleet:
         assert fleet.status()["rulings"] == 1
@@ -270,10 +274,10 @@ class Beside:
     def __init__(self, folder: Path) -> None:
         self.store = stored(folder / "s0.sqlite", sound_logs())
         self.sound = [(one, change.body) for one in SOUND for change in self.store.replay(one)]
-        self.findings = Findings()
+        self.findings = VerificationCache()
         alone, self.merger = self.merged([])
         self.findings = self.merger.findings()
-        self.nodes = sorted(alone.postures)
+        self.nodes = sorted(alone.poses)
         self.poses = {one: alone.pose(one) for one in self.nodes}
         self.links = [link.pair for link in alone.links]
         self.places = [told([self.answers.relocalizer.answer(view)]) for view in views()]
@@ -343,7 +347,7 @@ def test_contents_that_show_what_others_show_end_nothing(beside: Beside) -> None
         merged, _ = beside.merged(log)
         linked += any(map_id in (link.a.map, link.b.map) for link in merged.links)
         assert not merged.set_apart, (seed, merged.set_apart)
-        assert set(beside.nodes) <= set(merged.postures)
+        assert set(beside.nodes) <= set(merged.poses)
         for view in views():
             beside.answers.relocalizer.answer(view)
     assert linked > 5
@@ -357,7 +361,7 @@ def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Besi
 
 def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
     """It puts one of its nodes 200 times a second."""
-    upkeep = Upkeep(1.0)
+    upkeep = MergeWorker(1.0)
     upkeep.start()
     stop = threading.Event()
     logs = {one: [decode_change(message) for message in log] for one, log in sound_logs().items()}
@@ -384,7 +388,7 @@ def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
 
 
 def test_of_the_puts_of_one_node_that_wait_the_last_counts() -> None:
-    upkeep = Upkeep(1.0)
+    upkeep = MergeWorker(1.0)
     nodes = [replace(node(1), stamp_ns=k) for k in range(50)]
     for k, one in enumerate(nodes):
         upkeep.take(Change(BAD, k + 1, 0, NodePut(one)))

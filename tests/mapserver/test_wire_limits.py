@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, EdgePut, NodePut
-from hybridmap.node import Edge, EdgeKind, MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
-from mapserver.answers import Answers
-from mapserver.merging.merger import Merger
-from mapserver.wire_limits import Pairs, drivable, said
-from synthetic.world import take_map
-from tests.mapserver.test_living import HERE, Two
-from wire.messages import (
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.wire_limits import Pairs, drivable, said
+from mapweave.wire.messages import (
     decode_relocalize_answer,
     encode_known_answer,
     encode_relocalize_answer,
     encode_route_answer,
 )
+from synthetic.world import take_map
+from tests.mapserver.test_active_nodes import HERE, Two
 
 FAR = PoseGaussian.from_sigmas(Pose2(2e6, 0.0, 0.0), 0.01, 0.01)
 NEAR = PoseGaussian.from_sigmas(Pose2(1.0, 2.0, 0.0), 0.01, 0.01)
@@ -48,7 +48,7 @@ def test_what_cannot_be_said_is_left_out(
     places: list[tuple[PoseGaussian, PoseGaussian]],
     left: tuple[Certainty, list[int]],
 ) -> None:
-    candidates = tuple(place(k, *postures) for k, postures in enumerate(places, start=1))
+    candidates = tuple(place(k, *poses) for k, poses in enumerate(places, start=1))
     answer = said(RelocalizeAnswer(certainty, candidates, "words"))
     back = decode_relocalize_answer(encode_relocalize_answer(answer))
     assert (back.certainty, [one.node.number for one in back.candidates]) == left
@@ -105,8 +105,8 @@ def test_a_route_goes_around_legs_that_no_robot_drives() -> None:
         for k, name in enumerate(names):
             node = nodes[name]
             assert node is not None
-            posture = FAR if names[k - 1 : k + 1] == [middle, goal] else NEAR
-            legs.append(RouteLeg(node, posture, EdgeKind.MAPPED if k else None))
+            pose = FAR if names[k - 1 : k + 1] == [middle, goal] else NEAR
+            legs.append(RouteLeg(node, pose, EdgeKind.MAPPED if k else None))
         return RouteAnswer(tuple(legs), "words")
 
     answer = drivable(route, [(goal, start)])

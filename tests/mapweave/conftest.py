@@ -56,4 +56,4 @@ def recording(tmp_path: Path) -> Path:
 def simulator() -> None:
     """PyBullet greets whoever loads it first; that is not what is tested."""
     if INSTALLED:
-        import sim.simulation  # noqa: F401
+        import mapweave.sim.simulation  # noqa: F401

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridmap.camera import Camera
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
 from mapweave.cli import main
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.storage.map_file import MapFile, write_map_file
 from tests.mapweave.command_line import complaint
-from wire.mapfile import MapFile, write_map_file
 
 pytestmark = pytest.mark.usefixtures("signals", "simulator")
 
@@ -50,7 +50,7 @@ def test_what_has_no_end_is_not_read(tmp_path, capfd, pipe):
 
 
 def test_a_map_that_cannot_be_solved(tmp_path, capfd):
-    """The covariances of one robot's edges contradict its nodes so that the posture of one has none."""
+    """The covariances of one robot's edges contradict its nodes so that the pose of one has none."""
     bodies = []
     for number in (1, 3, 5):
         here = PoseGaussian(Pose2(number, 0, 0), np.eye(3) * 1e-4)
@@ -127,10 +127,10 @@ def test_places_that_cannot_be_written(tmp_path, capfd, recording, nobody):
 
 def one_node():
     """A map of one place."""
-    from hybridmap.camera import Camera
-    from hybridmap.change import NodePut
-    from hybridmap.node import Landmarks, Node, NodeId
-    from hybridmap.pose import Pose2, PoseGaussian
+    from mapweave.hybridmap.camera import Camera
+    from mapweave.hybridmap.change import NodePut
+    from mapweave.hybridmap.node import Landmarks, Node, NodeId
+    from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
     camera = Camera(64, 48, 60, 60, 32, 24, 0.3)
     here = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)

@@ -8,22 +8,22 @@ import time
 import numpy as np
 import pytest
 
-from agent.fleet import encode_mission
-from agent.mission import GoTo, Idle
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2
+from mapweave.agent.fleet_client import encode_mission
+from mapweave.agent.mission import GoTo, Idle
 from mapweave.demo.options import DemoOptions
 from mapweave.demo.run import run_demo
-from mapweave.scoring import posture_error, score_map
-from mapweave.trial.children import Children, free_port
-from mapweave.trial.reports import Reports
-from sim.control import SimControl
+from mapweave.evaluation.map_score import pose_error, score_map
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.children import Children, free_port
+from mapweave.scenarios.reports import Reports
+from mapweave.sim.ground_truth_client import SimControl
+from mapweave.storage.map_file import read_map_file, unpack_map_file
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
 from tests.simulator import needs_simulator
-from wire.bus_settings import BusSettings
-from wire.keys import Keys
-from wire.mapfile import read_map_file, unpack_map_file
-from wire.zenoh_bus import ZenohBus
 
 EXPLORE = 30.0
 """Simulated seconds of exploration."""
@@ -87,7 +87,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
             truth: dict[NodeId, Pose2] = {}
             for node in whole.nodes.values():
                 truth[node.id] = control.truth_at(node.id.agent, [node.stamp_ns])[0]
-            score = score_map({n: (c, p.mean) for n, (c, p) in merged.postures.items()}, [], truth)
+            score = score_map({n: (c, p.mean) for n, (c, p) in merged.poses.items()}, [], truth)
             assert len(whole.nodes) >= 12
             assert score.ate < 0.10
 
@@ -103,7 +103,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
                 return status.mission == "goto" and status.finished
 
             wait_for(parked, 90, children, "not parked")
-            distance, angle = posture_error(control.status().robots["r0"].world_from_robot, truth[goal])
+            distance, angle = pose_error(control.status().robots["r0"].world_from_robot, truth[goal])
             assert distance < 0.05
             assert np.degrees(angle) < 3.0
             assert all(robot.collisions == 0 for robot in control.status().robots.values())

@@ -13,20 +13,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2
-from hybridmap.ruling import Rulings
-from mapserver.mapfiles import map_file_of
 from mapweave.cli import MISSING_EXTRA, main
 from mapweave.extras import MODULES
-from mapweave.offline import merge_parts
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.map_files import map_file_of
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.offline_merge import merge_parts
+from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.world import room, take_map
 from tests.mapweave.command_line import commands
 from tests.simulator import needs_simulator
-from wire.mapfile import MapFile, write_map_file
 
 ROOT = Path(__file__).parents[2]
 
@@ -80,7 +80,7 @@ def merged() -> MergedMap:
     for name in ("r0", "r1"):
         nodes, edges = take_map(here, MapId(name, 1), stops, rng)
         maps[MapId(name, 1)] = HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
-    return merge_parts(maps, Rulings())
+    return merge_parts(maps, ManualConstraints())
 
 
 @pytest.fixture

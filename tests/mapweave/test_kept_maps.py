@@ -9,28 +9,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.drivers.messages import decode_step, encode_description, encode_observation
-from agent.observation import Observation, Odometry
-from agent.report import AgentReport, decode_report
-from agent.sharing.journal import Journal
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from mapweave.agent_process import epochs_of_files
+from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
+from mapweave.agent.observation import Observation, Odometry
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.status_message import AgentStatus, decode_agent_status
 from mapweave.cli import main
-from mapweave.trial.children import Children, free_port
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.processes.agent import epochs_of_files
+from mapweave.scenarios.children import Children, free_port
+from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
+from mapweave.wire.bus import Request
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.codec import encode_body, encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.mapweave.command_line import complaint
 from tests.mapweave.test_cli_files import one_node
 from tests.waiting import eventually
-from wire.bus import Request
-from wire.bus_settings import BusSettings
-from wire.codec import encode_body, encode_change
-from wire.keys import Keys
-from wire.mapfile import MapFile, read_map_file, write_map_file
-from wire.zenoh_bus import ZenohBus
 
 KEYS = Keys("kept")
 PATIENCE = 120.0
@@ -89,14 +89,14 @@ def test_agents_that_are_killed_begun_afresh_and_robbed_of_their_disk_lose_no_ma
              endpoint, *more],
         )  # fmt: skip
 
-    def report() -> AgentReport | None:
+    def report() -> AgentStatus | None:
         children.check()
         replies = [r for r in bus.ask(KEYS.agent_status("r0"), b"", 2.0) if not r.error]
-        return decode_report(replies[0].payload) if replies else None
+        return decode_agent_status(replies[0].payload) if replies else None
 
-    def mapped(nodes: int) -> AgentReport:
+    def mapped(nodes: int) -> AgentStatus:
         """Wait until a map has so many nodes, all of them on the server's disk."""
-        found: list[AgentReport] = []
+        found: list[AgentStatus] = []
 
         def done() -> bool:
             now = report()
@@ -198,7 +198,7 @@ def test_what_is_neither_journal_nor_store_or_is_in_use_is_named(tmp_path, capfd
 def test_what_a_store_can_still_read_is_extracted_and_the_rest_is_named(tmp_path, capfd):
     import sqlite3
 
-    from hybridmap.change import Change
+    from mapweave.hybridmap.change import Change
 
     path = tmp_path / "s0.sqlite"
     store = Store(path)

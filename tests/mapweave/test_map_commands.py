@@ -15,19 +15,19 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from mapserver.mapfiles import merged_of
 from mapweave.cli import main
-from mapweave.trial.children import Children, free_port
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.map_files import merged_of
+from mapweave.scenarios.children import Children, free_port
+from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.codec import encode_change
+from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.world import room, take_map
-from wire.bus_settings import BusSettings
-from wire.codec import encode_change
-from wire.mapfile import MapFile, read_map_file, write_map_file
-from wire.zenoh_bus import ZenohBus
 
 R0, R1, R2 = MapId("r0", 1), MapId("r1", 1), MapId("r2", 1)
 
@@ -194,7 +194,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     out = said("map", "retire", "r1.1", "--because", "rebuilt", "--by", "anna", "--map", path)
     assert "1 retired" in out and not links(path)
     left = read_map_file(path)
-    assert {node.map for node in left.postures} == {R0, R2}
+    assert {node.map for node in left.poses} == {R0, R2}
     assert len(left.changes) == len(before.changes) - len(links(files[3])), "nothing of the maps is lost"
     out = said("map", "explain", "r0.1", "r1.1", "--map", path)
     assert "not one map: map r1.1 is retired by anna on 20" in out and '"rebuilt"' in out

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 from mapweave.commands.map_ends import _patiently
-from wire.bus import Reply, Request
-from wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.bus import Reply, Request
+from mapweave.wire.memory import MemoryBus, MemoryHub
 
 
 def test_a_busy_server_is_asked_again_when_it_says() -> None:

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.change import ChangeBody, EdgePut, NodePut
-from hybridmap.node import Edge, EdgeKind, MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
 from mapweave.cli import main
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.world import room, take_map
-from wire.mapfile import MapFile, write_map_file
 
 TOUR = [Pose2(2.5, 2.0, h) for h in np.arange(0, 2 * math.pi, math.pi / 3)]
 
@@ -42,9 +42,9 @@ def merged_file(tmp_path: Path) -> Path:
     nodes = [body.node for body in bodies if isinstance(body, NodePut)]
     near = PoseGaussian.from_sigmas(Pose2(), 0.02, 0.02)
     link = Edge(NodeId("s0", 1, 1), nodes[0].id, NodeId("r1", 1, 1), near, EdgeKind.MERGED)
-    postures = {n.id: (1 if n.id == NodeId("r1", 1, 11) else 0, n.map_from_robot) for n in nodes}
+    poses = {n.id: (1 if n.id == NodeId("r1", 1, 11) else 0, n.map_from_robot) for n in nodes}
     path = tmp_path / "merged.mapweave"
-    write_map_file(path, MapFile("merged", "two robots", (*bodies, EdgePut(link)), postures))
+    write_map_file(path, MapFile("merged", "two robots", (*bodies, EdgePut(link)), poses))
     return path
 
 

@@ -13,21 +13,21 @@ import cv2
 import numpy as np
 import pytest
 
-from agent.drivers.replay import Replay
-from agent.global_localization.settings import ResumptionSettings
-from agent.pipeline import PipelineSettings
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.global_localization.settings import ResumptionSettings
+from mapweave.agent.pipeline import PipelineSettings
 from mapweave.cli import main
-from mapweave.examination.merging import changes
-from mapweave.examination.pieces import OVERLAP, cut
-from sim.camera import WEBCAM
-from sim.renderer import Renderer
-from sim.scene import Scene
-from sim.world import PanelSet
-from sim.worlds.catalog import make_world
-from wire.mapfile import read_map_file
+from mapweave.evaluation.merging import changes
+from mapweave.evaluation.pieces import OVERLAP, cut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.camera import WEBCAM
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.scene import Scene
+from mapweave.sim.world import PanelSet
+from mapweave.sim.worlds.catalog import make_world
+from mapweave.storage.map_file import read_map_file
 
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 
@@ -85,7 +85,7 @@ def test_two_robots_of_one_walk_become_one_map(
     assert report["false_links"] == 0 and report["link_precision"] == 1.0
     assert float(str(report["merged_ate_m"])) < 0.1
     content = read_map_file(tmp_path / "out" / "merged.mapweave")
-    assert {node.agent for node in content.postures} == {"one", "two"}
+    assert {node.agent for node in content.poses} == {"one", "two"}
     picture = cv2.imread(str(tmp_path / "out" / "map.png"))
     assert picture is not None and picture.std() > 5.0
     with (tmp_path / "out" / "links.csv").open() as file:

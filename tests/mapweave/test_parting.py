@@ -14,19 +14,19 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 
-from agent.sharing.journal import Journal
-from agent.sharing.merged_postures import MergedPostures
-from agent.sharing.replication import Replicator
-from hybridmap.change import ChangeBody, EdgePut, NodePut
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.merged_poses import MergedPoses
+from mapweave.agent.replication.replicator import Replicator
 from mapweave.cli import main
-from mapweave.trial.children import Children
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.children import Children
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.world import room, take_map
 from tests.waiting import eventually, free_port
-from wire.bus_settings import BusSettings
-from wire.keys import Keys
-from wire.zenoh_bus import ZenohBus
 
 R0, R1 = MapId("r0", 1), MapId("r1", 1)
 EAST = Pose2(20.0, 0.0, 0.0)
@@ -74,10 +74,10 @@ class Robot:
         self.journal = Journal(folder / f"{map_id.agent}.sqlite", map_id.agent)
         self.journal.open_map(map_id.epoch)
         self.sender = Replicator(self.bus, KEYS, self.journal, map_id)
-        self.postures = MergedPostures(self.bus, KEYS, map_id.agent, "s0")
+        self.poses = MergedPoses(self.bus, KEYS, map_id.agent, "s0")
 
     def close(self) -> None:
-        self.postures.close()
+        self.poses.close()
         self.sender.close()
         self.journal.close()
         self.bus.close()
@@ -89,7 +89,7 @@ class Robot:
 
     def frames(self) -> set[NodeId]:
         """Of the components in which its first nodes lie, as it was told."""
-        found = [self.postures.of(NodeId(*self.map, 2 * k + 1)) for k in range(FIRST)]
+        found = [self.poses.of(NodeId(*self.map, 2 * k + 1)) for k in range(FIRST)]
         return {NodeId("?", 0, 0) if one is None else one.frame for one in found}
 
 

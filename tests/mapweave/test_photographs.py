@@ -10,19 +10,19 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.errors import InvalidValue
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2
 from mapweave.cli import main
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
 from mapweave.photographs import SCALE_SHARE, map_of_photographs
-from sim.camera import CAMERAS
-from sim.photographer import walk
-from sim.worlds.catalog import world_from_table
+from mapweave.sim.camera import CAMERAS
+from mapweave.sim.photographer import walk
+from mapweave.sim.worlds.catalog import world_from_table
+from mapweave.storage.map_file import read_map_file
+from mapweave.wire.codec import encode_body
 from tests.mapweave.command_line import complaint
-from wire.codec import encode_body
-from wire.mapfile import read_map_file
 
 COUNT, SPACING, PHONE = 6, 0.5, CAMERAS["phone"]
 

@@ -13,24 +13,24 @@ import numpy as np
 import pytest
 import skimage.data
 
-from hybridmap.camera import Camera
-from hybridmap.change import Change, NodePut
-from hybridmap.errors import Busy
-from hybridmap.node import Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import View
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from mapserver.server import MapServer
-from mapserver.services import Services
 from mapweave.cli import main
-from mapweave.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
-from vision.lens import Lens
-from vision.sift import Sift
-from wire.bus_settings import BusSettings
-from wire.codec import encode_change
-from wire.keys import Keys
-from wire.zenoh_bus import ZenohBus
+from mapweave.drawing.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.server import MapServer
+from mapweave.mapserver.services import Services
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
@@ -146,8 +146,8 @@ def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypat
     assert "the map server refused: busy, retry after 60.0 s" in capfd.readouterr().err
 
 
-def test_what_agrees_is_what_the_posture_explains(node: Node) -> None:
-    """By hand, match by match; a posture that is wrong explains next to nothing."""
+def test_what_agrees_is_what_the_pose_explains(node: Node) -> None:
+    """By hand, match by match; a pose that is wrong explains next to nothing."""
     view = view_of(picture(MOVED))
     overlay = Overlay.of(node, view, MOVED)
     assert overlay.agreeing.sum() > 20

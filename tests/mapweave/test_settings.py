@@ -12,10 +12,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import SettingsError
+from mapweave.merge.merging import MergeSettings
 from mapweave.settings import Settings, load_settings, merge_settings
-from merge.merging import MergeSettings
-from wire.tables import build
+from mapweave.storage.settings_file import build
 
 
 def load(tmp_path: Path, text: str | bytes) -> Settings:

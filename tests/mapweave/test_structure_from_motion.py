@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hybridmap.camera import Camera
-from hybridmap.descriptor import quantise
-from hybridmap.errors import InvalidValue
-from hybridmap.query import View
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.query import View
 from mapweave.structure_from_motion import CAMERA_FROM_LEVEL, Structure, reconstruct
 from synthetic.world import random_vectors
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeId, EdgeKind, MapId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.ruling import Ruling, Rulings
-from merge.graph.candidates import Pair
-from merge.graph.links import Link, RefusedLink
-from merge.graph.merged import MergedMap
-from merge.graph.verdicts import Verdict, Verdicts
-from merge.merging import merge_maps
-from merge.undoing import undo
+from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.manual_constraints import apply_constraints
+from mapweave.merge.merging import merge_maps
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
 from synthetic.fleet import FleetSettings, draw_fleet
 
 SMALL = FleetSettings(robots=5, nodes=16, side=7.0, true_links=80, apart=6)
@@ -39,7 +39,7 @@ class Life:
         self.known: dict[Pair, Verdict] = {}
         self.verdicts = Verdicts()
         self.touched: set[MapId] = set()
-        self.rulings = Rulings()
+        self.rulings = ManualConstraints()
         self.number = 0
 
     def there(self, pair: Pair) -> bool:
@@ -87,8 +87,8 @@ class Life:
             pair = known[int(rng.integers(len(known)))]
             ends = pair if rng.random() < 0.7 or pair[0].map == pair[1].map else (pair[0].map, pair[1].map)
             self.number += 1
-            ruling = Ruling(ends, bool(rng.random() < 0.6), "anna", self.number)
-            self.rulings = self.rulings + Rulings([ruling])
+            ruling = ManualConstraint(ends, bool(rng.random() < 0.6), "anna", self.number)
+            self.rulings = self.rulings + ManualConstraints([ruling])
 
     def _loop(self) -> None:
         """A robot recognises a place of its own, or drives there, and may be mistaken."""
@@ -111,5 +111,5 @@ class Life:
     def anew(self) -> MergedMap:
         links = [v for v in self.known.values() if isinstance(v, Link)]
         refused = [v for v in self.known.values() if isinstance(v, RefusedLink)]
-        undone = undo(self.maps, links, self.rulings)
+        undone = apply_constraints(self.maps, links, self.rulings)
         return undone.completed(merge_maps(undone.maps, undone.links, [*refused, *undone.refused]))

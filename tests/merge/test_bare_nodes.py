@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.node import Landmarks, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from merge.graph.links import Link, RefusedLink
-from merge.graph.verification import verify
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.verification import verify
 from synthetic.world import room, take_node
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))

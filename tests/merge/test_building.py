@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.merger import Merger
 from synthetic.building import Building
 
 
@@ -17,6 +17,6 @@ def test_ten_thousand_nodes_with_true_links_become_one_map() -> None:
     merger = Merger()
     merger.read((part for robot in range(100) for part in building.log(robot)), *building.knowledge(told))
     merged = merger.merged()
-    assert len(merged.components) == 1 and len(merged.postures) == 10_000
+    assert len(merged.components) == 1 and len(merged.poses) == 10_000
     # One in ten thousand strains too much by chance.
     assert len(merged.refused) <= 4 and len(merged.links) > 22_000

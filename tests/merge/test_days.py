@@ -7,18 +7,18 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from hybridmap.change import NodeRetired
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.ruling import Ruling, Rulings
-from merge.graph.candidates import Pair
-from merge.graph.links import Link
-from merge.graph.merged import MergedMap
-from merge.graph.verdicts import Verdicts
-from merge.islands import Islands
-from merge.merging import merge_maps
-from merge.undoing import undo
+from mapweave.hybridmap.change import NodeRetired
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.islands import Islands
+from mapweave.merge.manual_constraints import apply_constraints
+from mapweave.merge.merging import merge_maps
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verdicts import Verdicts
 from synthetic.drives import Drive, DriveSettings, drives
 from synthetic.fleet import FleetSettings, link_between
 
@@ -30,7 +30,7 @@ class Daily:
 
     def __init__(self, seed: int, false_share: float = 0.0) -> None:
         self.days = drives(np.random.default_rng(seed), DriveSettings(FLOOR, false_share=false_share))
-        self.islands, self.verdicts, self.rulings = Islands(exact=60), Verdicts(), Rulings()
+        self.islands, self.verdicts, self.rulings = Islands(exact=60), Verdicts(), ManualConstraints()
         self.maps: dict[MapId, HybridMap] = {}
         self.links: dict[Pair, Link] = {}
         self.truth: dict[NodeId, Pose2] = {}
@@ -63,14 +63,14 @@ class Daily:
         return merged
 
     def anew(self) -> MergedMap:
-        undone = undo(self.maps, self.links.values(), self.rulings)
+        undone = apply_constraints(self.maps, self.links.values(), self.rulings)
         return undone.completed(merge_maps(undone.maps, undone.links, undone.refused))
 
 
 def check(merged: MergedMap, anew: MergedMap) -> None:
     assert set(merged.components) == set(anew.components)
     assert {link.pair for link in merged.links} == {link.pair for link in anew.links}
-    for node in anew.postures:
+    for node in anew.poses:
         assert merged.pose(node).distance(anew.pose(node)) < 1e-3
 
 
@@ -91,14 +91,14 @@ def test_people_rule_on_days_that_stand() -> None:
     daily = Daily(5)
     merged = daily.live(6)
     pair = merged.links[len(merged.links) // 2].pair
-    daily.rulings = Rulings([Ruling(pair, True, "anna", 1)])
+    daily.rulings = ManualConstraints([ManualConstraint(pair, True, "anna", 1)])
     daily.touched |= {pair[0].map, pair[1].map}
     merged = daily.merged()
     assert "undone by anna" in merged.explain(*pair)
     check(merged, daily.anew())
     daily.live(2)
     assert "undone by anna" in daily.merged().explain(*pair)
-    daily.rulings = daily.rulings + Rulings([Ruling(pair, False, "anna", 2)])
+    daily.rulings = daily.rulings + ManualConstraints([ManualConstraint(pair, False, "anna", 2)])
     daily.touched |= {pair[0].map, pair[1].map}
     merged = daily.merged()
     assert pair in {link.pair for link in merged.links}
@@ -108,7 +108,7 @@ def test_people_rule_on_days_that_stand() -> None:
 def test_maps_and_nodes_of_days_that_stand_are_retired() -> None:
     daily = Daily(6)
     daily.live(6)
-    daily.rulings = Rulings([Ruling((MapId("r0", 2), MapId("r0", 2)), True, "anna", 1)])
+    daily.rulings = ManualConstraints([ManualConstraint((MapId("r0", 2), MapId("r0", 2)), True, "anna", 1)])
     daily.touched.add(MapId("r0", 2))
     check(daily.merged(), daily.anew())
     one = HybridMap(daily.maps[MapId("r0", 3)].contents())

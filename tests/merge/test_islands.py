@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.change import NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.ruling import Ruling, Rulings
-from merge import islands as islands_module
-from merge.graph import solver
-from merge.graph.merged import MergedMap
-from merge.islands import Islands
-from merge.merging import MergeSettings
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.merge import islands as islands_module
+from mapweave.merge.islands import Islands
+from mapweave.merge.merging import MergeSettings
+from mapweave.merge.pose_graph import component_solver
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from tests.merge.lives import DENSE, Life
 
 
@@ -45,13 +45,13 @@ def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> Non
             anew = life.anew()
             assert told(merged) == told(anew)
             assert [graph.anchor for graph in merged.graphs] == [graph.anchor for graph in anew.graphs]
-            assert list(merged.postures) == list(anew.postures)
-            for node, place in merged.postures.items():
-                other = anew.postures[node]
+            assert list(merged.poses) == list(anew.poses)
+            for node, place in merged.poses.items():
+                other = anew.poses[node]
                 assert place.component == other.component
                 assert place.merged_from_robot.mean == other.merged_from_robot.mean
                 assert np.array_equal(place.merged_from_robot.covariance, other.merged_from_robot.covariance)
-    assert len(islands.merge(life.maps, life.verdicts, set(), life.rulings).postures) > 20
+    assert len(islands.merge(life.maps, life.verdicts, set(), life.rulings).poses) > 20
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(40, 0.0), (41, 0.3), (42, 0.5)])
@@ -75,8 +75,8 @@ def test_decisions_that_stand_are_those_of_the_merge_made_anew(
 ) -> None:
     """Nothing is ever decided again here, and few nodes are moved at a time."""
     monkeypatch.setattr(islands_module, "CHANGED", math.inf)
-    monkeypatch.setattr(solver, "WHOLE", 0)
-    monkeypatch.setattr(solver, "LEAST", 12)
+    monkeypatch.setattr(component_solver, "WHOLE", 0)
+    monkeypatch.setattr(component_solver, "LEAST", 12)
     life, islands = Life(seed, 0.0, DENSE), Islands(exact=0)
     for _ in range(60):
         life.step(quiet=True)
@@ -87,7 +87,7 @@ def test_decisions_that_stand_are_those_of_the_merge_made_anew(
     one, two = ({link.pair for link in links} for links in (merged.links, anew.links))
     assert len(two) > 150 and len(one ^ two) <= 0.03 * len(two)
     if one == two:
-        assert max(merged.pose(node).distance(anew.pose(node)) for node in anew.postures) < 0.02
+        assert max(merged.pose(node).distance(anew.pose(node)) for node in anew.poses) < 0.02
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(46, 0.0), (47, 0.3), (48, 0.3)])
@@ -102,14 +102,14 @@ def test_whatever_happens_decisions_stand_or_fall_as_in_a_merge_made_anew(
         if life.maps and life.rng.random() < 0.05:
             which = sorted(life.maps)[int(life.rng.integers(len(life.maps)))]
             life.number += 1
-            ruling = Ruling((which, which), bool(life.rng.random() < 0.6), "anna", life.number)
-            life.rulings = life.rulings + Rulings([ruling])
+            ruling = ManualConstraint((which, which), bool(life.rng.random() < 0.6), "anna", life.number)
+            life.rulings = life.rulings + ManualConstraints([ruling])
         if life.rng.random() < 0.4:
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
             life.touched, anew = set(), life.anew()
             one, two = ({link.pair for link in some.links} for some in (merged, anew))
             apart, links = apart + len(one ^ two), links + len(two)
-            assert set(merged.postures) == set(anew.postures)
+            assert set(merged.poses) == set(anew.poses)
             assert {r.pair for r in merged.refused} | one == {r.pair for r in anew.refused} | two
     assert links > 15 and apart <= 0.1 * links
 
@@ -132,8 +132,8 @@ def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPat
 
 
 def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solver, "WHOLE", 0)
-    monkeypatch.setattr(solver, "LEAST", 12)
+    monkeypatch.setattr(component_solver, "WHOLE", 0)
+    monkeypatch.setattr(component_solver, "LEAST", 12)
     found = []
     for _ in range(2):
         life, islands = Life(49, 0.3, DENSE), Islands(exact=0)
@@ -141,7 +141,7 @@ def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.Mon
             life.step()
             merged = islands.merge(life.maps, life.verdicts, life.touched, life.rulings)
             life.touched = set()
-        found.append((told(merged), [merged.pose(node).vector.tobytes() for node in merged.postures]))
+        found.append((told(merged), [merged.pose(node).vector.tobytes() for node in merged.poses]))
     assert found[0] == found[1]
 
 

@@ -1,4 +1,4 @@
-"""Whole merges of synthetic maps, from descriptors to postures."""
+"""Whole merges of synthetic maps, from descriptors to poses."""
 
 import math
 from itertools import pairwise
@@ -6,15 +6,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hybridmap.change import EdgePut, NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import EdgeKind, MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from merge.graph.candidates import choose_pairs, overlaps
-from merge.graph.links import Link, RefusedLink
-from merge.graph.merged import MergedMap
-from merge.graph.verification import verify
-from merge.merging import merge_maps
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.merging import merge_maps
+from mapweave.merge.pose_graph.candidates import choose_pairs, overlaps
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verification import verify
 from synthetic.world import World, room, take_map
 
 A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
@@ -60,17 +60,17 @@ class Fleet:
     def errors(self, merged: MergedMap, component: int) -> tuple[float, float]:
         """RMS error of positions after one rigid alignment, and mean squared Mahalanobis distance.
 
-        The distances are taken without alignment, from the component's anchor, whose posture is certain.
+        The distances are taken without alignment, from the component's anchor, whose pose is certain.
         """
         nodes = sorted(merged.components[component])
-        found = np.array([merged.postures[n].merged_from_robot.mean.vector[:2] for n in nodes])
+        found = np.array([merged.poses[n].merged_from_robot.mean.vector[:2] for n in nodes])
         true = np.array([self.truth[n].vector[:2] for n in nodes])
         u, _, vt = np.linalg.svd((found - found.mean(0)).T @ (true - true.mean(0)))
         rotation = u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt
         off = (found - found.mean(0)) @ rotation - (true - true.mean(0))
-        truth_from_merged = self.truth[nodes[0]] @ merged.postures[nodes[0]].merged_from_robot.mean.inverse()
+        truth_from_merged = self.truth[nodes[0]] @ merged.poses[nodes[0]].merged_from_robot.mean.inverse()
         distances = [
-            merged.postures[n].merged_from_robot.mahalanobis2(truth_from_merged.inverse() @ self.truth[n])
+            merged.poses[n].merged_from_robot.mahalanobis2(truth_from_merged.inverse() @ self.truth[n])
             for n in nodes[1:]
         ]
         return float((off**2).sum(axis=1).mean()) ** 0.5, float(np.mean(distances))
@@ -111,9 +111,9 @@ def test_result_does_not_depend_on_order() -> None:
     assert [link.pair for link in one.links] == [link.pair for link in two.links]
     assert [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
     assert one.components == two.components
-    for node, place in one.postures.items():
+    for node, place in one.poses.items():
         assert np.array_equal(
-            place.merged_from_robot.mean.vector, two.postures[node].merged_from_robot.mean.vector
+            place.merged_from_robot.mean.vector, two.poses[node].merged_from_robot.mean.vector
         )
 
 
@@ -127,7 +127,7 @@ def test_maps_of_different_places_stay_apart() -> None:
     for map_id in (A, B):
         first = min(fleet.maps[map_id].nodes)
         own = fleet.maps[map_id].nodes[first].map_from_robot.mean
-        assert merged.postures[first].merged_from_robot.mean.distance(own) < 1e-9
+        assert merged.poses[first].merged_from_robot.mean.distance(own) < 1e-9
 
 
 def test_a_room_that_is_just_like_another_is_not_taken_for_it() -> None:
@@ -204,7 +204,7 @@ def test_a_map_in_pieces_is_joined_piece_by_piece() -> None:
     whole.graph.remove_edge(NodeId("a", 1, 5), NodeId("a", 1, 7), key=NodeId("a", 1, 6))
     merged = merge_maps({A: whole}, [])
     assert [len(part) for part in merged.components] == [3, 3]
-    assert set(merged.postures) == set(whole.nodes)
+    assert set(merged.poses) == set(whole.nodes)
 
 
 def refused_links(merged: MergedMap) -> list[RefusedLink]:

@@ -6,26 +6,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from merge.graph.component import solve_graph
-from merge.graph.factors import Measurement
-from merge.merging import merge_maps
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.merging import merge_maps
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import Measurement
 from synthetic.city import draw_grid
 from synthetic.fleet import FleetSettings, draw_fleet
 from synthetic.gnc import wrong_measurements
-from synthetic.merge_rivals import (
-    RIVALS,
-    error,
-    oracle,
-    precision_recall,
-)
-from synthetic.pose_graph import (
-    batch_optimum,
-    chi2_of,
-    factors_of,
-    split,
-)
+from synthetic.merge_rivals import RIVALS, error, oracle, precision_recall
+from synthetic.pose_graph import batch_optimum, chi2_of, factors_of, split
 
 GATE = 16.27
 SMALL = FleetSettings(nodes=40, side=8.0)

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.jit import KERNELS
-from registration.gauss_newton import stack_sightings
-from registration.projection import improve, linearise, normal_equations
+from mapweave.hybridmap.jit import KERNELS
+from mapweave.registration.gauss_newton import stack_sightings
+from mapweave.registration.projection import improve, linearise, normal_equations
 from tests.hybridmap.kernel_forms import in_numpy
 from tests.registration.test_projection import scene
 

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from hybridmap.node import Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from registration.levelling import level
-from registration.recognition import recognise, register
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.registration.levelling import level
+from mapweave.registration.recognition import recognise, register
 from synthetic.world import Sensing, room, take_node, take_view
 from tests.hand_held import SCALE_SHARE, photograph
 

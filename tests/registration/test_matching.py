@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.descriptor import decode
-from registration.matching import MatchSettings, match, match_vectors, squared_distances, two_nearest
+from mapweave.hybridmap.descriptor import decode
+from mapweave.registration.matching import MatchSettings, match, match_vectors, squared_distances, two_nearest
 
 
 def brute_force(a: np.ndarray, b: np.ndarray, s: MatchSettings, noise: float) -> set[tuple[int, int]]:

@@ -1,14 +1,14 @@
-"""The second posture from which a flat thing looks almost the same."""
+"""The second pose from which a flat thing looks almost the same."""
 
 import math
 
 import numpy as np
 import pytest
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2
-from registration.planar_ambiguity import mirrored
-from registration.planar_pose import PlanarPoseSettings, solve_planar_pose
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.registration.planar_ambiguity import mirrored
+from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 SETTINGS = PlanarPoseSettings(pixel_sigma=1.0)
@@ -29,7 +29,7 @@ def poster(rng: np.random.Generator, size: float, depth: float) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("posture", [Pose2(0.2, 1.0, -0.4), Pose2(-1.0, -0.7, 0.1), Pose2(1.0, 0.0, 0.3)])
+@pytest.mark.parametrize("pose", [Pose2(0.2, 1.0, -0.4), Pose2(-1.0, -0.7, 0.1), Pose2(1.0, 0.0, 0.3)])
 def test_twice_mirrored_is_where_it_was(pose_vector):
     points = np.array([[3.0, -1.0], [3.1, 0.2], [3.3, 1.5]])
     there = mirrored(pose_vector, points)
@@ -58,7 +58,7 @@ def test_a_small_flat_thing_seen_from_aside_is_ambiguous(seed):
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("depth", [0.0, 1.5])
 def test_what_is_wide_or_deep_is_not(seed, depth):
-    """And the posture found is the right one, whichever of the two the search came upon first."""
+    """And the pose found is the right one, whichever of the two the search came upon first."""
     rng = np.random.default_rng(seed)
     points = poster(rng, 0.4 if depth else 2.6, depth)
     true = facing(0.3, 1.1, (3.0, 0.0))

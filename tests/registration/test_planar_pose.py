@@ -1,4 +1,4 @@
-"""Postures from sightings: Jacobians, likelihood, optimum and covariance against independent computations."""
+"""Poses from sightings: Jacobians, likelihood, optimum and covariance against independent computations."""
 
 import math
 
@@ -8,11 +8,11 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2, PoseGaussian
-from registration.minimal_poses import hypotheses
-from registration.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
-from registration.sightings import Sightings
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.registration.minimal_poses import hypotheses
+from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
+from mapweave.registration.sightings import Sightings
 from tests.hybridmap.kernel_forms import form
 
 __all__ = ["form"]
@@ -40,7 +40,7 @@ def error(found: Pose2, true: Pose2) -> float:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6))
-def test_exact_points_give_the_exact_posture(seed: int) -> None:
+def test_exact_points_give_the_exact_pose(seed: int) -> None:
     rng = np.random.default_rng(seed)
     true = random_pose(rng)
     points, pixels = seen_points(true, 12, rng)
@@ -64,7 +64,7 @@ def test_minimal_solutions_are_exact(inverted: bool) -> None:
 def noisy_problem(
     rng: np.random.Generator, n: int = 40, depth_share: float = 0.04
 ) -> tuple[Pose2, np.ndarray, np.ndarray, np.ndarray]:
-    """A posture near a node; points as a node has them (uncertain along their ray), noisy pixels."""
+    """A pose near a node; points as a node has them (uncertain along their ray), noisy pixels."""
     true = Pose2(*rng.normal([0, 0, 0], [0.5, 0.4, 0.2]))
     pixels = rng.uniform([4, 4], [316, 236], (n, 2))
     points = true.apply(CAMERA.back_project(pixels, rng.uniform(1.0, 5.0, n)))
@@ -122,7 +122,7 @@ def test_common_scale_error_is_covered() -> None:
 
 
 def test_optimum_against_scipy_with_points_as_variables() -> None:
-    """The eliminated points must give the same posture as a full least squares over posture and points."""
+    """The eliminated points must give the same pose as a full least squares over pose and points."""
     rng = np.random.default_rng(8)
     true, points, covariances, pixels = noisy_problem(rng, n=18, depth_share=0.08)
     fix = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances, settings=HONEST)
@@ -185,7 +185,7 @@ def test_a_prior_counts_as_a_measurement() -> None:
     )
 
 
-def test_measured_depths_make_a_posture_more_certain() -> None:
+def test_measured_depths_make_a_pose_more_certain() -> None:
     rng = np.random.default_rng(12)
     true, points, covariances, pixels = noisy_problem(rng, n=15, depth_share=0.1)
     in_robot = true.inverse().apply(points)
@@ -206,7 +206,7 @@ def test_measured_depths_make_a_posture_more_certain() -> None:
 
 @pytest.mark.parametrize("n", [0, 1, 3, 4, 10])
 @pytest.mark.parametrize("kind", ["nan", "same point", "behind", "zero", "huge"])
-def test_degenerate_input_gives_none_or_a_posture_but_never_raises(n: int, kind: str) -> None:
+def test_degenerate_input_gives_none_or_a_pose_but_never_raises(n: int, kind: str) -> None:
     rng = np.random.default_rng(13)
     points, pixels = seen_points(Pose2(), n, rng)
     if kind == "nan":
@@ -226,7 +226,7 @@ def test_degenerate_input_gives_none_or_a_posture_but_never_raises(n: int, kind:
         assert fix is None
 
 
-def test_same_seed_same_posture() -> None:
+def test_same_seed_same_pose() -> None:
     _, points, covariances, pixels = noisy_problem(np.random.default_rng(14), n=60)
     fixes = [
         solve_planar_pose(points, pixels, CAMERA, rng=np.random.default_rng(1), point_covariances=covariances)

@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from hybridmap.node import NodeId
-from hybridmap.pose import Pose2, PoseGaussian, averaged
-from registration.planar_pose import PlanarPoseSettings
-from registration.pose_refinement import look_closer
-from registration.recognition import recognise
-from synthetic.world import (
-    Sensing,
-    room,
-    take_node,
-    take_view,
-)
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged
+from mapweave.registration.planar_pose import PlanarPoseSettings
+from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.recognition import recognise
+from synthetic.world import Sensing, room, take_node, take_view
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 WORLD = room(0, 0, 5, 4, 700, np.random.default_rng(1))

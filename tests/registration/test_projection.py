@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2
-from registration.gauss_newton import stack_sightings
-from registration.projection import (
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.registration.gauss_newton import stack_sightings
+from mapweave.registration.projection import (
     DEPTH_DECADES,
     Linear,
     Stack,
@@ -19,7 +19,7 @@ from registration.projection import (
     linearise,
     normal_equations,
 )
-from registration.sightings import Sightings
+from mapweave.registration.sightings import Sightings
 from tests.hybridmap.kernel_forms import form
 
 __all__ = ["form"]
@@ -158,7 +158,7 @@ def test_linearised_against_finite_differences(seed: int, n: int) -> None:
         np.testing.assert_allclose(normal_equations(linear)[1:], information, rtol=1e-3, atol=1e-3 * scale)
 
 
-def test_what_does_not_determine_a_posture() -> None:
+def test_what_does_not_determine_a_pose() -> None:
     assert determined(np.diag([1.0, 1.0, 1e-6]))
     assert not determined(np.diag([1.0, 1.0, 1e-12]))
     assert not determined(np.zeros((3, 3)))

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.node import Landmarks, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from registration.recognition import (
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.registration.recognition import (
     Recognition,
     RecognitionSettings,
     Refusal,
@@ -16,13 +16,7 @@ from registration.recognition import (
     recognise,
     register,
 )
-from synthetic.world import (
-    Sensing,
-    World,
-    room,
-    take_node,
-    take_view,
-)
+from synthetic.world import Sensing, World, room, take_node, take_view
 from tests.hybridmap.kernel_forms import form
 
 __all__ = ["form"]
@@ -48,7 +42,7 @@ def somewhere(rng: np.random.Generator) -> Pose2:
     return Pose2(*rng.uniform([1.5, 1.2, -3.1], [3.5, 2.8, 3.1]))
 
 
-def test_views_nearby_are_recognised_with_an_honest_posture() -> None:
+def test_views_nearby_are_recognised_with_an_honest_pose() -> None:
     rng = np.random.default_rng(2)
     distances, found = [], 0
     for _ in range(60):

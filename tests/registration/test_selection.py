@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hybridmap.descriptor import decode, quantise, rounding_noise
-from hybridmap.errors import InvalidValue
-from hybridmap.node import Landmarks
-from registration.selection import FIXED_BYTES, SelectionSettings, choose, distinctness, worth
+from mapweave.hybridmap.descriptor import decode, quantise, rounding_noise
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import Landmarks
+from mapweave.registration.selection import FIXED_BYTES, SelectionSettings, choose, distinctness, worth
 from synthetic.world import CAMERA, random_vectors
 
 PLENTY = SelectionSettings(most_bytes=100_000)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
-from sim.floorplan import FloorPlan, Rectangle
-from sim.world import Block, PanelSet, World
-from sim.worlds.office import make_office
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.world import Block, PanelSet, World
+from mapweave.sim.worlds.office import make_office
 from tests.sim.stage import Stage
 
 
@@ -35,7 +35,7 @@ class RayCaster:
     """Solves one 3 x 3 system for each pixel and panel."""
 
     def cast(self, panels: PanelSet, camera: Camera, rotation: Array, position: Array, pixels: Array) -> Cast:
-        """Follow the rays of (N, 2) pixels from a camera on a robot with that posture in world."""
+        """Follow the rays of (N, 2) pixels from a camera on a robot with that pose in world."""
         rays = (camera.back_project(pixels, np.ones(len(pixels)))) - [
             camera.mount_forward,
             0,

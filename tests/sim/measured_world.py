@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2
-from sim.floorplan import Rectangle
-from sim.renderer import Renderer
-from sim.world import Block, Panel, PanelSet, World
-from sim.worlds.catalog import make_world
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.floorplan import Rectangle
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.world import Block, Panel, PanelSet, World
+from mapweave.sim.worlds.catalog import make_world
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 ROBOT = 0.28

@@ -10,17 +10,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.drivers.remote import RemoteRobot
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Array, Pose2
-from sim.bridge import SimBridge
-from sim.control import SimControl
-from sim.floorplan import FloorPlan, Rectangle
-from sim.keys import SimKeys
-from sim.simulated import Simulated
-from wire.memory import MemoryBus, MemoryHub
+from mapweave.agent.drivers.remote import RemoteRobot
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.bridge import SimBridge
+from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.ground_truth_client import SimControl
+from mapweave.sim.keys import SimKeys
+from mapweave.sim.simulation_interface import Simulated
+from mapweave.wire.memory import MemoryBus, MemoryHub
 
 KEYS = SimKeys("test")
 TICK_NS = 100_000_000

@@ -8,16 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from agent.observation import Command
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Pose2
-from sim.actors import AHEAD, FIGURES, Actor
-from sim.events import Walk
-from sim.floorplan import FloorPlan, distances_to
-from sim.places import is_clear, sampled
-from sim.simulation import Simulation
-from sim.world import World
-from sim.worlds.catalog import KINDS, make_world
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.actors import AHEAD, FIGURES, Actor
+from mapweave.sim.events import Walk
+from mapweave.sim.floorplan import FloorPlan, distances_to
+from mapweave.sim.placement import is_clear, sampled
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
+from mapweave.sim.worlds.catalog import KINDS, make_world
 
 NOBODY = np.zeros((0, 2))
 

@@ -7,13 +7,13 @@ import time
 
 import pytest
 
-from agent.observation import Command
-from hybridmap.pose import Pose2
-from sim.bridge import SimBridge
-from sim.control import SimControl
-from sim.lockstep_robot import LockstepRobot
-from sim.simulation import Simulation
-from wire.memory import MemoryBus, MemoryHub
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.bridge import SimBridge
+from mapweave.sim.ground_truth_client import SimControl
+from mapweave.sim.lockstep_robot import LockstepRobot
+from mapweave.sim.simulation import Simulation
+from mapweave.wire.memory import MemoryBus, MemoryHub
 
 
 class Table:

@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
-from agent.drivers.messages import StepRequest, encode_step
-from agent.drivers.remote import RemoteRobot
-from agent.observation import Command, Odometry, RobotDescription
-from sim.simulation import Simulation
-from sim.worlds.office import make_office
+from mapweave.agent.drivers.messages import StepRequest, encode_step
+from mapweave.agent.drivers.remote import RemoteRobot
+from mapweave.agent.observation import Command, Odometry, RobotDescription
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.worlds.office import make_office
 from tests.sim.stage import CAMERA, KEYS, TICK_NS, Driver, FakeSimulation, Stage
 from tests.waiting import eventually
 

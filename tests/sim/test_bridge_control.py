@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.drivers.messages import ENDED
-from agent.observation import Odometry
-from hybridmap.errors import InvalidValue, NotConnected
-from hybridmap.pose import Pose2
-from sim.control import SimControl
+from mapweave.agent.drivers.messages import ENDED
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.ground_truth_client import SimControl
 from tests.sim.stage import KEYS, PLAN, TICK_NS, Driver, FakeSimulation, Stage
 from tests.waiting import eventually
 
@@ -82,7 +82,7 @@ def test_stop_ends_the_run_and_tells_every_agent(stage: Stage) -> None:
         driver.join(30.0)
         assert driver.ended
     assert simulation.tick == 5
-    with pytest.raises(NotConnected, match=r"sim/control: nobody answers; .*mapweave sim"):
+    with pytest.raises(NotConnected, match=r"sim/ground_truth_client: nobody answers; .*mapweave sim"):
         SimControl(stage.join(), "test", timeout=0.5).status()
 
 

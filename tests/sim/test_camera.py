@@ -11,17 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Pose2
-from sim.camera import CAMERAS, CameraSetup, Exposure, undistorted
-from sim.imager import Imager
-from sim.renderer import Renderer
-from sim.robots import RobotSetup
-from sim.scene import Scene
-from sim.texture import Texture
-from sim.world import PanelSet, upright_panel
-from vision.lens import Lens
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.camera import CAMERAS, CameraSetup, Exposure, undistorted
+from mapweave.sim.imager import Imager
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.robots import RobotSetup
+from mapweave.sim.scene import Scene
+from mapweave.sim.texture import Texture
+from mapweave.sim.world import PanelSet, upright_panel
+from mapweave.vision.lens import Lens
 
 COLUMNS, ROWS = 12, 9
 """Squares of a board that fills the picture."""

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.errors import InvalidValue, MapweaveError, SettingsError
-from hybridmap.pose import Pose2
-from sim.camera import CAMERAS
-from sim.robots import RobotSetup, robot_from_table, robot_setups
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError, SettingsError
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.camera import CAMERAS
+from mapweave.sim.robots import RobotSetup, robot_from_table, robot_setups
 
 
 def test_a_camera_is_a_name_or_what_differs_from_one() -> None:

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from hybridmap.errors import InvalidValue, MapweaveError, SettingsError
-from sim.worlds.catalog import KINDS, make_world, parameter_names, world_from_table
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError, SettingsError
+from mapweave.sim.worlds.catalog import KINDS, make_world, parameter_names, world_from_table
 
 
 @pytest.mark.parametrize(

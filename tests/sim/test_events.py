@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.observation import Command
-from hybridmap.errors import InvalidValue, MapweaveError
-from hybridmap.pose import Pose2
-from sim.events import KINDS, Fail, Kidnap, Light, MoveFurniture, Walk, parse_event
-from sim.robots import RobotSetup
-from sim.simulation import Simulation
-from sim.world import World
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.events import KINDS, Fail, Kidnap, Light, MoveFurniture, Walk, parse_event
+from mapweave.sim.robots import RobotSetup
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
 
 
 def test_tables_become_events() -> None:

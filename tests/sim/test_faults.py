@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.observation import Command, Odometry
-from hybridmap.pose import Pose2
-from sim.events import Fail
-from sim.faults import Faults, describe
-from sim.simulation import Simulation
-from sim.world import World
+from mapweave.agent.observation import Command, Odometry
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.events import Fail
+from mapweave.sim.faults import Faults, describe
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
 
 AXLE = 0.24
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from hybridmap.errors import InvalidValue, SettingsError
-from hybridmap.pose import Pose2, wrap_angle
-from sim.gym import MapweaveEnv
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.sim.gym import MapweaveEnv
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -36,7 +36,7 @@ def test_ten_lines_are_ten() -> None:
 
 def test_gymnasium_accepts_the_environment() -> None:
     """Spaces, seeds, types, rendering."""
-    env = gymnasium.make("sim.gym:mapweave/Park-v0", seconds=5.0, render_mode="rgb_array")
+    env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0", seconds=5.0, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.close()
 
@@ -107,7 +107,7 @@ def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.Mon
             raise ImportError(name)
         return real(name, *rest, **more)
 
-    monkeypatch.delitem(sys.modules, "sim.gym")
+    monkeypatch.delitem(sys.modules, "mapweave.sim.gym")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(SettingsError, match=r"pip install mapweave\[gym\]"):
-        importlib.import_module("sim.gym")
+        importlib.import_module("mapweave.sim.gym")

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.drivers.messages import AGAIN, StepRequest
-from agent.observation import Command
-from hybridmap.errors import InvalidValue
-from sim.lockstep import Lockstep
+from mapweave.agent.drivers.messages import AGAIN, StepRequest
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim.lockstep import Lockstep
 
 
 @dataclass

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.errors import InvalidValue
-from sim.simulation import Simulation
-from sim.world import World
-from sim.worlds.office import DOOR, make_office
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
+from mapweave.sim.worlds.office import DOOR, make_office
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 SEEDS = range(9)
 SCALE = 40

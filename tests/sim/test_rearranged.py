@@ -8,14 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.errors import InvalidValue
-from tests.sim.measured_world import (
-    SEEDS,
-    Drawing,
-    check_panels,
-    local_to,
-    world_of,
-)
+from mapweave.hybridmap.errors import InvalidValue
+from tests.sim.measured_world import SEEDS, Drawing, check_panels, local_to, world_of
 
 MOVING = [
     (name, seed) for name in ("office", "warehouse", "twins", "joined twins", "arena") for seed in SEEDS

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2
-from sim.renderer import Renderer
-from sim.scene import Scene
-from sim.texture import Texture
-from sim.world import Panel, PanelSet, World, upright_panel
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.scene import Scene
+from mapweave.sim.texture import Texture
+from mapweave.sim.world import Panel, PanelSet, World, upright_panel
 
 CAMERA = Camera(320, 240, 277.0, 271.0, 159.5, 118.0, mount_height=0.3, mount_forward=0.07)
 COLUMNS, ROWS = 10, 8

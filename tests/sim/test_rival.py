@@ -12,12 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
-from sim.camera import WEBCAM
-from sim.physics import Physics
-from sim.renderer import Renderer
-from sim.world import PanelSet, World
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.camera import WEBCAM
+from mapweave.sim.physics import Physics
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.world import PanelSet, World
 
 
 class TinyRenderer:

@@ -11,14 +11,14 @@ import sys
 import numpy as np
 import pytest
 
-from agent.observation import Command
-from hybridmap.errors import InvalidValue
-from hybridmap.pose import Pose2
-from sim.body import BodySettings
-from sim.robots import RobotSetup, camera_from_table
-from sim.simulation import Simulation
-from sim.world import World
-from sim.worlds.office import make_office
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.body import BodySettings
+from mapweave.sim.robots import RobotSetup, camera_from_table
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import World
+from mapweave.sim.worlds.office import make_office
 
 RANGE_NOISE = RobotSetup("r0").range_noise
 
@@ -249,15 +249,15 @@ def test_robots_see_and_sense_each_other(bare: World) -> None:
 
 
 def test_truth_is_kept_by_tick(bare: World) -> None:
-    """One posture a tick; times and names that do not exist are refused."""
+    """One pose a tick; times and names that do not exist are refused."""
     with Simulation(bare, ["r0"], 8, [Pose2(1.0, 2.0, 0.5)]) as simulation:
         for _ in range(6):
             simulation.advance({"r0": Command(0.3)})
-        stamps, postures = simulation.trajectory("r0")
+        stamps, poses = simulation.trajectory("r0")
         assert stamps.tolist() == [k * 100_000_000 for k in range(7)]
         assert simulation.truth_at("r0", 0).distance(Pose2(1.0, 2.0)) < 1e-9
         assert simulation.truth_at("r0", int(stamps[-1])) == simulation.truth("r0")
-        assert postures[-1].tolist() == simulation.truth("r0").vector.tolist()
+        assert poses[-1].tolist() == simulation.truth("r0").vector.tolist()
         for stamp_ns in (-1, 700_000_000):
             with pytest.raises(InvalidValue, match="not between"):
                 simulation.truth_at("r0", stamp_ns)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from agent.observation import Command
-from agent.vision.tracker import Tracker, TrackerSettings
-from sim.simulation import Simulation
-from sim.world import PanelSet, World
-from vision.lens import Lens
+from mapweave.agent.observation import Command
+from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.sim.simulation import Simulation
+from mapweave.sim.world import PanelSet, World
+from mapweave.vision.lens import Lens
 
 PATCH = np.array([(dx, dy) for dx in (-9, 0, 9) for dy in (-9, 0, 9)], float)
 """Around a point, px: all of it must be on one surface, or what is tracked is no point of a wall."""

@@ -13,20 +13,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import sim.worlds
-from hybridmap.camera import Camera
-from hybridmap.errors import MapweaveError
-from hybridmap.pose import Pose2
-from sim.renderer import Renderer
-from sim.world import PanelSet, World
-from sim.worlds.build import build_world
-from sim.worlds.catalog import KINDS, make_design
-from sim.worlds.design import Design, Furniture, Poster, Room, Wall
-from sim.worlds.file import ITEMS, load_design, load_world, save_design
-from sim.worlds.textures import NOTHING, PAINTERS, WALLS, WITH_ARGUMENT, Textures
-from wire.tables import build
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim import worlds
+from mapweave.sim.renderer import Renderer
+from mapweave.sim.world import PanelSet, World
+from mapweave.sim.worlds.build import build_world
+from mapweave.sim.worlds.catalog import KINDS, make_design
+from mapweave.sim.worlds.design import Design, Furniture, Poster, Room, Wall
+from mapweave.sim.worlds.file import ITEMS, load_design, load_world, save_design
+from mapweave.sim.worlds.textures import NOTHING, PAINTERS, WALLS, WITH_ARGUMENT, Textures
+from mapweave.storage.settings_file import build
 
-EXAMPLE = Path(sim.worlds.__file__).parent / "examples" / "flat.toml"
+EXAMPLE = Path(worlds.__file__).parent / "examples" / "flat.toml"
 DOCS = Path(__file__).parents[2] / "docs" / "worlds.md"
 ROOM = '[[rooms]]\nname = "room 0"\nlow = [0.0, 0.0]\nhigh = [4.0, 3.0]\n'
 """The least that a file needs."""

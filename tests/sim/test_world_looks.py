@@ -8,16 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.pose import Pose2
-from sim.world import World
-from sim.worlds.catalog import make_design
-from tests.sim.measured_world import (
-    ROBOT,
-    SEEDS,
-    corners_of,
-    picture,
-    world_of,
-)
+from mapweave.hybridmap.pose import Pose2
+from mapweave.sim.world import World
+from mapweave.sim.worlds.catalog import make_design
+from tests.sim.measured_world import ROBOT, SEEDS, corners_of, picture, world_of
 
 
 def twin_poses(world: World) -> list[Pose2]:

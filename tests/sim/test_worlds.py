@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from hybridmap.errors import InvalidValue
-from sim.worlds.catalog import make_world
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.sim.worlds.catalog import make_world
 from tests.sim.measured_world import (
     CASES,
     WORLDS,

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sim.texture import Texture
-from sim.worlds.catalog import make_world
-from sim.worlds.design import Wall
-from sim.worlds.faces import SEGMENT, cut_face, nearest_face
-from sim.worlds.layout import wall_rectangle
-from sim.worlds.light import AMBIENT, FULL, MOST, Lit
-from sim.worlds.textures import Plain
+from mapweave.sim.texture import Texture
+from mapweave.sim.worlds.catalog import make_world
+from mapweave.sim.worlds.design import Wall
+from mapweave.sim.worlds.faces import SEGMENT, cut_face, nearest_face
+from mapweave.sim.worlds.layout import wall_rectangle
+from mapweave.sim.worlds.light import AMBIENT, FULL, MOST, Lit
+from mapweave.sim.worlds.textures import Plain
 
 LAMPS = ((1.0, 2.0, 2.15), (4.0, 2.0, 2.15))
 

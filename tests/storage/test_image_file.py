@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.camera import Camera
-from hybridmap.errors import DeviceError
-from storage.image_file import decode_grey, image_size, read_grey
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.storage.image_file import decode_grey, image_size, read_grey
 
 CAMERA = Camera(64, 48, 60, 60, 32, 24, 0.3)
 

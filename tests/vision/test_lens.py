@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from vision.lens import Lens
+from mapweave.hybridmap.camera import Camera
+from mapweave.vision.lens import Lens
 
 CAMERA = Camera(320, 240, 277.0, 276.0, 158.0, 121.0, mount_height=0.3)
 IDEAL = Lens(CAMERA)

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from agent.observation import RobotDescription
-from hybridmap.camera import Camera
-from vision.lens import Lens
-from vision.sift import Sift, SiftSettings
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift, SiftSettings
 
 CAMERA = Camera(320, 240, 277.0, 276.0, 158.0, 121.0, mount_height=0.3)
 IDEAL = Lens(CAMERA)

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.descriptor import quantise
-from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.ranges import Ranges
-from hybridmap.wake import FURTHEST, LONGEST, MOST, Wake
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.hybridmap.trajectory_segment import FURTHEST, LONGEST, MOST, TrajectorySegment
 from synthetic.world import random_vectors
 from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet
 
@@ -33,8 +33,8 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @st.composite
-def postures(draw: st.DrawFn) -> PoseGaussian:
-    """Postures whose covariance may be singular and may mix large and small variances."""
+def poses(draw: st.DrawFn) -> PoseGaussian:
+    """Poses whose covariance may be singular and may mix large and small variances."""
     random = np.random.default_rng(draw(seeds))
     scales = 10.0 ** np.array([draw(st.floats(-6, 1)) for _ in range(3)])
     root = random.normal(size=(3, draw(st.integers(0, 4)))) * scales[:, None]
@@ -75,12 +75,16 @@ def ranges(draw: st.DrawFn) -> Ranges:
 
 
 @st.composite
-def wakes(draw: st.DrawFn, ranges: Ranges) -> Wake:
+def wakes(draw: st.DrawFn, ranges: Ranges) -> TrajectorySegment:
     count = draw(st.integers(0, MOST))
     random = np.random.default_rng(draw(seeds))
-    postures = random.uniform([-FURTHEST, -FURTHEST, -3.1], [FURTHEST, FURTHEST, 3.1], (count, 3))
+    poses = random.uniform([-FURTHEST, -FURTHEST, -3.1], [FURTHEST, FURTHEST, 3.1], (count, 3))
     distances = np.minimum(random.uniform(0, 2 * ranges.reach, (count, len(ranges))), ranges.reach)
-    return Wake(np.sort(random.uniform(-LONGEST, LONGEST, count)), postures, distances) if count else Wake()
+    return (
+        TrajectorySegment(np.sort(random.uniform(-LONGEST, LONGEST, count)), poses, distances)
+        if count
+        else TrajectorySegment()
+    )
 
 
 @st.composite
@@ -93,7 +97,7 @@ def nodes(draw: st.DrawFn) -> Node:
     return Node(
         draw(node_ids),
         stamp_ns,
-        draw(postures()),
+        draw(poses()),
         camera,
         draw(landmarks(camera)),
         clock,
@@ -112,7 +116,7 @@ def edges(draw: st.DrawFn) -> Edge:
     index = st.integers(0, draw(st.sampled_from([3, 255, 256, 1999])))
     pairs = draw(st.lists(st.tuples(index, index), max_size=20))
     return Edge(
-        own, a, b, draw(postures()), draw(st.sampled_from(EdgeKind)),
+        own, a, b, draw(poses()), draw(st.sampled_from(EdgeKind)),
         np.array(pairs, np.int64).reshape(-1, 2),
         draw(st.dictionaries(names, st.floats(0.0, 2000.0), max_size=6)),
     )  # fmt: skip
@@ -141,11 +145,9 @@ def sample_node(count: int = 150, number: int = 17, map_id: MapId = MAP, seed: i
     depths[::5] = np.nan
     pixels = (random.uniform(0, 1, (count, 2)) * [319, 239]).astype(np.float32)
     codes = quantise(random_vectors(count, random))
-    posture = PoseGaussian.from_sigmas(Pose2(1.2345, -2.0, 0.3), 0.02, 0.01)
+    pose = PoseGaussian.from_sigmas(Pose2(1.2345, -2.0, 0.3), 0.02, 0.01)
     stamp_ns = 1_700_000_000_000_000_000
-    return Node(
-        NodeId(*map_id, number), stamp_ns, posture, CAMERA, Landmarks(pixels, codes, depths, depths / 8)
-    )
+    return Node(NodeId(*map_id, number), stamp_ns, pose, CAMERA, Landmarks(pixels, codes, depths, depths / 8))
 
 
 def sample_edge(count: int = 60, map_id: MapId = MAP) -> Edge:
@@ -153,9 +155,9 @@ def sample_edge(count: int = 60, map_id: MapId = MAP) -> Edge:
     random = np.random.default_rng(1)
     shared = np.stack([random.permutation(150)[:count], random.permutation(150)[:count]], axis=1)
     evidence = {"inliers": 43.0, "rms_px": 0.613}
-    posture = PoseGaussian.from_sigmas(Pose2(0.5, 0.1, 0.2), 0.01, 0.01)
+    pose = PoseGaussian.from_sigmas(Pose2(0.5, 0.1, 0.2), 0.01, 0.01)
     a, b = NodeId(*map_id, 16), NodeId(*map_id, 17)
-    return Edge(NodeId(*map_id, 18), a, b, posture, EdgeKind.MAPPED, shared, evidence)
+    return Edge(NodeId(*map_id, 18), a, b, pose, EdgeKind.MAPPED, shared, evidence)
 
 
 def sample_changes() -> list[Change]:
@@ -174,7 +176,7 @@ def sample_changes() -> list[Change]:
 def some() -> SimpleNamespace:
     """Strategies and samples, by name."""
     return SimpleNamespace(
-        bodies=bodies(), nodes=nodes(), edges=edges(), postures=postures(), node_ids=node_ids, names=names,
+        bodies=bodies(), nodes=nodes(), edges=edges(), poses=poses(), node_ids=node_ids, names=names,
         cameras=cameras(), landmarks=landmarks, node=sample_node, edge=sample_edge, changes=sample_changes,
         map=MAP, camera=CAMERA,
     )  # fmt: skip

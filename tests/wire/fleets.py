@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from mapweave.wire.bus import Bus, Reply, Sample
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.zenoh_bus import ZenohBus
 from tests.waiting import eventually, free_port
-from wire.bus import Bus, Reply, Sample
-from wire.bus_settings import BusSettings
-from wire.memory import MemoryBus, MemoryHub
-from wire.zenoh_bus import ZenohBus
 
 
 class Fleet(Protocol):

@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from hybridmap.errors import Busy, InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError
+from mapweave.wire.bus import Reply, Request, Sample
 from tests.waiting import eventually
 from tests.wire.fleets import Fleet, settle, subscribe
-from wire.bus import Reply, Request, Sample
 
 
 def test_a_message_comes_with_key_payload_and_attachment(fleet: Fleet) -> None:
@@ -133,7 +133,7 @@ def test_handlers_that_raise(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> 
 
     server.serve("expected", expected)
     server.serve("unexpected", unexpected)
-    with caplog.at_level(logging.CRITICAL + 1, logger="wire.dispatch"):
+    with caplog.at_level(logging.CRITICAL + 1, logger="mapweave.wire.dispatch"):
         settle(asker, "unexpected")
         settle(asker, "expected")
         assert asker.ask("expected", b"", 3.0) == [Reply(error="the reason in words")]

@@ -7,10 +7,10 @@ import time
 
 import pytest
 
-from hybridmap.errors import NotConnected
+from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire.bus import Reply, Request, Sample
 from tests.waiting import eventually
 from tests.wire.fleets import Fleet, settle, subscribe
-from wire.bus import Reply, Request, Sample
 
 
 def test_who_is_alive_before_and_after(fleet: Fleet) -> None:

@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from hybridmap.change import Change, EdgePut, NodePut, NodeRetired
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import Edge, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from wire.codec import decode_body, decode_change, element_of, encode_body, encode_change
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import Edge, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.wire.codec import decode_body, decode_change, element_of, encode_body, encode_change
 
 data = st.data()
 

@@ -11,13 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplanation, Standing, Witness
-from hybridmap.node import MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.ruling import Ruling
-from synthetic.world import room, take_map
-from wire.explanation_messages import (
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.explanation import (
+    MapsExplanation,
+    Misfit,
+    NearMiss,
+    PairExplanation,
+    Standing,
+    Witness,
+)
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.wire.explanation_messages import (
     ExplainRequest,
     decode_explain_request,
     decode_maps,
@@ -28,6 +34,7 @@ from wire.explanation_messages import (
     encode_pair,
     encode_ruling,
 )
+from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 2)
 NODE_A, NODE_B = NodeId("a", 1, 3), NodeId("b", 2, 5)
@@ -41,12 +48,12 @@ def nodes() -> tuple[Node, Node]:
 
 def explanation() -> PairExplanation:
     a, b = nodes()
-    posture = PoseGaussian.from_sigmas(Pose2(0.25, -0.5, 0.125), 0.5, 0.25)
-    matches, misfit = np.array([[1, 2], [3, 4]]), Misfit(posture, np.array([0.1, 0.2, -0.3]), 4.5, False)
+    pose = PoseGaussian.from_sigmas(Pose2(0.25, -0.5, 0.125), 0.5, 0.25)
+    matches, misfit = np.array([[1, 2], [3, 4]]), Misfit(pose, np.array([0.1, 0.2, -0.3]), 4.5, False)
     return PairExplanation(
-        a, b, Standing.LINKED, "because", matches, matches[:1], np.array([math.nan]), posture,
+        a, b, Standing.LINKED, "because", matches, matches[:1], np.array([math.nan]), pose,
         {"inliers": 12.0, "rms_px": 0.7}, 0.9, misfit, (Witness(NODE_A, NODE_B, 2.5, True, False),),
-        ("a has recognised the one at the other",), (Ruling((A, B), True, "anna", 1, "why"),),
+        ("a has recognised the one at the other",), (ManualConstraint((A, B), True, "anna", 1, "why"),),
     )  # fmt: skip
 
 
@@ -83,7 +90,7 @@ words = st.text(st.characters(codec="utf-8", categories=["L", "N", "P", "Zs"]), 
 )
 counts = st.integers(0, 2**40)
 rulings = st.builds(
-    Ruling,
+    ManualConstraint,
     st.tuples(ids, ids).filter(lambda e: e[0] != e[1])
     | st.tuples(ids, ids).map(lambda e: (e[0].map, e[1].map)).filter(lambda e: e[0] != e[1]),
     st.booleans(), words, st.integers(0, 2**62), words,
@@ -101,7 +108,7 @@ def test_maps_come_back(told: tuple[MapsExplanation, ...]) -> None:
 
 
 @given(rulings)
-def test_rulings_and_questions_come_back(ruling: Ruling) -> None:
+def test_rulings_and_questions_come_back(ruling: ManualConstraint) -> None:
     assert decode_ruling(encode_ruling(ruling)) == ruling
     request = ExplainRequest(ruling.ends)
     assert decode_explain_request(encode_explain_request(request)) == request

@@ -14,15 +14,31 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hybridmap.change import NodePut
-from hybridmap.errors import InvalidMessage
-from hybridmap.explanation import MapsExplanation, Misfit, NearMiss, PairExplanation, Standing, Witness
-from hybridmap.node import EdgeKind, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
-from hybridmap.ruling import Ruling
-from wire.codec import decode_body, decode_change, encode_body, encode_change
-from wire.explanation_messages import (
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.explanation import (
+    MapsExplanation,
+    Misfit,
+    NearMiss,
+    PairExplanation,
+    Standing,
+    Witness,
+)
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import (
+    Certainty,
+    KnownAnswer,
+    RelocalizeAnswer,
+    RouteAnswer,
+    RouteLeg,
+    View,
+    Whereabouts,
+)
+from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
+from mapweave.wire.codec import decode_body, decode_change, encode_body, encode_change
+from mapweave.wire.explanation_messages import (
     ExplainRequest,
     decode_explain_request,
     decode_maps,
@@ -33,7 +49,7 @@ from wire.explanation_messages import (
     encode_pair,
     encode_ruling,
 )
-from wire.log_messages import (
+from mapweave.wire.log_messages import (
     Ack,
     Head,
     LogAnswer,
@@ -43,8 +59,7 @@ from wire.log_messages import (
     decode_record,
     encode_record,
 )
-from wire.mapfile import MapFile, pack_map_file, unpack_map_file
-from wire.messages import (
+from mapweave.wire.messages import (
     KnownRequest,
     RouteRequest,
     decode_known_answer,
@@ -60,8 +75,8 @@ from wire.messages import (
     encode_route_request,
     encode_view,
 )
-from wire.packing import _exceeds
-from wire.posture_messages import MergedPosture, PostureNews
+from mapweave.wire.packing import _exceeds
+from mapweave.wire.pose_messages import MergedPose, PoseNews
 
 Decoder = Callable[[bytes], object]
 
@@ -80,7 +95,7 @@ def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
         (decode_body, encode_body(NodePut(some.node(5)))),
         (Mark.decode, Mark(7, 2**63).encode()),
         (Head.decode, Head(5, 7, {"s0": 3, "s1": 7}).encode()),
-        (partial(PostureNews.decode, agent="r0"), postures(node, NodeId("r0", 4, 9)).encode("r0")),
+        (partial(PoseNews.decode, agent="r0"), poses(node, NodeId("r0", 4, 9)).encode("r0")),
         (Ack.decode, Ack(some.map, 5, 7, (Refusal(3, "because"), Refusal(5, "of this"))).encode()),
         (LogRequest.decode, LogRequest(3, 200).encode()),
         (LogAnswer.decode, LogAnswer(5, 3, 6, ((3, b"abc"), (5, b""))).encode()),
@@ -97,22 +112,22 @@ def messages(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
     ]  # fmt: skip
 
 
-def postures(node: Node, gone: NodeId) -> PostureNews:
+def poses(node: Node, gone: NodeId) -> PoseNews:
     """Of two maps in two frames, and one that is gone."""
     own, other = NodeId("r0", 3, 5), NodeId("r0", 4, 2)
-    places = {own: MergedPosture(own, Pose2(1, 2, 3)), other: MergedPosture(node.id, Pose2(-1, 0.5, 0))}
-    return PostureNews(2**63, 4, 5, places, (gone,))
+    places = {own: MergedPose(own, Pose2(1, 2, 3)), other: MergedPose(node.id, Pose2(-1, 0.5, 0))}
+    return PoseNews(2**63, 4, 5, places, (gone,))
 
 
-def explanations(some: SimpleNamespace, a: Node, posture: PoseGaussian) -> list[tuple[Decoder, bytes]]:
+def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tuple[Decoder, bytes]]:
     """Of two nodes and two maps, with the questions and rulings."""
     b, (one, two) = replace(a, id=NodeId("r1", 1, 1)), (a.id.map, MapId("r1", 1))
-    ruling = Ruling((a.id, b.id), True, "anna", 5, "two kitchens")
+    ruling = ManualConstraint((a.id, b.id), True, "anna", 5, "two kitchens")
     pairs = np.array([[1, 2], [3, 4]])
-    misfit = Misfit(posture, np.zeros(3), 1.5, False)
+    misfit = Misfit(pose, np.zeros(3), 1.5, False)
     witness = Witness(a.id, b.id, 2.5, True, False)
     pair = PairExplanation(
-        a, b, Standing.LINKED, "why", pairs, pairs[:1], np.array([0.5]), posture, {"inliers": 12.0}, 0.9,
+        a, b, Standing.LINKED, "why", pairs, pairs[:1], np.array([0.5]), pose, {"inliers": 12.0}, 0.9,
         misfit, (witness,), ("r0 says so",), (ruling,),
     )  # fmt: skip
     near = NearMiss(a.id, b.id, 5, 3, "too few")
@@ -278,8 +293,8 @@ def messages_once(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
     return _once
 
 
-def test_postures_come_back_as_they_were(some: SimpleNamespace) -> None:
-    news = postures(some.node(3), NodeId("r0", 4, 9))
-    assert PostureNews.decode(news.encode("r0"), "r0") == news
+def test_poses_come_back_as_they_were(some: SimpleNamespace) -> None:
+    news = poses(some.node(3), NodeId("r0", 4, 9))
+    assert PoseNews.decode(news.encode("r0"), "r0") == news
     with pytest.raises(InvalidMessage, match="r0's nodes, not of r1's"):
-        PostureNews.decode(news.encode("r0"), "r1")
+        PoseNews.decode(news.encode("r0"), "r1")

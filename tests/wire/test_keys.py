@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import MapId
-from wire.keyexpr import check_key, check_pattern, intersects
-from wire.keys import Keys
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId
+from mapweave.wire.keyexpr import check_key, check_pattern, intersects
+from mapweave.wire.keys import Keys
 
 KEYS = Keys("warehouse")
 names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
@@ -40,7 +40,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
         KEYS.agents_alive(): KEYS.agent_alive(one),
         KEYS.agent_statuses(): KEYS.agent_status(one.agent),
         KEYS.acks(one.agent): KEYS.ack(server, one.agent),
-        KEYS.all_postures(server): KEYS.postures(server, one.agent),
+        KEYS.all_poses(server): KEYS.poses(server, one.agent),
         KEYS.any_relocalize(): KEYS.relocalize(server),
         KEYS.any_route(): KEYS.route(server),
         KEYS.any_known(): KEYS.known(server),

@@ -17,20 +17,20 @@ import skimage.data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from hybridmap.change import Change, NodePut
-from hybridmap.descriptor import encode
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.grid import settle
-from hybridmap.landmark_tables import landmark_tables
-from hybridmap.node import Landmarks, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.ranges import Ranges
-from registration.recognition import Recognition, examine_nodes
-from registration.selection import SelectionSettings, choose
-from tests.hybridmap.kernel_forms import in_numpy
-from wire.codec import decode_body, encode_body, encode_change
-from wire.landmark_codec import (
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.descriptor import encode
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.landmark_tables import landmark_tables
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.quantization import settle
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.registration.recognition import Recognition, examine_nodes
+from mapweave.registration.selection import SelectionSettings, choose
+from mapweave.storage.map_file import read_map_file
+from mapweave.wire.codec import decode_body, encode_body, encode_change
+from mapweave.wire.landmark_codec import (
     MAX_LANDMARKS,
     MAX_LANDMARKS_BYTES,
     pack_features,
@@ -38,7 +38,7 @@ from wire.landmark_codec import (
     unpack_features,
     unpack_landmarks,
 )
-from wire.mapfile import read_map_file
+from tests.hybridmap.kernel_forms import in_numpy
 
 data = st.data()
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)

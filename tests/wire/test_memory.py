@@ -8,12 +8,12 @@ import threading
 import numpy as np
 import pytest
 
-from hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import SettingsError
+from mapweave.wire.bus import Reply, Request, Sample
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.dispatch import Dispatcher
+from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
 from tests.waiting import eventually
-from wire.bus import Reply, Request, Sample
-from wire.bus_settings import BusSettings
-from wire.dispatch import Dispatcher
-from wire.memory import Faults, MemoryBus, MemoryHub
 
 
 def run(faults: Faults, count: int = 300, seed: int = 1) -> list[int]:

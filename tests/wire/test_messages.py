@@ -9,11 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.node import EdgeKind, MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
-from wire.log_messages import (
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import (
+    Certainty,
+    KnownAnswer,
+    RelocalizeAnswer,
+    RouteAnswer,
+    RouteLeg,
+    View,
+    Whereabouts,
+)
+from mapweave.wire.log_messages import (
     Ack,
     Head,
     LogAnswer,
@@ -23,7 +31,7 @@ from wire.log_messages import (
     decode_record,
     encode_record,
 )
-from wire.messages import (
+from mapweave.wire.messages import (
     MAX_KNOWN,
     KnownRequest,
     RouteRequest,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.errors import InvalidMessage, InvalidValue
-from hybridmap.ranges import Ranges
-from wire.range_codec import pack_ranges, unpack_ranges
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.wire.range_codec import pack_ranges, unpack_ranges
 
 
 @given(st.binary(max_size=80))

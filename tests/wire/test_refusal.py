@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wire.bus import Reply
-from wire.refusal import LONGEST_PAUSE, MARK, decode_refusal, encode_refusal
+from mapweave.wire.bus import Reply
+from mapweave.wire.refusal import LONGEST_PAUSE, MARK, decode_refusal, encode_refusal
 
 
 @given(

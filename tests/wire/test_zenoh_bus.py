@@ -9,11 +9,11 @@ import time
 
 import pytest
 
-from hybridmap.errors import NotConnected
+from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire.bus import Sample
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.zenoh_bus import ZenohBus
 from tests.waiting import eventually, free_port
-from wire.bus import Sample
-from wire.bus_settings import BusSettings
-from wire.zenoh_bus import ZenohBus
 
 
 def test_a_client_may_come_before_its_router() -> None:
@@ -88,8 +88,8 @@ def test_the_interpreter_exits_cleanly(declaring_thread_is_daemon: bool, closes:
     """Whether the bus is closed or forgotten, declared from a daemon thread or not, with a question open."""
     program = f"""
 import threading, time
-from wire.bus_settings import BusSettings
-from wire.zenoh_bus import ZenohBus
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.zenoh_bus import ZenohBus
 listen = ("tcp/127.0.0.1:{free_port()}",)
 router = ZenohBus(BusSettings(mode="router", listen=listen))
 client = ZenohBus(BusSettings(endpoints=listen))

@@ -38,12 +38,12 @@ function picture(parent, pair) {
     draw(svg, "circle", { cx: x + shift[side], cy: y, r: 1.3, fill: "#333" })));
   const alike = pair.matches.filter(match => !agree.has(String(match))).length;
   add(parent, "small", "Dots are landmarks; images are not kept. " +
-    `${pair.shared.length} agree on one posture: dark where it predicts them, yellow where it is ` +
+    `${pair.shared.length} agree on one pose: dark where it predicts them, yellow where it is ` +
     `${BAD_PX} px off. ${alike} look alike and do not agree: grey.`);
 }
 const metres = ([x, y, turn]) =>
   `${x.toFixed(3)} m ahead, ${y.toFixed(3)} m left, ${(turn * 180 / Math.PI).toFixed(1)}\u00b0`;
-function posture(gaussian) {
+function pose(gaussian) {
   const sigma = [0, 1, 2].map(k => Math.sqrt(gaussian.covariance[k][k]));
   return `${metres(gaussian.mean)} (sigma ${sigma[0].toFixed(3)} m, ${sigma[1].toFixed(3)} m, ` +
     `${(sigma[2] * 180 / Math.PI).toFixed(1)}\u00b0)`;
@@ -57,8 +57,8 @@ function showPair(pair) {
   add(box, "p", `${pair.a} and ${pair.b}: ${pair.standing}: ${pair.reason}.`);
   if (pair.evidence.doubles)
     add(box, "p", `${pair.evidence.doubles} of the landmarks that agree are found at other places too.`);
-  if (pair.a_from_b) add(box, "p", "Seen from the first, the second is " + posture(pair.a_from_b) + ".");
-  if (pair.misfit) add(box, "p", `In the map it is ${posture(pair.misfit.merged_a_from_b)}; off by ` +
+  if (pair.a_from_b) add(box, "p", "Seen from the first, the second is " + pose(pair.a_from_b) + ".");
+  if (pair.misfit) add(box, "p", `In the map it is ${pose(pair.misfit.merged_a_from_b)}; off by ` +
     `${metres(pair.misfit.off)}, ${Math.sqrt(pair.misfit.strain2).toFixed(1)} standard deviations` +
     (pair.misfit.alone ? "; nothing else says how they stand." : "."));
   if (pair.probability !== null) {
@@ -98,7 +98,7 @@ function showTwo(one) {
   const box = add(told, "section", "", one.joined ? "good" : "");
   add(box, "p", one.reason);
   if (!one.joined)
-    add(box, "p", `${one.refused} links refused, ${one.unverified} alike pairs without a common posture.`);
+    add(box, "p", `${one.refused} links refused, ${one.unverified} alike pairs without a common pose.`);
   if (one.nearest.length) add(box, "p", one.joined ? "Weakest links:" : "Nearest to a link:");
   const list = add(box, "ul");
   for (const n of one.nearest) {

@@ -6,17 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agent.ekf.mapping import FilterSettings, MappingFilter
-from agent.ekf.report import Health
-from agent.observation import Odometry
-from hybridmap.pose import Pose2
-from synthetic.mapping_run import (
-    AXLE,
-    SHAPES,
-    WHEEL_NOISE,
-    MappingRun,
-    draw_run,
-)
+from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.update_report import Health
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Pose2
+from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
 
 FIRST, LAST, END = 150, 170, 300
 """The fault lasts from one step to the other; the run goes on until the end."""
@@ -62,7 +56,7 @@ def scrambled(run: MappingRun, k: int) -> tuple[Odometry, np.ndarray | None]:
 
 
 def drive(run: MappingRun, fault: Fault) -> tuple[MappingFilter, list[Health], list[float], list[float]]:
-    """Health, trace of the posture's covariance, and squared distance from the truth after each step."""
+    """Health, trace of the pose's covariance, and squared distance from the truth after each step."""
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))
     ids = np.arange(len(run.points))
     filter_.add(ids, run.pixels[0])
@@ -111,7 +105,7 @@ def test_without_sight_the_doubt_grows_and_is_named(
 
 
 @pytest.mark.parametrize("fault", [silent_encoders, spiking_encoder])
-def test_wheels_that_lie_are_named_and_the_image_holds_the_posture(run: MappingRun, fault: Fault) -> None:
+def test_wheels_that_lie_are_named_and_the_image_holds_the_pose(run: MappingRun, fault: Fault) -> None:
     filter_, health, _, distances = drive(run, fault)
     lies = [
         k

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from agent.ekf.gating import believe, chi_squares, one_point_consensus, pixel_gate
-from agent.ekf.innovations import leave_one_out, whiten
+from mapweave.agent.ekf.gating import believe, chi_squares, one_point_consensus, pixel_gate
+from mapweave.agent.ekf.innovations import leave_one_out, whiten
 
 
 def joint(n: int, shared: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from agent.ekf.innovations import (
+from mapweave.agent.ekf.innovations import (
     LEAF,
     examine,
     innovation_covariance,
@@ -14,24 +14,24 @@ from agent.ekf.innovations import (
     wheel_errors,
     whiten,
 )
-from agent.ekf.motion import move_posture, move_rays, propagate
-from agent.ekf.moving_state import MovingState, Step
-from agent.ekf.report import Health
-from agent.ekf.sighting import Pinhole, Sighting, slots_of
-from agent.observation import Odometry
-from hybridmap.camera import Camera
+from mapweave.agent.ekf.mapping_state import MappingState, Step
+from mapweave.agent.ekf.measurement_model import ImageMeasurement, Pinhole, slots_of
+from mapweave.agent.ekf.motion import move_pose, move_rays, propagate
+from mapweave.agent.ekf.update_report import Health
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.camera import Camera
 
 sizes = st.tuples(st.integers(1, 14), st.integers(0, 2**32 - 1))
 steps = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.8, 0.8), st.floats(-0.2, 0.2))
 
 
-def scene(n: int, seed: int) -> tuple[np.random.Generator, MovingState]:
-    """A posture, rays, and a covariance whose entries are of very different sizes."""
+def scene(n: int, seed: int) -> tuple[np.random.Generator, MappingState]:
+    """A pose, rays, and a covariance whose entries are of very different sizes."""
     rng = np.random.default_rng(seed)
     size = 3 + 3 * n
     root = rng.normal(size=(size, size)) * 10.0 ** rng.uniform(-4, 0, (size, 1))
     rays = np.column_stack([rng.uniform(-0.6, 0.6, n), rng.uniform(-0.5, 0.5, n), rng.uniform(0.0, 1.5, n)])
-    return rng, MovingState(rng.normal(size=3), rays, root @ root.T / size)
+    return rng, MappingState(rng.normal(size=3), rays, root @ root.T / size)
 
 
 def some_slots(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -81,13 +81,13 @@ def test_a_step_is_linearised_where_it_is_asked(
     measured = Odometry(forward + rng.normal(0, 0.02), turn + rng.normal(0, 0.05)) if elsewhere else at
     wheel_root, side_slip, variances = rng.normal(size=(2, 2)) * 0.01, 0.003, rng.random(3)
     taken = Step(state, measured, wheel_root, side_slip, variances, mount, at, state.pose_vector, state.rays)
-    pose_vector, by_posture, posture_by_input = move_posture(state.pose_vector, at)
+    pose_vector, by_pose, pose_by_input = move_pose(state.pose_vector, at)
     moved = move_rays(state.rays, at, mount)
     if moved.scale.min() < 0.05:
         return
-    by_input = np.concatenate([posture_by_input, moved.by_input.reshape(-1, 3)])
+    by_input = np.concatenate([pose_by_input, moved.by_input.reshape(-1, 3)])
     dense = np.zeros_like(state.covariance)
-    dense[:3, :3] = by_posture
+    dense[:3, :3] = by_pose
     for i in range(n):
         dense[3 + 3 * i : 6 + 3 * i, 3 + 3 * i : 6 + 3 * i] = moved.by_ray[i]
     covariance = dense @ state.covariance @ dense.T
@@ -227,7 +227,7 @@ def test_what_is_in_sight(size: tuple[int, int], in_order: bool) -> None:
     rows = [k for k in range(len(ids)) if int(ids[k]) in place and np.isfinite(pixels[k]).all()]
     believed, innovations = rng.random(len(rows)) < 0.5, rng.normal(size=(len(rows), 2))
     assert slots_of(held, ids).tolist() == [place.get(int(landmark), -1) for landmark in ids]
-    seen = Sighting.of(held, ids, pixels, pinhole)
+    seen = ImageMeasurement.of(held, ids, pixels, pinhole)
     assert seen.rows.tolist() == rows
     assert seen.slots.tolist() == [place[int(ids[k])] for k in rows]
     np.testing.assert_allclose(pinhole.pixels(seen.slopes), pixels[rows], atol=1e-10)

@@ -1,12 +1,12 @@
-"""The closed forms of agent.ekf.motion against point transforms and finite differences."""
+"""The closed forms of mapweave.agent.ekf.motion against point transforms and finite differences."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.ekf.motion import WheelNoise, move_posture, move_rays
-from agent.observation import Odometry
-from hybridmap.pose import Pose2
+from mapweave.agent.ekf.motion import WheelNoise, move_pose, move_rays
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Pose2
 
 steps = st.builds(Odometry, st.floats(-0.2, 0.2), st.floats(-0.4, 0.4))
 mounts = st.sampled_from([0.0, 0.1, -0.07])
@@ -69,17 +69,15 @@ def test_jacobians_of_rays(step: Odometry, mount: float, seed: int) -> None:
 
 
 @given(steps, st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3))
-def test_posture_moves_by_composition_and_its_jacobians(step: Odometry, x: float, y: float, h: float) -> None:
+def test_pose_moves_by_composition_and_its_jacobians(step: Odometry, x: float, y: float, h: float) -> None:
     pose_vector = np.array([x, y, h])
-    after, by_posture, by_input = move_posture(pose_vector, step)
+    after, by_pose, by_input = move_pose(pose_vector, step)
     expected = Pose2.from_vector(pose_vector) @ step.motion()
     np.testing.assert_allclose(after[:2], expected.vector[:2], atol=1e-12)
     assert abs(np.sin(after[2] - expected.heading)) < 1e-12
-    np.testing.assert_allclose(
-        by_posture, derivative(lambda p: move_posture(p, step)[0], pose_vector), atol=1e-8
-    )
+    np.testing.assert_allclose(by_pose, derivative(lambda p: move_pose(p, step)[0], pose_vector), atol=1e-8)
     u = np.array([step.forward, step.turn, 0.0])
-    numeric = derivative(lambda v: move_posture(pose_vector, Odometry(v[0], v[1]), v[2])[0], u)
+    numeric = derivative(lambda v: move_pose(pose_vector, Odometry(v[0], v[1]), v[2])[0], u)
     np.testing.assert_allclose(by_input, numeric, atol=1e-8)
 
 

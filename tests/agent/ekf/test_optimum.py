@@ -7,21 +7,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from agent.ekf.mapping import FilterSettings, MappingFilter
-from synthetic.mapping_error import (
-    error,
-    filter_error,
-    follow,
-    landmark_nees,
-)
+from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from synthetic.mapping_error import error, filter_error, follow, landmark_nees
 from synthetic.mapping_optimum import batch_optimum
-from synthetic.mapping_run import (
-    AXLE,
-    SHAPES,
-    WHEEL_NOISE,
-    MappingRun,
-    draw_run,
-)
+from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
 from synthetic.track_faults import spoil
 
 RUNS = 20
@@ -50,7 +39,7 @@ def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) ->
     assert max(ratios) < 1.25
 
 
-def test_posture_is_as_far_off_as_it_says(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+def test_pose_is_as_far_off_as_it_says(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     """Average NEES in its interval; with each step linearised only where the wheels say, it is 8 to 10."""
     nees = [filter_.pose.mahalanobis2(run.poses[-1]) for run, filter_ in runs]
     low, high = INTERVAL

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agent.global_localization.candidates import FleetMap, OwnMap
-from agent.global_localization.global_localization import GlobalLocalization
-from agent.mission import Answer, Question, WhereAmI, WhichWay
-from agent.motion_primitives import NO_ANSWER, MotionPrimitives
-from agent.observation import Observation, Odometry
-from agent.tally import Tally
-from hybridmap.change import NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.query import RouteAnswer
+from mapweave.agent.drive_statistics import DriveStatistics
+from mapweave.agent.global_localization.candidates import FleetMap, OwnMap
+from mapweave.agent.global_localization.global_localization import GlobalLocalization
+from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
+from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
+from mapweave.agent.observation import Observation, Odometry
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import RouteAnswer
 from synthetic.world import take_map
 from tests.agent.scripted_fleet import (
     BODY,
@@ -67,7 +67,7 @@ def test_it_drives_elsewhere_to_tell_two_places_apart(home):
     trial.run(60.0, lambda: trial.navigator.fix is not None)
     assert trial.navigator.fix is not None and trial.navigator.fix.node == A
     assert any("driving on to look from elsewhere" in detail for _, detail in trial.said)
-    assert trial.navigator.tally == Tally(relocalizations=1)
+    assert trial.navigator.tally == DriveStatistics(relocalizations=1)
     turned = sum(abs(command.turn) for command in trial.commands) * BODY.tick
     assert turned > math.tau, "first it looked all around"
 

@@ -9,22 +9,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from agent.global_localization.global_localization import MOVE
-from agent.global_localization.resumption import Resumption
-from agent.global_localization.settings import ResumptionSettings
-from agent.observation import Command, Observation, Odometry, RobotDescription
-from hybridmap.change import NodePut
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import CODE_BYTES, MapId
-from hybridmap.pose import Pose2, wrap_angle
-from synthetic.world import (
-    CAMERA,
-    World,
-    room,
-    take_map,
-    take_view,
-)
-from vision.sift import Features
+from mapweave.agent.global_localization.global_localization import MOVE
+from mapweave.agent.global_localization.resumption import Resumption
+from mapweave.agent.global_localization.settings import ResumptionSettings
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import CODE_BYTES, MapId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.vision.sift import Features
+from synthetic.world import CAMERA, World, room, take_map, take_view
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
 BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)
@@ -151,7 +145,7 @@ def test_it_turns_until_two_views_agree_where_it_is(home, own_map, heading):
     assert body.commands[-1] == Command()
     assert all(command.forward == 0.0 for command in body.commands)
     assert QUICK.consistency.turn <= turned(body) < math.pi, "and no further than it needs"
-    # The rangers' readings are kept with the postures from which they were taken.
+    # The rangers' readings are kept with the poses from which they were taken.
     assert len(resumption.seen) == len(body.commands)
     for odom_from_robot, _ in resumption.seen:
         assert odom_from_robot.distance(Pose2()) < 1e-9

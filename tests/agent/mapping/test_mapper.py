@@ -7,11 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from agent.mapping.mapper import Mapper
-from agent.observation import Odometry
-from hybridmap.change import NodePut
-from hybridmap.node import MapId
-from hybridmap.pose import Pose2
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
 
 
 def drive(mapper, walls, positions, start=1):

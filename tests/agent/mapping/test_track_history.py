@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agent.mapping.track_history import TrackHistory
-from hybridmap.pose import Pose2
+from mapweave.agent.mapping.track_history import TrackHistory
+from mapweave.hybridmap.pose import Pose2
 
 
 def seen(*ids: int) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +70,7 @@ def test_long_drives_keep_a_bounded_even_choice():
 
 
 def test_a_new_anchor_sees_the_same_world():
-    """Only who counts as the origin changes: relative postures and pixels stay."""
+    """Only who counts as the origin changes: relative poses and pixels stay."""
     rng = np.random.default_rng(0)
     history = TrackHistory()
     drive = [Pose2(*rng.uniform(-1, 1, 3)) for _ in range(6)]

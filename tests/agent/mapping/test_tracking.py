@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from agent.mapping.placed import HERE
-from agent.mapping.track_settings import TrackingSettings
-from agent.mapping.tracking import Tracking
-from agent.observation import Observation, Odometry
-from hybridmap.pose import Pose2
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.agent.mapping.anchored_keyframe import HERE
+from mapweave.agent.mapping.tracking import Tracking
+from mapweave.agent.mapping.tracking_settings import TrackingSettings
+from mapweave.agent.observation import Observation, Odometry
+from mapweave.hybridmap.pose import Pose2
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 LEFT = 0.06
 """rad a tick."""

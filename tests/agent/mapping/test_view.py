@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.mapping.view import associate, even_choice
-from hybridmap.node import CODE_BYTES
-from vision.sift import Features
+from mapweave.agent.mapping.view import associate, even_choice
+from mapweave.hybridmap.node import CODE_BYTES
+from mapweave.vision.sift import Features
 
 places = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), max_size=14, unique=True)
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agent.observation import Command, RobotDescription
-from agent.servo.step import ServoStep
-from agent.servo.supervisor import Servo
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.servo.servo_step import ServoStep
+from mapweave.agent.servo.supervisor import Servo
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
 
 FOCAL = 160.0 / math.tan(math.radians(30.0))
 CAMERA = Camera(320, 240, FOCAL, FOCAL, 160.0, 120.0, mount_height=0.25)
@@ -32,7 +32,7 @@ def seen_by_projection(camera: Camera, pose: Pose2, points: Array) -> NDArray[np
 
 
 def unicycle(pose: Pose2, command: Command, seconds: float, steps: int) -> list[Pose2]:
-    """Postures under a constant command: Runge-Kutta of x' = v cos, y' = v sin, heading' = w."""
+    """Poses under a constant command: Runge-Kutta of x' = v cos, y' = v sin, heading' = w."""
     state, path = pose.vector, []
     v, w, dt = command.forward, command.turn, seconds / steps
 
@@ -99,7 +99,7 @@ def drive(
     ticks: int = 600,
     blind_to: tuple[int, ...] = (),
 ) -> Drive:
-    """Run the servo on a true unicycle with noisy postures; obstacle points are seen within 0.7 m."""
+    """Run the servo on a true unicycle with noisy poses; obstacle points are seen within 0.7 m."""
     walls = np.zeros((0, 2)) if obstacles is None else obstacles
     servo.start(start, points)
     run = Drive(start)

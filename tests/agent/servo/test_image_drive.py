@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from agent.observation import Command, RobotDescription
-from agent.servo.image_drive import ImageDrive
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.servo.image_drive import ImageDrive
+from mapweave.hybridmap.pose import Array, Pose2
 
 Integrate = Callable[[Pose2, Command, float, int], list[Pose2]]
 FREE = 0.8

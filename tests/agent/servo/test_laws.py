@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from agent.servo.laws import (
+from mapweave.agent.servo.laws import (
     DIRECTION,
     LAWS,
     charts,
@@ -19,9 +19,9 @@ from agent.servo.laws import (
     lyapunov_rate,
     saturate,
 )
-from agent.servo.polar import Polar, bearings, continued, polar_of
-from hybridmap.camera import Camera
-from hybridmap.pose import Pose2, wrap_angle
+from mapweave.agent.servo.polar import Polar, bearings, continued, polar_of
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 rho_ = st.floats(0.05, 4.0)
 phi_ = st.floats(0.01, 2 * math.pi - 0.01)
@@ -91,12 +91,12 @@ def test_control_has_no_hole_where_beta_tilde_vanishes() -> None:
         assert at == pytest.approx(beside, abs=1e-5)
 
 
-def test_all_equilibria_are_the_goal_posture() -> None:
+def test_all_equilibria_are_the_goal_pose() -> None:
     laws = np.arange(LAWS)
     zero = np.zeros((1, LAWS))
-    postures = law_paths(laws, zero, zero, zero)[:, 0]
-    assert np.abs(postures[:, :2]).max() == 0.0
-    assert [wrap_angle(float(h)) for h in postures[:, 2]] == pytest.approx([0.0] * LAWS, abs=1e-9)
+    poses = law_paths(laws, zero, zero, zero)[:, 0]
+    assert np.abs(poses[:, :2]).max() == 0.0
+    assert [wrap_angle(float(h)) for h in poses[:, 2]] == pytest.approx([0.0] * LAWS, abs=1e-9)
 
 
 def test_the_sign_of_each_law() -> None:

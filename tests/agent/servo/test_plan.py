@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agent.observation import RobotDescription
-from agent.servo.field import Field
-from agent.servo.lattice import FARTHEST, lattice
-from agent.servo.plan import Plan, Price, Surroundings
-from agent.servo.settings import ServoSettings
-from agent.servo.way import thorough_plan
-from agent.servo.zigzag import zigzag
-from hybridmap.camera import Camera
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import RobotDescription
+from mapweave.agent.servo.field_of_view import FieldOfView
+from mapweave.agent.servo.lattice_planner import FARTHEST, lattice_plan
+from mapweave.agent.servo.plan import Plan, Price, Surroundings
+from mapweave.agent.servo.planner import thorough_plan
+from mapweave.agent.servo.settings import ServoSettings
+from mapweave.agent.servo.two_leg_planner import two_leg_plan
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array, Pose2
 
 Seen = Callable[[Camera, Pose2, Array], NDArray[np.bool_]]
 Draw = tuple[Callable[..., Array], Callable[..., Pose2]]
@@ -46,7 +46,7 @@ def check(plan: Plan, start: Pose2, points: Array, camera: Camera, seen: Seen, w
         assert seen(camera, Pose2(0.0, 0.0, float(turned)), points).sum() >= 4
 
 
-@pytest.mark.parametrize("planner", [zigzag, lattice])
+@pytest.mark.parametrize("planner", [two_leg_plan, lattice_plan])
 def test_plans_lead_to_the_goal_in_view(
     planner: Any, robot: RobotDescription, seen: Seen, draw: Draw
 ) -> None:
@@ -56,7 +56,7 @@ def test_plans_lead_to_the_goal_in_view(
     for _ in range(15):
         points = draw_points(rng)
         start = draw_start(rng, points)
-        around = Surroundings(Field(points, robot.camera), np.zeros((0, 2)), 0.2)
+        around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
         plan = planner(around, start, 0.02, Price())
         if plan is not None:
             found += 1
@@ -74,9 +74,9 @@ def test_a_wall_in_the_way_is_driven_around(
     # The lattice's moves are longer than its cells: once they jumped through the end of the wall.
     points = np.array([[x, y, 0.3] for x in (3.0, 4.0) for y in np.linspace(-2.0, 2.0, 9)])
     wall = np.column_stack([np.full(25, -0.9), np.linspace(-half, half, 25)])
-    around = Surroundings(Field(points, robot.camera), wall, 0.2)
-    assert zigzag(Surroundings(around.field, np.zeros((0, 2)), 0.2), start, 0.02, Price()) is not None
-    plan = lattice(around, start, 0.02, Price())
+    around = Surroundings(FieldOfView(points, robot.camera), wall, 0.2)
+    assert two_leg_plan(Surroundings(around.field, np.zeros((0, 2)), 0.2), start, 0.02, Price()) is not None
+    plan = lattice_plan(around, start, 0.02, Price())
     assert plan is not None
     assert plan.length > math.hypot(start.x + 0.9, half) + math.hypot(0.9, half)
     check(plan, start, points, robot.camera, seen, wall)
@@ -89,20 +89,20 @@ def test_there_is_no_plan_out_of_a_ring(robot: RobotDescription) -> None:
     points = np.array([[3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
     angles = np.linspace(0.0, 2 * math.pi, 60)
     ring = np.column_stack([-1.6 + 0.4 * np.cos(angles), 0.4 * np.sin(angles)])
-    around = Surroundings(Field(points, robot.camera), ring, 0.2)
+    around = Surroundings(FieldOfView(points, robot.camera), ring, 0.2)
     assert thorough_plan(around, Pose2(-1.6, 0.0, 0.0), ServoSettings()) is None
 
 
 def test_there_is_no_plan_to_a_goal_that_sees_nothing(robot: RobotDescription) -> None:
     points = np.array([[-3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
-    around = Surroundings(Field(points, robot.camera), np.zeros((0, 2)), 0.2)
+    around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
     assert thorough_plan(around, Pose2(-0.5, 0.0, math.pi), ServoSettings()) is None
 
 
 def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -> None:
     points = np.array([[3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
-    around = Surroundings(Field(points, robot.camera), np.zeros((0, 2)), 0.2)
-    plan = zigzag(around, Pose2(0.5, 0.0, 0.0), 0.05, Price())
+    around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
+    plan = two_leg_plan(around, Pose2(0.5, 0.0, 0.0), 0.05, Price())
     assert plan is not None
     assert [leg.direction for leg in plan.legs] == [-1.0]
     assert plan.length == pytest.approx(0.5)
@@ -113,11 +113,11 @@ def test_the_lattice_is_bounded(robot: RobotDescription) -> None:
     rng = np.random.default_rng(1)
     points = np.array([[4.0, y, 0.3] for y in np.linspace(-2.0, 2.0, 24)])
     walls = np.column_stack([rng.uniform(-5.0, 3.0, 400), rng.uniform(1.0, 5.0, 400)])
-    around = Surroundings(Field(points, robot.camera), walls, 0.2)
+    around = Surroundings(FieldOfView(points, robot.camera), walls, 0.2)
     for far in (Pose2(-1e6, 0.0, 0.0), Pose2(0.0, -FARTHEST - 0.1, 0.0)):
-        assert lattice(around, far, 0.02, Price()) is None
+        assert lattice_plan(around, far, 0.02, Price()) is None
     tracemalloc.start()
-    lattice(around, Pose2(-FARTHEST + 0.1, 0.0, 0.0), 0.02, Price(), 0.06, 1.5)
+    lattice_plan(around, Pose2(-FARTHEST + 0.1, 0.0, 0.0), 0.02, Price(), 0.06, 1.5)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 200e6

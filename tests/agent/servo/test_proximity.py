@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from agent.observation import Command, RobotDescription
-from agent.servo.proximity import guard, ranger_points
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.servo.proximity import guard, ranger_points
+from mapweave.hybridmap.pose import Array, Pose2
 
 Integrate = Callable[[Pose2, Command, float, int], list[Pose2]]
 

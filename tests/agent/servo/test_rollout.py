@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agent.servo.laws import LAWS, control, lyapunov
-from agent.servo.polar import Polar, continued, polar_of
-from agent.servo.rollout import roll_out
-from hybridmap.pose import Pose2
+from mapweave.agent.servo.laws import LAWS, control, lyapunov
+from mapweave.agent.servo.polar import Polar, continued, polar_of
+from mapweave.agent.servo.rollout import roll_out
+from mapweave.hybridmap.pose import Pose2
 
 
 @settings(max_examples=8, deadline=None)
@@ -31,7 +31,7 @@ def test_roll_out_is_the_path_of_the_unicycle_under_each_law(rho: float, phi: fl
             here = continued(moved, here)
             path.append(moved.vector)
         fine = np.array(path)[:, :2]
-        rolled = rollouts.postures[law][:, :2]
+        rolled = rollouts.poses[law][:, :2]
         gap = np.hypot(*(rolled[:, None] - fine[None]).transpose(2, 0, 1)).min(axis=1)
         assert gap.max() < 0.03 + 0.01 * rho
 
@@ -41,10 +41,10 @@ def test_roll_outs_start_here_and_never_move_away(rho: float, phi: float, beta: 
     polar = Polar(rho, phi, beta)
     rollouts = roll_out(polar, 2.0, 0.006)
     here = polar.pose().vector
-    assert np.abs(rollouts.postures[:, 0, :2] - here[:2]).max() < 1e-9
-    turned = rollouts.postures[:, 0, 2] - here[2]
+    assert np.abs(rollouts.poses[:, 0, :2] - here[:2]).max() < 1e-9
+    turned = rollouts.poses[:, 0, 2] - here[2]
     assert np.abs(np.angle(np.exp(1j * turned))).max() < 1e-9
-    distance = np.hypot(rollouts.postures[..., 0], rollouts.postures[..., 1])
+    distance = np.hypot(rollouts.poses[..., 0], rollouts.poses[..., 1])
     assert (np.diff(distance, axis=1) <= 1e-9).all()
     assert (distance[rollouts.parked, -1] <= 0.006 + 1e-12).all()
     assert (rollouts.lengths >= rho - distance[:, -1] - 1e-9).all()
@@ -56,7 +56,7 @@ def test_a_law_parks_an_easy_start_and_lowers_its_own_function() -> None:
     assert rollouts.lengths[0] == pytest.approx(math.hypot(1.5, 0.4), rel=0.1)
     values = []
     polar = polar_of(Pose2(-1.5, 0.4, -0.2))
-    for x, y, heading in rollouts.postures[0]:
+    for x, y, heading in rollouts.poses[0]:
         polar = continued(Pose2(x, y, heading), polar)
         values.append(lyapunov(polar.rho, polar.phi, polar.beta)[0])
     assert (np.diff(values) <= 1e-9).all()

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.observation import RobotDescription
-from agent.servo.supervisor import Servo
-from hybridmap.pose import Array, Pose2
+from mapweave.agent.observation import RobotDescription
+from mapweave.agent.servo.supervisor import Servo
+from mapweave.hybridmap.pose import Array, Pose2
 
 Draw = tuple[Callable[..., Array], Callable[..., Pose2]]
 WALL_OF_POINTS = np.array([[3.0, y, 0.3] for y in np.linspace(-1.2, 1.2, 13)])
@@ -134,7 +134,7 @@ def test_landmarks_without_depth_are_ignored(robot: RobotDescription) -> None:
 def test_a_long_search_is_made_at_rest(
     robot: RobotDescription, simulate: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import agent.servo.supervisor as module
+    import mapweave.agent.servo.supervisor as module
 
     searched: list[int] = []
     run_steps: list[Any] = []

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.vision.node_tracks import NodeTracks
-from agent.vision.tracker import TrackerSettings
-from hybridmap.pose import Pose2
-from registration.recognition import recognise
-from vision.lens import Lens
-from vision.sift import Features, Sift
+from mapweave.agent.vision.node_tracks import NodeTracks
+from mapweave.agent.vision.tracker import TrackerSettings
+from mapweave.hybridmap.pose import Pose2
+from mapweave.registration.recognition import recognise
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Features, Sift
 
 HERE, BESIDE = Pose2(), Pose2(0.0, 0.02)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.vision.template import TemplateMatcher, TemplateSettings
+from mapweave.agent.vision.template import TemplateMatcher, TemplateSettings
 
 SPOTS = np.array([[x + 0.37, y - 0.21] for x in range(60, 280, 40) for y in range(50, 200, 35)])
 

@@ -7,11 +7,11 @@ import copy
 import numpy as np
 import pytest
 
-from agent.vision.tracker import Tracker, TrackerSettings
-from hybridmap.camera import Camera
-from hybridmap.errors import InvalidValue
-from vision.lens import Lens
-from vision.sift import Sift
+from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 CAMERA = Camera(320, 240, 277.0, 276.0, 158.0, 121.0, mount_height=0.3)
 IDEAL = Lens(CAMERA)

@@ -10,14 +10,14 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 
-from hybridmap.errors import Busy
-from hybridmap.history import Happening, Kind
-from hybridmap.node import NodeId
-from mapserver.http.explanation_json import route_values
-from mapserver.http.web import Web
-from mapserver.route_explaining import explain_route
-from mapserver.routes import Router
-from merge.explaining.explanation import explain_nodes
+from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.node import NodeId
+from mapweave.mapserver.http.explanation_json import route_values
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.route_explaining import explain_route
+from mapweave.mapserver.routes import Router
+from mapweave.merge.explanation.node_explanation import explain_nodes
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.desks import Desk, two_maps
 from tests.waiting import eventually
@@ -151,8 +151,8 @@ def test_what_has_happened_is_told_newest_first(
         eventually(lambda: "r0.1 and r1.1 are one map: " in page.run(TOLD))
         assert page.run(hidden) and page.run(shown) == []
         desk.happenings = (
-            Happening(10**18, Kind.JOINED, "r0.1 and r1.1 are one map now"),
-            Happening(10**18 + 7 * 10**9, Kind.PARTED, "<b>x"),
+            MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now"),
+            MapEvent(10**18 + 7 * 10**9, MapEventKind.PARTED, "<b>x"),
         )
         page.open(f"http://127.0.0.1:{served.port}/why?a=r0.1&b=r1.1")
         eventually(lambda: not page.run(hidden))
@@ -163,7 +163,7 @@ def test_what_has_happened_is_told_newest_first(
 
 
 def test_what_has_happened_is_told_with_its_time(served: Web, desk: Desk) -> None:
-    desk.happenings = (Happening(10**18, Kind.RULED, "no"),)
+    desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no"),)
     with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
         (one,) = json.load(reply)["history"]
     assert one == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "ruled", "words": "no"}

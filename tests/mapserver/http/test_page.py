@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hybridmap.errors import Busy, InvalidValue
-from mapserver.http.web import Web
+from mapweave.hybridmap.errors import Busy, InvalidValue
+from mapweave.mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.desks import PLACE, Desk, picture
 from tests.waiting import eventually

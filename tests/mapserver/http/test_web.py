@@ -18,11 +18,11 @@ from email.message import Message
 import numpy as np
 import pytest
 
-from hybridmap.errors import Busy, NotConnected, SettingsError
-from hybridmap.history import Happening, Kind
-from mapserver.http import serving, web
-from mapserver.http.serving import Limits
-from mapserver.http.web import MOST_BYTES, Web, parse_address
+from mapweave.hybridmap.errors import Busy, NotConnected, SettingsError
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.mapserver.http import serving, web
+from mapweave.mapserver.http.serving import Limits
+from mapweave.mapserver.http.web import MOST_BYTES, Web, parse_address
 from tests.mapserver.desks import ANSWER, Desk, picture
 from tests.waiting import eventually
 
@@ -410,7 +410,7 @@ def test_a_head_that_never_ends_is_dropped(desk: Desk) -> None:
 
 
 def test_who_takes_nothing_of_an_answer_is_dropped(desk: Desk) -> None:
-    desk.happenings = (Happening(10**18, Kind.RULED, "no" * 2000),) * 3000
+    desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no" * 2000),) * 3000
     with (
         Web(("127.0.0.1", 0), desk, limits=Limits(stall=0.5)) as served,
         socket.socket() as slow,

@@ -11,27 +11,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.sharing.journal import Draft, Journal
-from agent.sharing.replication import ReplicationSettings, Replicator
-from hybridmap.camera import Camera
-from hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from hybridmap.errors import InvalidFile, InvalidValue
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.ruling import Ruling
-from mapserver.explainer import RulingBook
-from mapserver.log import store as store_module
-from mapserver.log.agent_log import PullSettings
-from mapserver.log.ingest import Ingest, IngestSettings
-from mapserver.log.integrity import checksum
-from mapserver.log.store import Store
+from mapweave.agent.replication.journal import Draft, Journal
+from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.cli import main
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.explainer import RulingBook
+from mapweave.mapserver.log import store as store_module
+from mapweave.mapserver.log.agent_log import PullSettings
+from mapweave.mapserver.log.ingest import Ingest, IngestSettings
+from mapweave.mapserver.log.integrity import checksum
+from mapweave.mapserver.log.store import Store
+from mapweave.storage.map_file import read_map_file
+from mapweave.wire.codec import encode_body, encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.waiting import eventually, free_port
-from wire.codec import encode_body, encode_change
-from wire.keys import Keys
-from wire.mapfile import read_map_file
-from wire.memory import MemoryBus, MemoryHub
 
 KEYS = Keys("fleet")
 AGENT = ReplicationSettings(beacon_interval=0.02, answer_bytes=20_000)
@@ -159,7 +159,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert replicator.wait_acknowledged(30)
     book = RulingBook(fleet.store)
     for k in range(5):
-        book.add(Ruling((MapId("r0", 1), MapId(f"r{k + 1}", 1)), True, "anna", k, "two kitchens"))
+        book.add(ManualConstraint((MapId("r0", 1), MapId(f"r{k + 1}", 1)), True, "anna", k, "two kitchens"))
     fleet.stop_robots()
     fleet.stop_server()
     return fleet.folder

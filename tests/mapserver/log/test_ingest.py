@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hybridmap.node import MapId
-from mapserver.log.agent_log import AgentLog, PullSettings
-from mapserver.log.entry import Applied, Entry
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
+from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.wire.bus import Sample
+from mapweave.wire.log_messages import Ack, LogRequest
+from mapweave.wire.memory import MemoryHub
 from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server
 from tests.waiting import eventually
-from wire.bus import Sample
-from wire.log_messages import Ack, LogRequest
-from wire.memory import MemoryHub
 
 
 def test_changes_are_applied_and_acknowledged(server: Server, agent: HandAgent) -> None:

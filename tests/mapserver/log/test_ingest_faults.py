@@ -11,16 +11,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agent.sharing.journal import Journal
-from agent.sharing.replication import ReplicationSettings, Replicator
-from hybridmap.change import Change, NodeRetired
-from hybridmap.node import NodeId
-from mapserver.log.agent_log import PullSettings
-from mapserver.log.ingest import Ingest, IngestSettings
-from mapserver.log.store import Store
-from wire.codec import encode_change
-from wire.keys import Keys
-from wire.memory import Faults, MemoryBus, MemoryHub
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
+from mapweave.hybridmap.change import Change, NodeRetired
+from mapweave.hybridmap.node import NodeId
+from mapweave.mapserver.log.agent_log import PullSettings
+from mapweave.mapserver.log.ingest import Ingest, IngestSettings
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.codec import encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
 
 KEYS = Keys("fleet")
 AGENT = ReplicationSettings(beacon_interval=0.02, answer_bytes=1500)

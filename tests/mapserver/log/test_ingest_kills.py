@@ -11,21 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.sharing.journal import Journal
-from hybridmap.node import MapId
-from mapserver.log.store import Store
-from wire.codec import encode_change
+from mapweave.agent.replication.journal import Journal
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.codec import encode_change
 
 CHANGES = 400
 
 SERVER = """
 import sys, time
 from pathlib import Path
-from mapserver.log.ingest import Ingest
-from mapserver.log.store import Store
-from wire.bus_settings import BusSettings
-from wire.keys import Keys
-from wire.zenoh_bus import ZenohBus
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
 
 path, endpoint = sys.argv[1:]
 bus = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
@@ -41,13 +41,13 @@ store.close()
 AGENT = """
 import sys, time
 from pathlib import Path
-from agent.sharing.journal import Journal
-from agent.sharing.replication import Replicator
-from hybridmap.change import NodeRetired
-from hybridmap.node import NodeId
-from wire.bus_settings import BusSettings
-from wire.keys import Keys
-from wire.zenoh_bus import ZenohBus
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.change import NodeRetired
+from mapweave.hybridmap.node import NodeId
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
 
 path, endpoint, total = sys.argv[1:]
 bus = ZenohBus(BusSettings(endpoints=(endpoint,)))

@@ -7,15 +7,15 @@ import time
 
 import pytest
 
-from hybridmap.change import Change
-from hybridmap.errors import InvalidFile
-from hybridmap.node import MapId
+from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import MapId
+from mapweave.wire.bus import Request
+from mapweave.wire.codec import MAX_CHANGE_BYTES
+from mapweave.wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
+from mapweave.wire.memory import MemoryHub
 from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server, message
 from tests.waiting import eventually
-from wire.bus import Request
-from wire.codec import MAX_CHANGE_BYTES
-from wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
-from wire.memory import MemoryHub
 
 
 def test_a_change_damaged_on_the_way_is_pulled(server: Server, agent: HandAgent) -> None:

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from agent.sharing.journal import Journal
-from agent.sharing.replication import ReplicationSettings, Replicator
-from hybridmap.change import ChangeBody, NodeRetired
-from hybridmap.errors import InvalidFile
-from hybridmap.node import MapId, NodeId
-from mapserver.log.store import Store
-from mapserver.server import MapServer
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
+from mapweave.hybridmap.change import ChangeBody, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.server import MapServer
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.waiting import eventually
-from wire.keys import Keys
-from wire.memory import MemoryBus, MemoryHub
 
 KEYS = Keys("fleet")
 MAP = MapId("r0", 1)

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.camera import Camera
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
-from hybridmap.errors import InvalidFile, InvalidValue
-from hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from mapserver.log.entry import Entry
-from mapserver.log.store import Store
-from wire.codec import encode_body, encode_change
-from wire.log_messages import Refusal
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.codec import encode_body, encode_change
+from mapweave.wire.log_messages import Refusal
 
 MAP, OTHER = MapId("r0", 1), MapId("r1", 1)
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
@@ -203,14 +203,14 @@ def test_what_the_maps_cost_on_the_wire(store: Store) -> None:
 
 
 def test_results_are_kept_by_name(store: Store) -> None:
-    assert store.result("postures") is None
-    store.put_result("postures", b"1")
-    store.put_result("postures", b"2")
-    assert store.result("postures") == b"2"
+    assert store.result("poses") is None
+    store.put_result("poses", b"1")
+    store.put_result("poses", b"2")
+    assert store.result("poses") == b"2"
 
 
 def test_a_journal_is_no_store(tmp_path: Path) -> None:
-    from agent.sharing.journal import Journal
+    from mapweave.agent.replication.journal import Journal
 
     Journal(tmp_path / "j", "r0").close()
     with pytest.raises(InvalidFile, match="is not a Mapweave map store"):

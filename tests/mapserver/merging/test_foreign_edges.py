@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut
-from hybridmap.node import Edge, EdgeKind, MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from mapserver.merging.merger import Merger
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.world import room, take_map
 
 Log = list[tuple[MapId, ChangeBody]]
@@ -33,7 +33,7 @@ def said(merged: MergedMap) -> tuple[object, ...]:
     """All that a merge has decided of the sound robots."""
     links = [(link.pair, link.weight) for link in merged.links]
     return links, [(r.pair, r.reason) for r in merged.refused if r.edge is None], [
-        (node, merged.pose(node)) for node in sorted(merged.postures)
+        (node, merged.pose(node)) for node in sorted(merged.poses)
     ]  # fmt: skip
 
 

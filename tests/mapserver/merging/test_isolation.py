@@ -13,18 +13,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import merge.belief.memory
-import merge.merging
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from hybridmap.errors import InvalidValue
-from hybridmap.hybrid_map import HybridMap
-from hybridmap.node import MapId, NodeId
-from hybridmap.pose import Pose2, PoseGaussian
-from hybridmap.ruling import Ruling, Rulings
-from mapserver.merging.isolation import leave_out
-from mapserver.merging.merger import Merger
-from mapweave.offline import merge_parts
-from merge.graph.merged import MergedMap
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.merging.isolation import leave_out
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge import merging
+from mapweave.merge.outlier_rejection import decision_cache
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.offline_merge import merge_parts
 from synthetic.world import room, take_map
 
 Log = list[tuple[MapId, ChangeBody]]
@@ -95,31 +95,31 @@ def merger_of(told: dict[MapId, Log], *maps: MapId) -> Merger:
 
 def alone_fails(monkeypatch: pytest.MonkeyPatch, *bad: MapId) -> None:
     """Let the merge fail wherever any of these maps is cut into pieces."""
-    real = merge.belief.memory.fragments_of
+    real = decision_cache.fragments_of
 
     def fails(maps: dict[MapId, HybridMap], *more: Any) -> Any:
         if set(bad) & maps.keys():
             raise np.linalg.LinAlgError("Singular\nmatrix")
         return real(maps, *more)
 
-    monkeypatch.setattr(merge.belief.memory, "fragments_of", fails)
+    monkeypatch.setattr(decision_cache, "fragments_of", fails)
 
 
 def together_fail(monkeypatch: pytest.MonkeyPatch, *bad: MapId) -> None:
     """Let the merge fail where all of these are merged in one island."""
-    real = merge.merging.weigh
+    real = merging.weigh
 
     def fails(links: Any, by_node: Iterable[NodeId], *more: Any) -> Any:
         if set(bad) <= {node.map for node in by_node}:
             raise ZeroDivisionError("together")
         return real(links, by_node, *more)
 
-    monkeypatch.setattr(merge.merging, "weigh", fails)
+    monkeypatch.setattr(merging, "weigh", fails)
 
 
 def said(merged: MergedMap, *maps: MapId) -> tuple[object, ...]:
     """All that a merge says of some maps."""
-    nodes = sorted(node for node in merged.postures if node.map in maps)
+    nodes = sorted(node for node in merged.poses if node.map in maps)
     return (
         [(link.pair, link.weight) for link in merged.links if {n.map for n in link.pair} <= set(maps)],
         [(r.pair, r.reason) for r in merged.refused if {n.map for n in r.pair} <= set(maps)],
@@ -215,11 +215,15 @@ def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
     alone_fails(monkeypatch, BAD)
     merger = merger_of(told, R0, R1, BAD)
     assert merger.merged().set_apart
-    merger.rule(Rulings([Ruling((BAD, BAD), True, "anna", 1)]))
+    merger.rule(ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))
     merged = merger.merged()
     assert not merged.set_apart and BAD in merged.maps
     assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)
-    merger.rule(Rulings([Ruling((BAD, BAD), True, "anna", 1), Ruling((BAD, BAD), False, "anna", 2)]))
+    merger.rule(
+        ManualConstraints(
+            [ManualConstraint((BAD, BAD), True, "anna", 1), ManualConstraint((BAD, BAD), False, "anna", 2)]
+        )
+    )
     assert merger.merged().set_apart.keys() == {BAD}
 
 
@@ -235,7 +239,7 @@ def test_before_maps_are_compared_the_bad_one_is_left_out(
 def test_nodes_that_cannot_be_compared_are_not_linked(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    import mapserver.merging.merger as module
+    import mapweave.mapserver.merging.merger as module
 
     real = module.verify
 
@@ -293,6 +297,6 @@ def test_files_are_merged_with_all_maps_or_not_at_all(
     alone_fails(monkeypatch, BAD)
     maps = {one: HybridMap(body for _, body in told[one]) for one in (R0, BAD)}
     with pytest.raises(InvalidValue, match=r"map bad\.1 cannot be merged: the merge fails with it .*retire"):
-        merge_parts(maps, Rulings())
-    retired = merge_parts(maps, Rulings([Ruling((BAD, BAD), True, "anna", 1)]))
+        merge_parts(maps, ManualConstraints())
+    retired = merge_parts(maps, ManualConstraints([ManualConstraint((BAD, BAD), True, "anna", 1)]))
     assert retired.maps.keys() == {R0, BAD}

@@ -6,26 +6,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
-from hybridmap.node import EdgeKind, MapId, Node, NodeId
-from hybridmap.pose import Pose2
-from hybridmap.query import Certainty
-from hybridmap.route import RouteSettings
-from mapserver.merging.merger import Merger
-from mapserver.relocalizing.belief import Support, probabilities
-from mapserver.relocalizing.judgement import JudgementSettings
-from mapserver.relocalizing.relocalization import RelocalizationSettings, Relocalizer
-from mapserver.relocalizing.seenplaces import fuse
-from mapserver.routes import Router, RouterSettings
-from merge.graph.merged import MergedMap
-from registration.recognition import examine_matches
-from synthetic.world import (
-    Sensing,
-    World,
-    room,
-    take_map,
-    take_view,
-)
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty
+from mapweave.hybridmap.route import RouteSettings
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.relocalization.calibration import HypothesisSupport, probabilities
+from mapweave.mapserver.relocalization.place_hypotheses import fuse
+from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.mapserver.relocalization.verdict import HypothesisSelectionSettings
+from mapweave.mapserver.routes import Router, RouterSettings
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.registration.recognition import examine_matches
+from synthetic.world import Sensing, World, room, take_map, take_view
 
 A, B = MapId("a", 1), MapId("b", 1)
 Log = list[tuple[MapId, ChangeBody]]
@@ -70,8 +64,8 @@ def same(one: MergedMap, two: MergedMap) -> bool:
         and [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
         and one.components == two.components
         and all(
-            np.array_equal(p.merged_from_robot.mean.vector, two.postures[n].merged_from_robot.mean.vector)
-            for n, p in one.postures.items()
+            np.array_equal(p.merged_from_robot.mean.vector, two.poses[n].merged_from_robot.mean.vector)
+            for n, p in one.poses.items()
         )
     )
 
@@ -80,8 +74,8 @@ def test_two_maps_become_one(scene: Scene, merger: Merger) -> None:
     merged = merger.merged()
     assert len(merged.components) == 1 and merged.joined(A, B)
     anchor = min(scene.truth)
-    truth_from_merged = scene.truth[anchor] @ merged.postures[anchor].merged_from_robot.mean.inverse()
-    for node, place in merged.postures.items():
+    truth_from_merged = scene.truth[anchor] @ merged.poses[anchor].merged_from_robot.mean.inverse()
+    for node, place in merged.poses.items():
         assert scene.truth[node].distance(truth_from_merged @ place.merged_from_robot.mean) < 0.4
     assert merger.status().startswith("28 nodes, 2 maps, 1 component, ")
 
@@ -121,7 +115,7 @@ def test_retired_nodes_take_their_links_along(scene: Scene) -> None:
     for k, node in enumerate(gone):
         merger.on_change(Change(B, 200 + k, 0, NodeRetired(node)))
     merged = merger.merged()
-    assert set(merged.postures) == {node for node in scene.truth if node.map == A}
+    assert set(merged.poses) == {node for node in scene.truth if node.map == A}
     assert all(link.within for link in merged.links)
     assert same(merged, scene.merger([*scene.logs[A], (B, NodeRetired(gone[0]))]).merged())
 
@@ -174,7 +168,7 @@ def relocalizer(merger: Merger) -> Relocalizer:
     return Relocalizer(merger.index, merger.node, merger.merged())
 
 
-def test_lost_robots_are_found_with_honest_postures(scene: Scene, merger: Merger) -> None:
+def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -> None:
     rng, service = np.random.default_rng(5), relocalizer(merger)
     found, distances, errors = 0, [], []
     for node, stop in list(scene.truth.items())[::2]:
@@ -189,7 +183,7 @@ def test_lost_robots_are_found_with_honest_postures(scene: Scene, merger: Merger
         distances.append(best.node_from_robot.mahalanobis2(true))
         errors.append(best.node_from_robot.mean.distance(true))
         assert 0.5 < best.probability <= 1.0 and best.component == 0 and answer.reason
-        expected = merger.merged().postures[best.node].merged_from_robot.mean @ best.node_from_robot.mean
+        expected = merger.merged().poses[best.node].merged_from_robot.mean @ best.node_from_robot.mean
         assert best.merged_from_robot is not None
         assert best.merged_from_robot.mean.distance(expected) < 1e-9
         assert node.map in (A, B)
@@ -207,13 +201,13 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
         examined.append(node.id)
         return examine_matches(node, *others)
 
-    monkeypatch.setattr("mapserver.relocalizing.relocalization.examine_matches", counted)
+    monkeypatch.setattr("mapweave.mapserver.relocalization.relocalizer.examine_matches", counted)
     # Nobody suffices alone and nothing is faint: then every node that looks alike is examined.
     thorough = Relocalizer(
         merger.index,
         merger.node,
         merger.merged(),
-        RelocalizationSettings(judgement=JudgementSettings(alone=1000), faint=0.0),
+        RelocalizationSettings(judgement=HypothesisSelectionSettings(alone=1000), faint=0.0),
     )
     quick, rng, counts = relocalizer(merger), np.random.default_rng(11), np.zeros(2, int)
     for stop in list(scene.truth.values())[::4]:
@@ -293,14 +287,14 @@ def test_fusing_never_claims_more_than_the_better_estimate_and_both_allow(
 def test_probability_grows_with_support_and_falls_with_rivals() -> None:
     def told(**changes: float) -> float:
         known = {"inliers": 20, "share": 0.7, "seen": 0.4, "sightings": 1, "others": 0.0}
-        return probabilities([Support(**{**known, **changes})])[0]  # type: ignore[arg-type]
+        return probabilities([HypothesisSupport(**{**known, **changes})])[0]  # type: ignore[arg-type]
 
     more = [told(inliers=n) for n in (10, 20, 40, 80)]
     rivals = [told(others=share) for share in (0.0, 0.5, 1.0, 2.0)]
     assert more == sorted(more) and rivals == sorted(rivals, reverse=True)
     assert told(share=0.9) > told(share=0.4) and told(sightings=3) >= told()
     assert told(inliers=60) > 0.95, "nothing speaks against it"
-    twin = Support(60, 0.8, 0.5, 2, 1.0)
+    twin = HypothesisSupport(60, 0.8, 0.5, 2, 1.0)
     assert probabilities([twin, twin]) == pytest.approx([0.5, 0.5], abs=0.1), "one of two that look the same"
 
 
@@ -337,7 +331,7 @@ def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
     legs = router.route(start, goal, start_from_robot=start_from_robot).legs
     first = scene.truth[legs[0].node.id]
     assert first.distance(scene.truth[far]) < min(1.0, first.distance(scene.truth[start]))
-    # Its posture is told relative to the node that the robot knows.
+    # Its pose is told relative to the node that the robot knows.
     assert legs[0].previous_from_node.mean.distance(scene.truth[start].inverse() @ first) < 0.2
 
 
@@ -361,7 +355,7 @@ def test_routes_that_are_not_there_say_why(scene: Scene) -> None:
     merger = scene.merger(scene.logs[A])
     merger.apply(B, scene.logs[B][13][1])
     router = Router(merger.merged())
-    alone = next(node for node in merger.merged().postures if node.map == B)
+    alone = next(node for node in merger.merged().poses if node.map == B)
     assert "nothing joins" in router.route(min(scene.truth), alone).reason
     assert "not in the merged map" in router.route(NodeId("z", 1, 1), alone).reason
     assert router.route(alone, alone).legs[0].node.id == alone

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
-from hybridmap.node import MapId
-from hybridmap.ruling import Ruling, Rulings
-from mapserver.answers import Answers
-from mapserver.chronicle import Chronicle
-from mapserver.merging.merger import Merger
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.map_history import MapHistory
+from mapweave.mapserver.merging.merger import Merger
 from synthetic.wrong_geometry import (
     ODD,
     SCENES,
@@ -34,7 +34,7 @@ def told(merger: Merger, fleet: Fleet, scene: str) -> Counter[Told]:
 def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     fleet = draw_fleet(SEED, SCENES["room"], Fault.SLIP, stops=2)
     alone = told(merged_fleet(fleet, frozenset({ODD})), fleet, "room")
-    merger, chronicle = merged_fleet(fleet), Chronicle()
+    merger, chronicle = merged_fleet(fleet), MapHistory()
     merged = merger.merged()
     chronicle.follow(merged)
     assert chronicle.newest.startswith(f"map {ODD} contradicts r0.1, r1.1 and r2.1")
@@ -47,10 +47,12 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     before = chronicle.happenings
     chronicle.follow(merged)
     assert chronicle.happenings == before
-    gone = [Ruling((one, one), True, "anna", 1, "moved") for one in (MapId("r0", 1), MapId("r1", 1))]
-    merger.rule(Rulings(gone))
+    gone = [
+        ManualConstraint((one, one), True, "anna", 1, "moved") for one in (MapId("r0", 1), MapId("r1", 1))
+    ]
+    merger.rule(ManualConstraints(gone))
     assert not merger.merged().wrong
-    merger.rule(Rulings())
+    merger.rule(ManualConstraints())
     assert merger.merged().wrong.keys() == {ODD}
 
 

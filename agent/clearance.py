@@ -1,0 +1,39 @@
+"""How far the footprint may move, by what the rangers see now."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.observation import RobotDescription
+
+ASIDE = 0.06
+"""m, kept free beside the footprint."""
+BEFORE = 0.12
+"""m, kept free before it."""
+
+
+def clearance(
+    description: RobotDescription, proximity: NDArray[Any], direction: float, unknown: float = math.inf
+) -> float:
+    """How far the footprint may move in a direction, m.
+
+    Args:
+        description: footprint and rangers.
+        proximity: (K,) m from the robot's edge.
+        direction: rad, 0 ahead, positive to the left.
+        unknown: what is returned if no ranger looks that way.
+    """
+    bearings, radius = np.array(description.ranger_bearings), description.radius
+    if not len(bearings) or len(proximity) != len(bearings):
+        return unknown
+    off = np.angle(np.exp(1j * (bearings - direction)))
+    reach = proximity + radius
+    lateral = np.abs(reach * np.sin(off))
+    in_way = (np.cos(off) > 0.3) & (lateral < radius + ASIDE)
+    if not in_way.any():
+        return unknown
+    return float(max((reach * np.cos(off))[in_way].min() - radius - BEFORE, 0.0))

@@ -1,0 +1,89 @@
+"""What drives teach of a node's landmarks: their depths, better known each time the robot drives by them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_localizer import NodeLocalizer
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.quantization import snap
+
+
+@dataclass(frozen=True)
+class LandmarkRefinementSettings:
+    """When a node is put anew.
+
+    Attributes:
+        share: a landmark is known better if its depth's sigma has fallen below this share of what it was.
+        least: a node is told anew if so many of its landmarks are known better: it costs some 3 kB.
+        floor: what a depth is never better than: m, and share of the depth; as when it was mapped.
+        doubt: a depth that is off from the mapped one by more than this many sigma of that is no better one:
+            what was followed may be something else.
+    """
+
+    share: float = 0.7
+    least: int = 5
+    floor: tuple[float, float] = (0.01, 0.015)
+    doubt: float = 3.3
+
+
+class LandmarkRefinement:
+    """Watches a drive, and says how the landmarks of the robot's own nodes are known after it.
+
+    Each node is put anew once a drive at most: when the robot leaves it, or has arrived.
+    """
+
+    def __init__(self, own_map: HybridMap, settings: LandmarkRefinementSettings | None = None) -> None:
+        """Take the robot's own map; nodes of others are theirs to mend."""
+        self._map = own_map
+        self._settings = settings or LandmarkRefinementSettings()
+        self._localizer: NodeLocalizer | None = None
+        self._told: set[NodeId] = set()
+
+    def see(self, fix: Fix | None) -> Node | None:
+        """Take in where the robot is now; returns a node of the map with better landmarks.
+
+        Args:
+            fix: None if the robot is lost, or has arrived.
+        """
+        before = self._localizer
+        self._localizer = None if fix is None else fix.localizer
+        return None if before is None or before is self._localizer else self._refined(before)
+
+    def _refined(self, localizer: NodeLocalizer) -> Node | None:
+        node = self._map.nodes.get(localizer.node.id)
+        if node is None or node.id in self._told or len(node.landmarks) != len(localizer.node.landmarks):
+            return None
+        landmarks = refined(node.landmarks, *localizer.depths(), self._settings)
+        if landmarks is None:
+            return None
+        self._told.add(node.id)
+        # Rounded now, the robot works with the same numbers as everybody who gets the node.
+        return replace(node, landmarks=snap(landmarks, node.camera))
+
+
+def refined(
+    mapped: Landmarks, depths: Array, sigmas: Array, s: LandmarkRefinementSettings
+) -> Landmarks | None:
+    """Take over the depths that are known better; None if these are too few to tell.
+
+    Args:
+        mapped: N landmarks as the map has them.
+        depths: (N,) m, NaN where nothing was learned.
+        sigmas: (N,) m, of independent errors.
+        s: what counts as better.
+    """
+    sober = np.hypot(sigmas, s.floor[0] + s.floor[1] * depths)
+    with np.errstate(invalid="ignore"):
+        better = sober < s.share * mapped.depth_sigmas
+        better &= np.abs(depths - mapped.depths) < s.doubt * mapped.depth_sigmas
+    if np.count_nonzero(better) < s.least:
+        return None
+    new = [np.where(better, one, old).astype(np.float32) for one, old in
+           ((depths, mapped.depths), (sober, mapped.depth_sigmas))]  # fmt: skip
+    return replace(mapped, depths=new[0], depth_sigmas=new[1])

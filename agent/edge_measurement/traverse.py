@@ -1,0 +1,149 @@
+"""What a drive measures between the nodes that it passes: a traverse, as surveyors call it.
+
+At a hand-over the robot knows itself by the landmarks of one node, and a moment later by those of the next:
+the two poses of one robot are a measurement of where the nodes stand to each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapweave.agent.localization.fix import Fix, wheel_step
+from mapweave.agent.localization.node_localizer import NodeLocalizer
+from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+
+HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
+
+
+@dataclass(frozen=True)
+class TraverseSettings:
+    """When a drive from node to node is a measurement.
+
+    Attributes:
+        settled: images through which a node's landmarks must have been followed: fewer than lie between
+            two looks for the next node.
+        gap: what may lie between the landmarks of two nodes, as `Fix.blind` counts it, m.
+        reach: this near to a node the robot has passed it, m. It is twice the distance within which the
+            follower takes a node for passed.
+        floor: error of a settled pose that its covariance does not tell of, m and rad: tracks err alike
+            for a while, and the landmarks of a node were mapped by the same wheels.
+        widest: a traverse known no better than this is not worth telling, m.
+        detour: nor is one on a way longer than the straight line by more than this factor, and `reach` at
+            either end: something stands in between.
+    """
+
+    settled: int = 3
+    gap: float = 0.5
+    reach: float = 0.45
+    floor: tuple[float, float] = (0.005, 0.005)
+    widest: float = 0.1
+    detour: float = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class Traverse:
+    """The robot has stood at one node, and then at another.
+
+    Attributes:
+        start: the first node.
+        end: the second.
+        start_from_end: as measured on the way.
+        landmarks: fewest in sight where one node was handed over to the next.
+    """
+
+    start: NodeId
+    end: NodeId
+    start_from_end: PoseGaussian
+    landmarks: int
+
+
+class TraverseRecorder:
+    """Watches where a robot is on its way, and says when it has got from one node to another.
+
+    Between may lie nodes that it knew itself by and did not come near to. It measures nothing across a gap
+    that it drove blind for long, nor from where it had to be found anew.
+    """
+
+    def __init__(self, description: RobotDescription, settings: TraverseSettings | None = None) -> None:
+        """Start with no node passed."""
+        self._description = description
+        self._settings = settings or TraverseSettings()
+        self._watched: NodeLocalizer | None = None
+        self._images = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._node: NodeId | None = None
+        self._node_from_robot = HERE
+        self._gap = 0.0
+        self._in_sight = 0
+        self._passed: NodeId | None = None
+        self._passed_from_node = HERE
+        self._fewest, self._way = 0, 0.0
+
+    def see(self, fix: Fix | None, observation: Observation) -> Traverse | None:
+        """Take in one tick of a drive.
+
+        Args:
+            fix: where the robot is after this observation; None while it does not know, or is found anew.
+            observation: with the wheels' last step.
+
+        Returns:
+            A traverse that ends here.
+        """
+        if fix is None:
+            self._forget()
+            return None
+        step, blind = wheel_step(observation.odometry, self._description)
+        self._node_from_robot, self._gap = self._node_from_robot @ step, self._gap + blind
+        self._way += abs(observation.odometry.forward)
+        if not self._settled(fix):
+            if self._gap > self._settings.gap:
+                self._forget()
+            return None
+        assert fix.localizer is not None, "landmarks are in sight"
+        self._stand(fix.node, self._sober(fix.node_from_robot), len(fix.localizer.visible))
+        mean = self._node_from_robot.mean
+        return self._arrive() if mean.distance(Pose2()) <= self._settings.reach else None
+
+    def _settled(self, fix: Fix) -> bool:
+        """Whether landmarks that the node has with their depths have been in sight for a while."""
+        localizer = fix.localizer if fix.in_sight else None
+        known = localizer is not None and localizer is self._watched
+        self._images = self._images + 1 if known else 0
+        self._watched = localizer
+        return known and self._images >= self._settings.settled
+
+    def _stand(self, node: NodeId, node_from_robot: PoseGaussian, in_sight: int) -> None:
+        """Know the robot by a node; where that is another one, this is a hand-over."""
+        if self._node is None:
+            self._fewest = in_sight
+        elif node != self._node:
+            before_from_node = self._node_from_robot @ node_from_robot.inverse()
+            self._passed_from_node = self._passed_from_node @ before_from_node
+            self._fewest = min(self._fewest, self._in_sight, in_sight)
+        self._node, self._node_from_robot = node, node_from_robot
+        self._gap, self._in_sight = 0.0, in_sight
+
+    def _arrive(self) -> Traverse | None:
+        """The robot stands at the node that it knows itself by."""
+        assert self._node is not None
+        start, between, fewest, way = self._passed, self._passed_from_node, self._fewest, self._way
+        self._passed, self._passed_from_node = self._node, HERE
+        self._fewest, self._way = self._in_sight, 0.0
+        if start is None or start == self._node:
+            return None
+        s = self._settings
+        widest = float(np.sqrt(np.linalg.eigvalsh(between.covariance[:2, :2])[-1]))
+        straight = s.detour * between.mean.distance(Pose2()) + 2.0 * s.reach
+        return Traverse(start, self._node, between, fewest) if widest < s.widest and way < straight else None
+
+    def _sober(self, pose: PoseGaussian) -> PoseGaussian:
+        """A pose of the filter with the uncertainty that the filter cannot know."""
+        xy, heading = self._settings.floor
+        more: Array = np.diag([xy**2, xy**2, heading**2])
+        return PoseGaussian(pose.mean, pose.covariance + more)

@@ -1,0 +1,51 @@
+"""How far the mapping filter believes its wheels: less for a while, once an image has refuted them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapweave.agent.ekf.motion import WheelNoise
+from mapweave.agent.ekf.settings import FilterSettings
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Array
+
+
+class AdaptiveOdometryNoise:
+    """The wheels' noise, as it is said or as images have shown it to be."""
+
+    def __init__(self, noise: WheelNoise, settings: FilterSettings) -> None:
+        """Begin with trust."""
+        self._noise = noise
+        self._settings = settings
+        self._steps_doubted = 0
+
+    @property
+    def doubted(self) -> bool:
+        """Whether an image refuted the wheels a moment ago."""
+        return self._steps_doubted > 0
+
+    def root(self, odometry: Odometry) -> Array:
+        """(2, 2) root of the covariance of (u1 m, u2 rad) of the step that is taken now."""
+        if not self._steps_doubted:
+            return self._noise.root(odometry)
+        # Slip and lost encoders last for more than one step.
+        self._steps_doubted -= 1
+        return self._noise.refuted_root(odometry, 1.0, self._settings.slip[0])
+
+    def side_slip(self, odometry: Odometry) -> float:
+        """Standard deviation of a step's slip aside, m."""
+        way = abs(odometry.forward) + self._noise.axle * abs(odometry.turn)
+        return self._settings.side_slip * way
+
+    def refuted(self, odometry: Odometry, surprise: float) -> Array:
+        """The root for a step that its image refutes by so many sigmas; the next are doubted as well."""
+        self.doubt()
+        return self._noise.refuted_root(odometry, surprise, self._settings.slip[0])
+
+    def slipped(self) -> Array:
+        """The root for a step of which the wheels may say anything."""
+        return np.diag(self._settings.slip)
+
+    def doubt(self) -> None:
+        """From now on, for a while."""
+        self._steps_doubted = self._settings.distrust

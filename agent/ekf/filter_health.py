@@ -1,0 +1,72 @@
+"""What holds the mapping filter's estimate up, watched from step to step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from mapweave.agent.ekf.settings import FilterSettings
+from mapweave.agent.ekf.update_report import Health
+from mapweave.hybridmap.pose import Array, Pose2
+
+
+class FilterHealth:
+    """Keeps what the last image told, how long that is ago, and how far the robot has moved for parallax."""
+
+    def __init__(self, settings: FilterSettings, focal: float) -> None:
+        """Begin at the anchor, healthy.
+
+        Args:
+            settings: of the filter.
+            focal: horizontal, px.
+        """
+        self._settings = settings
+        self._focal = focal
+        self._last = (Health.GOOD, "")
+        self._steps_unseen = 0
+        self._base = (0.0, 0.0)
+        self._baseline = 0.0
+
+    def took_up(self, pose_vector: Array) -> None:
+        """Landmarks were taken up at a pose (3,): their parallax is counted from there."""
+        self._base, self._baseline = _position(pose_vector), 0.0
+
+    def moved(self, pose_vector: Array) -> None:
+        """The robot has moved to a pose (3,), and no image has told of it yet."""
+        self._steps_unseen += 1
+        self._baseline = max(self._baseline, math.dist(_position(pose_vector), self._base))
+
+    def saw(self, health: Health, reason: str) -> None:
+        """An image has come and told this."""
+        self._steps_unseen = 0
+        self._last = health, reason
+
+    def reanchored(self, old_from_new: Pose2) -> None:
+        """Poses are told from a new anchor on."""
+        base = old_from_new.inverse() @ Pose2(*self._base)
+        self._base = base.x, base.y
+
+    def health(self, converged: Callable[[], bool]) -> tuple[Health, str]:
+        """What holds the estimate up at present, and in words what is wrong; empty if nothing is.
+
+        Args:
+            converged: whether the depth of any landmark is known; only asked for if there was no parallax.
+        """
+        unseen, settings = self._steps_unseen, self._settings
+        if unseen >= settings.patience:
+            return Health.NO_IMAGE, f"no image for {unseen} steps"
+        if self._last[0] is not Health.GOOD:
+            return self._last
+        parallax = self._baseline * self._focal / settings.prior_depth
+        if parallax < settings.parallax_px and not converged():
+            way = 1e3 * self._baseline
+            return (
+                Health.NO_PARALLAX,
+                f"the robot has moved by {way:.0f} mm since landmarks were taken up: no depths",
+            )
+        return self._last
+
+
+def _position(pose_vector: Array) -> tuple[float, float]:
+    x, y, _ = pose_vector.tolist()
+    return x, y

@@ -1,0 +1,272 @@
+"""The localization filter: pose in a node's frame and the node's landmarks, 3 + 2n (paper section 6)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.ekf.gating import pixel_gate
+from mapweave.agent.ekf.inverse_depth import project_anchored, rays_of_points
+from mapweave.agent.ekf.iterated import Measurement, iterated_update
+from mapweave.agent.ekf.landmark_estimates import Ids, NodeLandmarks
+from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState, turning
+from mapweave.agent.ekf.motion import WheelNoise, move_pose
+from mapweave.agent.ekf.settings import LocalizationSettings
+from mapweave.agent.ekf.update_report import Health, UpdateReport
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose
+
+__all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
+
+
+class LocalizationFilter:
+    """Iterated extended Kalman filter over [node_from_robot (3), landmarks (a, w) x n].
+
+    Each landmark keeps the vertical slope b at the node that the map gives it. Its error is the same in
+    every image, so it is no noise: it is carried as a considered state
+    (mapweave.agent.ekf.localization_state).
+
+    Attributes:
+        ids: (n,) landmark ids in the state's order.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        axle: float,
+        wheel_noise: float,
+        prior: PoseGaussian,
+        ids: Ids,
+        points_in_node: Array,
+        covariances: Array,
+        scale_share: float = 0.0,
+        settings: LocalizationSettings | None = None,
+    ) -> None:
+        """Start from a pose, however uncertain, and a node's landmarks.
+
+        Args:
+            camera: of the robot that drives; the node's may be another.
+            axle: distance between the wheels, m.
+            wheel_noise: standard deviation of a wheel's way as a share of the way.
+            prior: node_from_robot.
+            ids: (n,) landmark ids as they will come in update.
+            points_in_node: (n, 3) m, in the node's robot frame; those that cannot be anchored are left out.
+            covariances: (n, 3, 3) m^2, in the node's robot frame.
+            scale_share: by which the points and the prior's position may be off together, besides that, as a
+                share of them: the wheels tell.
+            settings: see there.
+
+        Raises:
+            InvalidValue: shapes that do not belong together, or an id twice.
+        """
+        self.settings = settings or LocalizationSettings()
+        self.ids: Ids = np.zeros(0, np.int64)
+        self._camera = camera
+        self._wheels = WheelNoise(axle, wheel_noise, self.settings.wheel_floor)
+        self._focal = np.array([camera.fx, camera.fy])
+        self._centre = np.array([camera.cx, camera.cy])
+        self._state = LocalizationState.of_prior(prior)
+        self._bad = 0
+        self._bad_reason = ""
+        self._rng = np.random.default_rng(0)
+        self._insert(ids, points_in_node, covariances, np.zeros((len(ids), 3, 3)))
+        self._state = self._state.of_unknown_scale(scale_share)
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move by one step of the wheels. The landmarks stand still in the node's frame."""
+        pose_vector, by_pose, by_input = move_pose(self._state.pose_vector, odometry)
+        aside = self.settings.side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
+        noise = np.column_stack([by_input[:, :2] @ self._wheels.root(odometry), aside * by_input[:, 2]])
+        p = self._state.covariance.copy()
+        p[:3, 3:] = by_pose @ p[:3, 3:]
+        p[3:, :3] = p[:3, 3:].T
+        own = by_pose @ p[:3, :3] @ by_pose.T + noise @ noise.T
+        p[:3, :3] = 0.5 * (own + own.T)
+        self._state = replace(self._state, pose_vector=pose_vector, covariance=p)
+
+    def update(self, ids: Ids, pixels: Array) -> UpdateReport:
+        """Correct pose and landmarks by the pixels of one image.
+
+        Args:
+            ids: (N,) what is seen; ids that the filter does not hold are ignored.
+            pixels: (N, 2) px, undistorted; rows with NaN are ignored.
+        """
+        s, mount = self.settings, self._camera.mount_forward
+        slots, rows = self._slots(ids)
+        seen = np.isfinite(pixels[rows]).all(axis=1)
+        slots, rows = slots[seen], rows[seen]
+        start = self._start(slots, pixels[rows])
+        scales = [
+            project_anchored(start, rays[slots], mount).scale
+            for rays in (self._state.rays, self._state.first)
+        ]
+        ahead = np.minimum(*scales) > NEAREST_SCALE
+        slots, rows = slots[ahead], rows[ahead]
+        if not len(slots):
+            return self._judge(UpdateReport.blind(ids, "no landmark of the node is in view"))
+        slopes = (pixels[rows] - self._centre) / self._focal
+        variances, linear = (s.pixel_sigma / self._focal) ** 2, s.linear_px / self._camera.fx
+        gate = pixel_gate(s.gate_probability)
+        measurement = Measurement(slots, slopes, variances, gate, s.iterations, linear)
+        fit = iterated_update(self._state, start, measurement, mount)
+        if fit is None:
+            return self._judge(UpdateReport.blind(ids, "the pose is too uncertain to be corrected"))
+        accepted = np.zeros(len(ids), np.bool_)
+        # A few that agree among many that do not may as well be the wrong ones.
+        if fit.accepted.mean() >= s.least_agreeing_share:
+            self._state = fit.state
+            accepted[rows[fit.accepted]] = True
+        innovations_px = np.full((len(ids), 2), np.nan)
+        innovations_px[rows] = fit.innovations * self._focal
+        kept = int(fit.accepted.sum())
+        health, reason = Health.GOOD, ""
+        if kept < s.least_agreeing_share * len(slots):
+            health, reason = Health.DISAGREEMENT, f"{kept} of {len(slots)} landmarks agree"
+        elif kept < s.least_agreeing:
+            health, reason = Health.FEW, f"{kept} of {len(slots)} landmarks agree"
+        return self._judge(UpdateReport(ids, accepted, innovations_px, fit.mean_nis, health, reason))
+
+    def add(self, ids: Ids, points_in_robot: Array, covariances_in_robot: Array) -> NDArray[np.bool_]:
+        """Add landmarks that are new to the map, as they are known from where the robot stands now.
+
+        Args:
+            ids: (N,) new ids.
+            points_in_robot: (N, 3) m, in the robot's present frame.
+            covariances_in_robot: (N, 3, 3) m^2, in the robot's present frame.
+
+        Returns:
+            (N,) which were added: those that lie ahead of the node, where they can be anchored.
+
+        Raises:
+            InvalidValue: shapes that do not belong together, or an id twice.
+        """
+        pose = Pose2.from_vector(self._state.pose_vector)
+        points, turn = pose.apply(points_in_robot), turning(pose)
+        by_pose = np.zeros((len(points), 3, 3))
+        by_pose[:, 0, 0] = by_pose[:, 1, 1] = 1.0
+        by_pose[:, 0, 2] = pose.y - points[:, 1]
+        by_pose[:, 1, 2] = points[:, 0] - pose.x
+        return self._insert(ids, points, turn @ covariances_in_robot @ turn.T, by_pose)
+
+    def remove(self, ids: Ids) -> None:
+        """Forget landmarks; ids that are not there are ignored."""
+        self._keep(~np.isin(self.ids, ids))
+
+    def rebase(self, new_node_from_node: PoseGaussian) -> None:
+        """Hand over to another node's frame; landmarks that cannot be anchored there are let go.
+
+        Args:
+            new_node_from_node: where the old node stands in the new, independent of what the filter knows.
+        """
+        self._state, ahead = self._state.rebased(new_node_from_node, self._camera.mount_forward)
+        self._keep(ahead & self._anchorable(self._state.rays))
+
+    @property
+    def state(self) -> LocalizationState:
+        """The whole state, a value: for figures and tests."""
+        return self._state
+
+    @property
+    def pose(self) -> PoseGaussian:
+        """`node_from_robot`."""
+        return self._state.pose
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the pose may be driven by."""
+        return not self.reason
+
+    @property
+    def reason(self) -> str:
+        """Why it may not, in words; empty if healthy."""
+        if self._bad >= self.settings.patience:
+            return self._bad_reason
+        sigma = math.sqrt(float(np.linalg.eigvalsh(self._state.covariance[:2, :2])[-1]))
+        return f"position known to {sigma:.1f} m only" if sigma > self.settings.widest_sigma else ""
+
+    def predict_pixels(self, ids: Ids | None = None) -> Array:
+        """(N, 2) px where landmarks are expected now; NaN if behind the camera or not held."""
+        sight = project_anchored(self._state.pose_vector, self._state.rays, self._camera.mount_forward)
+        ahead = (sight.scale > NEAREST_SCALE)[:, None]
+        pixels = np.where(ahead, self._centre + self._focal * sight.rays[:, :2], np.nan)
+        if ids is None:
+            return pixels
+        slots, rows = self._slots(ids)
+        out = np.full((len(ids), 2), np.nan)
+        out[rows] = pixels[slots]
+        return out
+
+    def landmarks_in_node(self) -> NodeLandmarks:
+        """All landmarks as they are known now."""
+        return NodeLandmarks(self.ids.copy(), *self._state.points(self._camera))
+
+    def _slots(self, ids: Ids) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Places in the state of those ids that are held, and their rows among the ids given."""
+        _, slots, rows = np.intersect1d(self.ids, ids, return_indices=True)
+        return slots, rows
+
+    def _start(self, slots: NDArray[np.intp], pixels: Array) -> Array:
+        """Pose at which to linearise first: the static fix where the own is too loose or was refuted.
+
+        The fix is a point of linearisation only, so that no pixel is used twice. A refuted pose loses
+        its certainty; the landmarks keep theirs.
+        """
+        s, state = self.settings, self._state
+        refuted = self._bad >= s.patience
+        if not (refuted or state.covariance[2, 2] > s.loose_heading**2):
+            return state.pose_vector
+        least = s.least_refound if refuted else s.least_fixed
+        points, covariances = state.points(self._camera)
+        fix = solve_planar_pose(
+            points[slots],
+            pixels,
+            self._camera,
+            rng=self._rng,
+            point_covariances=covariances[slots],
+            settings=PlanarPoseSettings(pixel_sigma=s.pixel_sigma, least_inliers=least),
+        )
+        if fix is None:
+            return state.pose_vector
+        start = fix.node_from_robot.mean.vector
+        if refuted:
+            p = state.covariance.copy()
+            p[:3, :] = p[:, :3] = 0.0
+            p[[0, 1, 2], [0, 1, 2]] = s.lost_position**2, s.lost_position**2, s.lost_heading**2
+            self._state = replace(state, pose_vector=start.copy(), covariance=p)
+        # The same turn of the circle as the prior's heading.
+        start[2] += 2 * math.pi * round((self._state.pose_vector[2] - start[2]) / (2 * math.pi))
+        return start
+
+    def _judge(self, report: UpdateReport) -> UpdateReport:
+        self._bad = 0 if report.healthy else self._bad + 1
+        self._bad_reason = report.reason
+        return report
+
+    def _insert(self, ids: Ids, points: Array, covariances: Array, by_pose: Array) -> NDArray[np.bool_]:
+        n = len(ids)
+        if points.shape != (n, 3) or covariances.shape != (n, 3, 3):
+            raise InvalidValue("localization: ids, points and covariances do not belong together")
+        if np.isin(ids, self.ids).any() or len(np.unique(ids)) != n:
+            raise InvalidValue("localization: a landmark can be added only once")
+        rays, by_point = rays_of_points(points, self._camera.mount_forward, self._camera.mount_height)
+        fit = self._anchorable(rays) & np.isfinite(covariances).all(axis=(1, 2))
+        by_point = by_point[fit]
+        own = by_point @ covariances[fit] @ np.swapaxes(by_point, 1, 2)
+        self._state = self._state.grown(rays[fit], own, by_point @ by_pose[fit])
+        self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)[fit]])
+        return fit
+
+    def _anchorable(self, rays: Array) -> NDArray[np.bool_]:
+        near = rays[:, 2] * self.settings.nearest > 1.0
+        aside = ~(np.abs(rays[:, 0]) <= self.settings.widest_slope)
+        return np.asarray((rays[:, 2] > 0) & ~near & ~aside, np.bool_)
+
+    def _keep(self, mask: NDArray[np.bool_]) -> None:
+        self._state = self._state.kept(mask)
+        self.ids = self.ids[mask]

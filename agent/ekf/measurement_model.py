@@ -1,0 +1,108 @@
+"""What an image shows of the mapping filter's landmarks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.ekf.innovations import Examined, examine
+from mapweave.agent.ekf.landmark_estimates import Ids
+from mapweave.agent.ekf.mapping_state import MappingState, Step
+from mapweave.agent.ekf.settings import FilterSettings
+from mapweave.agent.ekf.update_report import Health, UpdateReport
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Array
+
+
+class Pinhole:
+    """Pixels and slopes of an ideal camera.
+
+    Attributes:
+        focal: (2,) px.
+        centre: (2,) px, principal point.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        """Of its intrinsics."""
+        self.focal = np.array([camera.fx, camera.fy])
+        self.centre = np.array([camera.cx, camera.cy])
+
+    def slopes(self, pixels: Array) -> Array:
+        """(N, 2) slopes (a, b) of pixels (N, 2)."""
+        return np.asarray((pixels - self.centre) / self.focal, np.float64)
+
+    def pixels(self, slopes: Array) -> Array:
+        """(N, 2) px of slopes (N, 2)."""
+        return np.asarray(self.centre + self.focal * slopes, np.float64)
+
+
+def slots_of(held: Ids, ids: Ids) -> NDArray[np.intp]:
+    """(N,) places in the state of landmarks by their ids; -1 for those that it does not hold.
+
+    Args:
+        held: (n,) ids of the state's landmarks, each once.
+        ids: (N,) of which landmarks.
+    """
+    places = {landmark: slot for slot, landmark in enumerate(held.tolist())}
+    return np.array([places.get(landmark, -1) for landmark in ids.tolist()], np.intp)
+
+
+class ImageMeasurement(NamedTuple):
+    """The landmarks of a filter that an image shows.
+
+    Attributes:
+        ids: (N,) what was tracked, as it was given.
+        slots: (m,) places in the state of what is held and seen.
+        rows: (m,) their rows among the ids.
+        slopes: (m, 2) where they are seen, (pixel - principal point) / focal length.
+        focal: (2,) px.
+    """
+
+    ids: Ids
+    slots: NDArray[np.intp]
+    rows: NDArray[np.intp]
+    slopes: Array
+    focal: Array
+
+    @staticmethod
+    def of(held: Ids, ids: Ids, pixels: Array, pinhole: Pinhole) -> ImageMeasurement:
+        """What of the landmarks held is seen.
+
+        Args:
+            held: (n,) ids in the state's order.
+            ids: (N,) what was tracked.
+            pixels: (N, 2) px, undistorted; rows with NaN are not seen.
+            pinhole: of the camera.
+        """
+        places = slots_of(held, ids)
+        rows = np.flatnonzero((places >= 0) & np.isfinite(pixels).all(axis=1))
+        return ImageMeasurement(ids, places[rows], rows, pinhole.slopes(pixels[rows]), pinhole.focal)
+
+    def compared(
+        self, step: Step | None, settled: MappingState, variances: Array, settings: FilterSettings
+    ) -> tuple[Step | None, Examined]:
+        """Hold an image beside what was expected of it.
+
+        Args:
+            step: that brought the robot to where the image was taken, if there was one.
+            settled: the state before it.
+            variances: (2,) of a slope.
+            settings: of the filter.
+
+        Returns:
+            The step, linearised where it seems to have gone, and what came out.
+        """
+        if step is not None and settings.relinearisations and len(self.slots) >= settings.least_agreeing:
+            return step.glanced(self.slots, self.slopes, variances, settings.slip_sigmas)
+        expected = settled if step is None else step.state
+        return step, examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)
+
+    def report(
+        self, believed: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
+    ) -> UpdateReport:
+        """Of an update by what is seen: believed (m,), innovations (m, 2) slopes measured minus expected."""
+        accepted, innovations_px = np.zeros(len(self.ids), np.bool_), np.full((len(self.ids), 2), np.nan)
+        accepted[self.rows], innovations_px[self.rows] = believed, innovations * self.focal
+        return UpdateReport(self.ids, accepted, innovations_px, mean_nis, health, reason)

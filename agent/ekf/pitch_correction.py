@@ -1,0 +1,39 @@
+"""A camera that nods: over a kerb, on a rough floor, or braking hard, all that it sees moves up or down.
+
+The filter knows of motion in the plane alone. A nod of half a degree moves every landmark by several pixels,
+all the same way, and landmarks that are well known then refute each other's gates, or the wheels. What nods
+have in common is told apart from all that: no motion in the plane moves everything up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapweave.hybridmap.pose import Array
+
+LEAST = 8
+"""Landmarks that a nod is read off; fewer may be wrong together."""
+SIGMAS = 4.0
+"""A nod is evident if it is so many times what the filter expects the landmarks to move together."""
+
+
+def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Array | None:
+    """What a nod of the camera has made of the innovations, if one is evident.
+
+    Args:
+        innovations: (N, 2) slopes, measured minus expected.
+        covariance: (2N, 2N) of these, joint: what the filter takes to be possible without a nod.
+        slopes: (N, 2) as they are measured.
+
+    Returns:
+        (N, 2) to be taken off the slopes, from the derivative of a pinhole camera's slopes (a, b) by its
+        pitch, (a b, 1 + b^2), times the median of what the landmarks say that the pitch is; None if the
+        filter may be wrong by as much in the plane.
+    """
+    if len(innovations) < LEAST:
+        return None
+    by_pitch = np.stack([slopes[:, 0] * slopes[:, 1], 1.0 + slopes[:, 1] ** 2], axis=1)
+    pitch = float(np.median(innovations[:, 1] / by_pitch[:, 1]))
+    mean = 1.0 / (len(slopes) * by_pitch[:, 1])
+    expected = float(mean @ covariance[1::2, 1::2] @ mean)
+    return pitch * by_pitch if pitch**2 > SIGMAS**2 * expected else None

@@ -1,0 +1,68 @@
+"""What a filter says of itself after an update."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.pose import Array
+
+
+class Health(StrEnum):
+    """What holds an estimate up, or what it lacks. The covariance tells how much is lost by it."""
+
+    GOOD = "good"
+    SLIP = "wheels refuted"
+    """Landmarks agree that the robot did not go where its wheels say: slip, a lost encoder."""
+    NO_PARALLAX = "no parallax"
+    """The robot stands or turns on the spot: depths stay as unknown as they are."""
+    FEW = "few landmarks"
+    """Too few are in view to tell a wrong one from a right one; what is seen is used."""
+    DISAGREEMENT = "landmarks disagree"
+    """Too few of those in view agree with each other and the wheels."""
+    BLIND = "no landmark in view"
+    """Dark, a covered lens, or the robot looks elsewhere."""
+    NO_IMAGE = "no image"
+    """The camera dropped frames: only the wheels move the estimate on."""
+
+    @property
+    def held_up(self) -> bool:
+        """Whether landmarks hold the pose up."""
+        return self in (Health.GOOD, Health.SLIP, Health.NO_PARALLAX)
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateReport:
+    """One update by the landmarks of one image.
+
+    Attributes:
+        ids: (N,) landmarks that were given, as they were given.
+        accepted: (N,) which of them were believed; never those that the filter does not hold.
+        innovations_px: (N, 2) px, measured minus expected before the update; NaN where there is none.
+        mean_nis: normalised innovation squared over its degrees of freedom, of the accepted landmarks taken
+            jointly; about 1 if the filter is consistent, NaN if nothing was accepted.
+        health: what held the estimate up.
+        reason: what is wrong, in words and figures; empty if nothing is.
+    """
+
+    ids: NDArray[np.int64]
+    accepted: NDArray[np.bool_]
+    innovations_px: Array
+    mean_nis: float
+    health: Health = Health.GOOD
+    reason: str = ""
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the estimate was held up by enough landmarks that agree."""
+        return self.health.held_up
+
+    @staticmethod
+    def blind(ids: NDArray[np.int64], reason: str) -> UpdateReport:
+        """The report of an update that had nothing to see."""
+        n = len(ids)
+        none = np.zeros(n, np.bool_)
+        return UpdateReport(ids, none, np.full((n, 2), np.nan), float("nan"), Health.BLIND, reason)

@@ -1,0 +1,191 @@
+"""The moves of exploration: map the view ahead, turn to the next one, travel along a way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterator
+
+import numpy as np
+
+from mapweave.agent.clearance import clearance
+from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.servo.image_drive import ImageDrive, ImageDriveSettings
+from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
+
+
+class ExplorationBehaviours:
+    """What an exploring robot can do, one generator a move: each `yield` is a command for one tick.
+
+    Attributes:
+        phase: what it is doing.
+        detail: why, in words.
+    """
+
+    def __init__(self, description: RobotDescription, mapper: Mapper, settings: ExplorerSettings) -> None:
+        """Take the body, and the mapper that the pipeline keeps up to date."""
+        self.phase = Phase.LOOKING
+        self.detail = ""
+        self._description = description
+        self._mapper = mapper
+        self._settings = settings
+        self._drive = ImageDrive(description, ImageDriveSettings(speed=settings.drive_speed))
+        self._observation: Observation | None = None
+
+    def see(self, observation: Observation) -> None:
+        """Begin a tick. The mapper has seen the observation already."""
+        self._observation = observation
+
+    def begin(self) -> Iterator[Command]:
+        """Stand still until there is a first image to map from."""
+        self.phase, self.detail = Phase.LOOKING, ""
+        while not self._mapper.started:
+            self._mapper.begin(self._now)
+            if not self._mapper.started:
+                self.detail = "no image from the camera yet"
+            yield Command()
+
+    def map_view(self) -> Iterator[Command]:
+        """Drive back and forth with the view's features in sight until their depths have converged."""
+        s = self._settings
+        if self._mapper.anchor_features < s.least_features:
+            self.detail = f"only {self._mapper.anchor_features} features in view: turning on"
+            return
+        ahead = self.room(0.0)
+        behind = self.room(math.pi)
+        reach = min(s.drive, ahead)
+        if reach < s.least_drive:
+            reach = -min(s.drive, behind)
+        if abs(reach) < s.least_drive:
+            self.detail = f"no room to drive: {ahead:.2f} m ahead, {behind:.2f} m behind"
+            return
+        self.phase = Phase.DRIVING
+        self._drive.start(reach)
+        far_end = False
+        for _ in self._ticks(4 * abs(reach) / 0.1 + 40):
+            since = self._mapper.anchor_from_robot
+            command, done, reason = self._drive.command(
+                since.x, since.heading, self._mapper.bearings, self._now.proximity
+            )
+            self.detail = reason
+            if not far_end and abs(since.x) > 0.3 and command.forward * reach < 0:
+                far_end = True
+                self._mapper.leaf(self._now)
+            if done:
+                return
+            yield command
+
+    def turn_to_next_view(self, side: float, phase: Phase = Phase.TURNING) -> Generator[Command, None, float]:
+        """Turn on the spot until at most four features of the view are left (paper, section 4.1).
+
+        Args:
+            side: 1 turns to the left, -1 to the right.
+            phase: what it turns for.
+
+        Returns:
+            How far it turned, rad, not negative.
+        """
+        s = self._settings
+        self.phase, self.detail = phase, ""
+        start = self._mapper.map_from_robot.mean.heading
+        for _ in self._ticks(s.most_turn / s.turn_rate / self._description.tick + 40):
+            turned = abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
+            left = self._mapper.anchored
+            if turned >= s.most_turn or (turned >= s.least_turn and left <= s.left):
+                break
+            self.detail = f"{left} features of the view left"
+            yield Command(0.0, side * s.turn_rate)
+        # A still image makes a better node than a moving one.
+        yield Command()
+        yield Command()
+        turned = abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
+        self.finish()
+        return turned
+
+    def travel(self, path: list[Array]) -> Generator[Command, None, bool]:
+        """Follow the corners of a way: turn toward each, then drive straight to it, adding nodes.
+
+        Args:
+            path: (2,) m in map each.
+
+        Returns:
+            Whether the end was reached.
+        """
+        self.phase = Phase.TRAVELLING
+        for corner in path:
+            yield from self._face(corner)
+            if not (yield from self.drive_to(corner)):
+                self.detail = "the way is blocked: looking around here"
+                self.finish()
+                return False
+        self.finish()
+        return True
+
+    def _face(self, corner: Array) -> Iterator[Command]:
+        s = self._settings
+        for _ in self._ticks(200):
+            error = self._bearing_to(corner)
+            if abs(error) < 0.05:
+                return
+            if self._mapper.anchored <= s.left and abs(self._mapper.anchor_from_robot.heading) > s.least_turn:
+                yield Command()
+                yield Command()
+                self.finish()
+            self.detail = f"turning {math.degrees(error):+.0f} deg toward the way"
+            yield Command(0.0, float(np.clip(2.0 * error, -s.turn_rate, s.turn_rate)))
+
+    def drive_to(self, corner: Array) -> Generator[Command, None, bool]:
+        """Returns whether the corner was reached."""
+        s = self._settings
+        if abs(self._mapper.anchor_from_robot.heading) > 0.2 or self._mapper.anchored <= s.left:
+            yield Command()
+            self.finish()
+        best, since_best = math.inf, 0.0
+        while True:
+            distance = float(np.linalg.norm(corner - self.position))
+            error = self._bearing_to(corner)
+            if distance < 0.08 or (distance < 0.3 and abs(error) > 1.2):
+                return True
+            if distance < best - 0.02:
+                best, since_best = distance, 0.0
+            since_best += self._description.tick
+            if since_best > s.patience or (self.room(0.0) <= 0.0 and since_best > 1.0):
+                return False
+            gone = self._mapper.anchor_from_robot
+            way = math.hypot(gone.x, gone.y)
+            if way > s.travel_step or (way > 0.3 and self._mapper.anchored < 2 * s.left):
+                yield Command()
+                self.finish()
+            self.detail = f"{distance:.1f} m to the next corner"
+            speed = min(s.travel_speed, max(0.6 * distance, 0.05)) * max(0.0, 1.0 - abs(error) / 0.5)
+            yield Command(speed, float(np.clip(1.5 * error, -s.turn_rate, s.turn_rate)))
+
+    # Small things
+
+    @property
+    def _now(self) -> Observation:
+        assert self._observation is not None
+        return self._observation
+
+    @property
+    def position(self) -> Array:
+        """Where the robot is, (2,) m in map."""
+        pose = self._mapper.map_from_robot.mean
+        return np.array([pose.x, pose.y])
+
+    def _bearing_to(self, point: Array) -> float:
+        pose: Pose2 = self._mapper.map_from_robot.mean
+        return wrap_angle(math.atan2(point[1] - pose.y, point[0] - pose.x) - pose.heading)
+
+    def room(self, direction: float) -> float:
+        """How far the footprint may move in a direction (rad, 0 ahead), m, by the rangers."""
+        return clearance(self._description, self._now.proximity, direction, self._settings.drive)
+
+    def _ticks(self, most: float) -> range:
+        """A bound on the length of a behaviour: nothing may last forever."""
+        return range(int(most))
+
+    def finish(self) -> None:
+        """End the episode: what was seen becomes nodes."""
+        self._mapper.finish(self._now)

@@ -1,0 +1,148 @@
+"""Exploration: look around at a place, map each view by driving back and forth, travel to the next place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from mapweave.agent.exploration.behaviours import ExplorationBehaviours
+from mapweave.agent.exploration.fleet_coverage import FleetCoverage
+from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_around, views_of
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.mission import Answer, Question
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Array
+
+
+class Explorer:
+    """Drives a robot so that its mapper sees the whole reachable floor.
+
+    Written as one generator a behaviour: each `yield` is a command for one tick, so the order of actions
+    can be read from top to bottom.
+
+    Attributes:
+        places: where it has looked all around, (x, y) m in map.
+    """
+
+    def __init__(
+        self,
+        map_id: MapId,
+        description: RobotDescription,
+        mapper: Mapper,
+        floor: OccupancyGrid,
+        settings: ExplorerSettings | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Take the body, and the mapper and floor that the pipeline keeps up to date."""
+        self.places: list[Array] = []
+        self._description = description
+        self._mapper = mapper
+        self._floor = floor
+        self._settings = settings or ExplorerSettings()
+        self._moves = ExplorationBehaviours(description, mapper, self._settings)
+        self._hearsay = FleetCoverage(map_id, self._settings.reach + self._settings.spacing)
+        self._rng = np.random.default_rng(seed)
+        self._side = self._either_side()
+        self._avoid: list[Array] = []
+        self._questions: list[Question] = []
+        self._behaviour = self._explore()
+
+    def step(
+        self, observation: Observation, answers: tuple[Answer, ...] = ()
+    ) -> tuple[Command, list[Question]]:
+        """One tick. The mapper and the floor have seen the observation already."""
+        self._moves.see(observation)
+        self._questions = []
+        for answer in answers:
+            self._hearsay.take(answer)
+        return next(self._behaviour), self._questions
+
+    @property
+    def phase(self) -> Phase:
+        """What it is doing."""
+        return self._moves.phase
+
+    @property
+    def detail(self) -> str:
+        """Why, in words."""
+        return self._moves.detail
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left to explore."""
+        return self.phase is Phase.DONE
+
+    def restart(self) -> None:
+        """Begin again from where the robot is now: it was lost, and knows its pose again."""
+        self._moves.phase, self._moves.detail = Phase.LOOKING, ""
+        self._behaviour = self._explore()
+
+    def _explore(self) -> Iterator[Command]:
+        yield from self._moves.begin()
+        self._ask()
+        while True:
+            if (
+                seen_around(self._views, self._moves.position, self._settings.known_reach)
+                >= self._settings.known
+            ):
+                yield from self._scan()
+            else:
+                yield from self._look_around()
+            self.places.append(self._moves.position)
+            path = self._way_on()
+            if not path:
+                break
+            self._ask()
+            if not (yield from self._moves.travel(path)):
+                self._avoid.append(path[-1])
+        self._moves.phase = Phase.DONE
+        while True:
+            yield Command()
+
+    def _look_around(self) -> Iterator[Command]:
+        """Map view after view, turning on the spot between them, all the way around."""
+        turned = 0.0
+        while True:
+            yield from self._moves.map_view()
+            before = turned
+            turned += yield from self._moves.turn_to_next_view(self._side)
+            if before < math.pi <= turned:
+                # The answer has half of the turn to come, and is still new when the robot has to choose.
+                self._ask()
+            if turned > math.tau - 0.3:
+                yield from self._moves.map_view()
+                return
+
+    def _scan(self) -> Iterator[Command]:
+        """Turn until the rangers have swept all around: the views are mapped, the floor is not known."""
+        self._ask()
+        bearings = np.sort(np.array(self._description.ranger_bearings))
+        gaps = np.diff(bearings, append=bearings[:1] + math.tau)
+        turned = 0.0
+        while turned < (gaps.max() if len(gaps) else math.tau):
+            turned += 0.05 + (yield from self._moves.turn_to_next_view(self._side, Phase.SCANNING))
+
+    def _way_on(self) -> list[Array]:
+        """Corners of the way to the next place; empty if there is none."""
+        s = self._settings
+        been = np.array(self.places + self._avoid)
+        theirs = self._hearsay.places(self._views, s.known_reach, s.known)
+        return next_viewpoint(self._floor, self._moves.position, been, theirs, s)
+
+    @property
+    def _views(self) -> Array:
+        """(N, 4) of own and of others' nodes; see `views_of`."""
+        return np.concatenate([views_of(self._mapper.map), self._hearsay.views])
+
+    def _ask(self) -> None:
+        """Ask what others have mapped around here. Nothing waits for the answer."""
+        if self._settings.ask:
+            self._questions.append(self._hearsay.question(self._moves.position))
+
+    def _either_side(self) -> float:
+        return 1.0 if self._rng.random() < 0.5 else -1.0

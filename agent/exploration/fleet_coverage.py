@@ -1,0 +1,54 @@
+"""What other robots have mapped around here, as the fleet's map tells it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapweave.agent.exploration.viewpoint_selection import seen_around
+from mapweave.agent.mission import Answer, WhatIsKnown
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.query import KnownAnswer
+
+NUMBER = -1
+"""Of every question: only the newest answer counts. The navigator's questions are positive."""
+
+
+class FleetCoverage:
+    """Others' views, in this robot's own map: none without a server, or before the maps are joined.
+
+    Attributes:
+        views: (N, 4) [x m, y m, heading rad, semi-aperture rad], in map.
+    """
+
+    def __init__(self, map_id: MapId, reach: float) -> None:
+        """Know nothing.
+
+        Args:
+            map_id: the robot's own map.
+            reach: how far around it is asked, m.
+        """
+        self.views: Array = np.zeros((0, 4))
+        self._map = map_id
+        self._reach = reach
+
+    def question(self, position: Array) -> WhatIsKnown:
+        """What to ask at a position, (2,) m in map."""
+        return WhatIsKnown(NUMBER, self._map, float(position[0]), float(position[1]), self._reach)
+
+    def take(self, answer: Answer) -> None:
+        """Take what came back. Nothing new is no reason to forget what was said before."""
+        if isinstance(answer.content, KnownAnswer):
+            self.views = answer.content.views
+
+    def places(self, views: Array, reach: float, known: float) -> Array:
+        """Where others have looked around, so that this robot need not: (M, 2) m, in map.
+
+        Args:
+            views: (N, 4) of everybody: it does not matter who looked.
+            reach: views within this of a place show it, m.
+            known: share of all directions into which they must look.
+        """
+        positions: Array = self.views[:, :2]
+        around = [seen_around(views, position, reach) >= known for position in positions]
+        return np.asarray(positions[np.array(around, dtype=bool)])

@@ -1,0 +1,59 @@
+"""Where the robot is with respect to a node of the map, kept up while it moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mapweave.agent.localization.node_localizer import NodeLocalizer
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import PoseGaussian
+
+TURN_SHARE = 0.15
+"""m/rad; a turn without landmarks in sight makes the robot as unsure as this way does."""
+
+
+@dataclass(eq=False)
+class Fix:
+    """Where the robot is with respect to a node: by the node's landmarks in sight, else by the wheels.
+
+    Attributes:
+        node: the node's id.
+        node_from_robot: pose.
+        localizer: follows the node's landmarks; None if they are not known or not in sight.
+        blind: way since landmarks were last in sight, m.
+    """
+
+    node: NodeId
+    node_from_robot: PoseGaussian
+    localizer: NodeLocalizer | None = None
+    blind: float = 0.0
+
+    @staticmethod
+    def of(localizer: NodeLocalizer) -> Fix:
+        """A fix on a node whose landmarks are in sight."""
+        return Fix(localizer.node.id, localizer.pose, localizer)
+
+    @property
+    def in_sight(self) -> bool:
+        """Whether the node's landmarks are in sight."""
+        return self.localizer is not None and self.localizer.in_sight
+
+    def follow(self, observation: Observation, description: RobotDescription) -> None:
+        """Take in what the robot senses."""
+        if self.localizer is not None:
+            self.localizer.step(observation)
+            if self.localizer.in_sight:
+                self.node_from_robot, self.blind = self.localizer.pose, 0.0
+                return
+            self.localizer = None
+        step, blind = wheel_step(observation.odometry, description)
+        self.node_from_robot, self.blind = self.node_from_robot @ step, self.blind + blind
+
+
+def wheel_step(odometry: Odometry, description: RobotDescription) -> tuple[PoseGaussian, float]:
+    """One step by wheels alone: `before_from_after`, and the blind way that it counts for, m."""
+    axle = description.axle
+    way = description.wheel_noise * (abs(odometry.forward) + abs(odometry.turn) * axle)
+    step = PoseGaussian.from_sigmas(odometry.motion(), way + 1e-5, way / axle + 1e-5)
+    return step, abs(odometry.forward) + TURN_SHARE * abs(odometry.turn)

@@ -1,0 +1,126 @@
+"""Looking for nodes whose landmarks should be in view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.localization.node_localizer import NodeLocalizer, NodeLocalizerSettings
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.registration.levelling import level
+from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.recognition import RecognitionSettings, recognise
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+
+
+@dataclass(frozen=True)
+class NodeDetectorSettings:
+    """When a node counts as found.
+
+    Attributes:
+        localizer: tracking and filtering of its landmarks from then on.
+        recognition: when it counts as recognised. Less is asked than of a lost robot, because the pose
+            must also be the expected one.
+        plausible: a recognition this far from where the robot believes to be is not believed, m.
+        plausible_turn: likewise, rad.
+        more: what is tracked already is given up for a fresh look that finds this many times as many
+            landmarks.
+    """
+
+    localizer: NodeLocalizerSettings = field(default_factory=NodeLocalizerSettings)
+    recognition: RecognitionSettings = field(
+        default_factory=lambda: RecognitionSettings(
+            least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0
+        )
+    )
+    plausible: float = 0.3
+    plausible_turn: float = 0.25
+    more: float = 1.3
+
+
+class Expected(NamedTuple):
+    """A node that may be in view.
+
+    Attributes:
+        leg: whatever the caller knows it by.
+        node: with its landmarks.
+        node_from_robot: where the robot believes to be.
+        doubt: how many times further than usual it may be off.
+        tracked: landmarks of the node that are tracked already.
+    """
+
+    leg: int
+    node: Node
+    node_from_robot: Pose2
+    doubt: float = 1.0
+    tracked: int = 0
+
+
+class NodeDetector:
+    """Finds nodes by their features, where they are expected and nowhere else."""
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        sift: Sift,
+        settings: NodeDetectorSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Take the robot's camera.
+
+        Args:
+            description: of the robot.
+            lens: of its camera.
+            sift: finds features.
+            settings: when a node counts as found.
+            rng: for verification.
+        """
+        self._description = description
+        self._lens = lens
+        self._sift = sift
+        self._settings = settings
+        self._rng = rng
+
+    def find(self, image: NDArray[np.uint8], wanted: Iterable[Expected]) -> tuple[int, NodeLocalizer] | None:
+        """Look for nodes, in their order.
+
+        Args:
+            image: (H, W) grey.
+            wanted: nodes that may be in view.
+
+        Returns:
+            Leg of the first that is found, and what follows its landmarks from this image on; or None.
+        """
+        s, features = self._settings, self._sift.extract(image)
+        view = features.view(self._description.camera)
+        for one in wanted:
+            found = recognise(one.node, view, s.recognition, self._rng)
+            if found is None or not self._plausible(found.node_from_robot.mean, one):
+                continue
+            if found.inliers > s.more * one.tracked:
+                node, closer = one.node, look_closer(one.node, view, found, s.recognition.pose)
+                if node.landmarks.scale_share:
+                    levelled = level(node, view, found)
+                    node, closer = levelled.node, levelled.node_from_robot
+                found = replace(found, node_from_robot=closer)
+                return one.leg, NodeLocalizer(
+                    self._description, self._lens, node, image, features, found, s.localizer
+                )
+        return None
+
+    def _plausible(self, found: Pose2, expected: Expected) -> bool:
+        """Whether the robot may be there, by what it believes."""
+        s, believed = self._settings, expected.node_from_robot
+        turned = abs(wrap_angle(found.heading - believed.heading))
+        return (
+            found.distance(believed) <= s.plausible * expected.doubt
+            and turned <= s.plausible_turn * expected.doubt
+        )

@@ -1,0 +1,154 @@
+"""Where the robot is with respect to one node: recognised by SIFT, then tracked and filtered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.ekf.localization_filter import LocalizationFilter, LocalizationSettings
+from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.vision.node_tracks import NodeTracks
+from mapweave.agent.vision.tracker import TrackerSettings
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.registration.recognition import Recognition
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Features
+
+
+@dataclass(frozen=True)
+class NodeLocalizerSettings:
+    """When a node's landmarks count as in sight.
+
+    Attributes:
+        tracker: tracks of the node's landmarks.
+        filter: the localization EKF.
+        least: landmarks that must be tracked (paper, section 6: n >= 4).
+        strikes: a track that the filter refuses this often in a row is given up.
+    """
+
+    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    filter: LocalizationSettings = field(default_factory=LocalizationSettings)
+    least: int = 4
+    strikes: int = 3
+
+
+class NodeLocalizer:
+    """Follows one node's landmarks. Track ids are the landmarks' indices in the node.
+
+    Attributes:
+        node: the node that the pose refers to.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        node: Node,
+        image: NDArray[np.uint8],
+        features: Features,
+        recognition: Recognition,
+        settings: NodeLocalizerSettings | None = None,
+    ) -> None:
+        """Start from a recognition of the node in an image's features."""
+        self.node = node
+        self._settings = s = settings or NodeLocalizerSettings()
+        self._description = description
+        self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, s.strikes)
+        self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
+        self._teaches = True
+        self._filter = self._filter_at(recognition.node_from_robot, self._tracks.ids)
+
+    @property
+    def pose(self) -> PoseGaussian:
+        """`node_from_robot` now."""
+        return self._filter.pose
+
+    @property
+    def visible(self) -> NDArray[np.int64]:
+        """Indices of the node's landmarks that are tracked now."""
+        return self._tracks.ids
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) px, where they are seen."""
+        return self._tracks.pixels
+
+    @property
+    def in_sight(self) -> bool:
+        """Whether enough landmarks are tracked and the filter trusts itself."""
+        return len(self._tracks.ids) >= self._settings.least and self._filter.healthy
+
+    def restart(self, pose: PoseGaussian) -> None:
+        """Believe a pose that is known better than by what was tracked so far.
+
+        By the same landmarks: so from then on they learn nothing from where the robot is.
+        """
+        self._note(np.ones(len(self._filter.ids), np.bool_))
+        self._teaches = False
+        self._filter = self._filter_at(pose, self._tracks.ids)
+
+    def depths(self) -> tuple[Array, Array]:
+        """What the filter knows of the depths of all landmarks that were followed until they left the view.
+
+        Returns:
+            (N,) m, and standard deviations (N,) m by which they may be kept one by one, see
+            LocalizationState.depths; in the order of the node's landmarks, NaN for those that were not
+            followed, or given up.
+        """
+        self._note(np.ones(len(self._filter.ids), np.bool_))
+        return self._depths.copy(), self._depth_sigmas.copy()
+
+    def _note(self, which: NDArray[np.bool_]) -> None:
+        """Keep the depths of some of the filter's landmarks."""
+        ids = self._filter.ids[which]
+        if self._teaches and self._filter.healthy:
+            depths, sigmas = self._filter.state.depths()
+            self._depths[ids], self._depth_sigmas[ids] = depths[which], sigmas[which]
+
+    def step(self, observation: Observation) -> None:
+        """One tick: predict by the wheels, follow the landmarks, correct."""
+        self._filter.predict(observation.odometry)
+        if observation.image is None:
+            return
+        self._tracks.follow(observation.image, self._expected())
+        gone = ~np.isin(self._filter.ids, self._tracks.ids)
+        if gone.any():
+            self._note(gone)
+            self._filter.remove(self._filter.ids[gone])
+        if len(self._tracks.ids):
+            report = self._filter.update(self._tracks.ids, self._tracks.pixels)
+            bad = self._tracks.judge(report.accepted)
+            if len(bad):
+                self._filter.remove(bad)
+                self._depths[bad] = self._depth_sigmas[bad] = np.nan
+
+    def _filter_at(self, pose: PoseGaussian, landmarks: NDArray[np.int64]) -> LocalizationFilter:
+        node, description = self.node, self._description
+        scale_share = node.landmarks.scale_share
+        return LocalizationFilter(
+            description.camera,
+            description.axle,
+            description.wheel_noise,
+            pose,
+            landmarks,
+            node.points_in_robot[landmarks],
+            node.landmarks.covariances_in_robot(node.camera, scale_share=scale_share)[landmarks],
+            scale_share,
+            settings=replace(self._settings.filter, side_slip=description.side_slip),
+        )
+
+    def _expected(self) -> Array:
+        """(N, 2) px where the tracks should be now, in the tracks' order."""
+        predicted = self._filter.predict_pixels()
+        order = np.argsort(self._filter.ids)
+        ids = self._filter.ids[order]
+        expected = np.full((len(self._tracks.ids), 2), np.nan)
+        if len(ids):
+            place = np.clip(np.searchsorted(ids, self._tracks.ids), 0, len(ids) - 1)
+            hit = ids[place] == self._tracks.ids
+            expected[hit] = predicted[order[place[hit]]]
+            expected[~self._description.camera.contains(expected)] = np.nan
+        return expected

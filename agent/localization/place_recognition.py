@@ -1,0 +1,113 @@
+"""Recognising places of the robot's own map, without any server."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapweave.hybridmap.descriptor import decode
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.registration.recognition import Recognition, recognise
+
+
+@dataclass(frozen=True)
+class PlaceRecognitionSettings:
+    """How places are looked up.
+
+    Attributes:
+        tries: nodes that are verified, by descending votes.
+        least_inliers: landmarks that must agree: one node speaks alone here, and the map is small.
+        votes: a node with fewer votes is not tried.
+    """
+
+    tries: int = 5
+    votes: int = 6
+    least_inliers: int = 24
+
+
+def recognise_place(
+    hybrid_map: HybridMap,
+    view: View,
+    rng: np.random.Generator,
+    settings: PlaceRecognitionSettings | None = None,
+) -> tuple[Node, Recognition] | None:
+    """The node of a robot's own map that a view shows best, and how it was recognised; or None.
+
+    See `recall_all`.
+    """
+    return next(iter(recognise_places(hybrid_map, view, rng, settings)), None)
+
+
+def recognise_places(
+    hybrid_map: HybridMap,
+    view: View,
+    rng: np.random.Generator,
+    settings: PlaceRecognitionSettings | None = None,
+) -> list[tuple[Node, Recognition]]:
+    """Find the nodes of a robot's own map that a view shows (paper, section 5: the kidnapped robot).
+
+    Every feature votes for the node that holds its nearest descriptor; the nodes with most votes are
+    verified by geometry. One robot's map is small, so all descriptors are compared.
+
+    Args:
+        hybrid_map: the robot's own map.
+        view: what it sees now.
+        rng: for the verification's random samples.
+        settings: how many to try.
+
+    Returns:
+        The nodes and how each was recognised, most inliers first.
+    """
+    settings = settings or PlaceRecognitionSettings()
+    nodes = [n for n in hybrid_map.nodes.values() if len(n.landmarks)]
+    if not nodes or not len(view):
+        return []
+    known = np.concatenate([decode(n.landmarks.codes) for n in nodes])
+    owner = np.repeat(np.arange(len(nodes)), [len(n.landmarks) for n in nodes])
+    nearest = (decode(view.codes) @ known.T - 0.5 * (known**2).sum(axis=1)).argmax(axis=1)
+    votes = np.bincount(owner[nearest], minlength=len(nodes))
+    recalled: list[tuple[Node, Recognition]] = []
+    for index in np.argsort(-votes, kind="stable")[: settings.tries]:
+        if votes[index] < settings.votes:
+            break
+        found = recognise(nodes[index], view, None, rng)
+        if found is not None and found.inliers >= settings.least_inliers:
+            recalled.append((nodes[index], found))
+    return sorted(recalled, key=lambda pair: -pair[1].inliers)
+
+
+def lookalikes(
+    recalled: list[tuple[Node, Recognition]], rival: float, apart: float
+) -> tuple[Node, Node] | None:
+    """The node that a view shows best, and another one, elsewhere, that it shows about as well; or None.
+
+    Args:
+        recalled: most inliers first, as `recall_all` returns them.
+        rival: another node has a say too with this share of the best one's inliers;
+        apart: it is elsewhere if it puts the robot further away than this, m.
+    """
+    if not recalled:
+        return None
+    node, best = recalled[0]
+    here = node.map_from_robot.mean @ best.node_from_robot.mean
+    for other, also in recalled[1:]:
+        there = other.map_from_robot.mean @ also.node_from_robot.mean
+        if also.inliers >= rival * best.inliers and here.distance(there) > apart:
+            return node, other
+    return None
+
+
+def exact_enough(pose: PoseGaussian, sure: tuple[float, float], leniency: float = 1.0) -> bool:
+    """Whether a recognition is exact enough to go on from; else another look, elsewhere, costs little.
+
+    Args:
+        pose: `node_from_robot`.
+        sure: standard deviations that are good enough, m and rad.
+        leniency: by how much they may be larger.
+    """
+    sigma = np.sqrt(np.diag(pose.covariance))
+    return bool(max(sigma[:2]) <= sure[0] * leniency and sigma[2] <= sure[1] * leniency)

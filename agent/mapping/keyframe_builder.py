@@ -1,0 +1,300 @@
+"""Views become nodes, and what joins them becomes edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.edge_measurement.driven_edge import driven_edge
+from mapweave.agent.edge_measurement.traverse import Traverse
+from mapweave.agent.ekf.triangulation import triangulate
+from mapweave.agent.mapping.anchored_keyframe import HERE, AnchoredKeyframe
+from mapweave.agent.mapping.tracking import Tracking
+from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
+from mapweave.agent.mapping.view import View
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.quantization import settle
+from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.registration.recognition import Recognition, register
+from mapweave.registration.selection import SelectionSettings, choose, worth
+
+TURN_ONLY = 0.15
+"""m; between two views nearer than this the robot has turned on the spot rather than driven."""
+
+
+@dataclass(frozen=True)
+class KeyframeBuilderSettings:
+    """How nodes and edges are made.
+
+    Attributes:
+        most_landmarks: landmarks that a node keeps.
+        selection: what a node may cost on the wire, and which landmarks it keeps if they cost more.
+        least_landmarks: a view with fewer becomes no node.
+        depth_share: a landmark is kept if its depth's sigma is below this share of the depth.
+        depth_floor: what a depth is never better than: m, and share of the depth.
+        most_chi2: a triangulated track fits if its mean squared residual is below this; 1 is expected.
+        edge_floor: what an edge's pose is never better than, m and rad: tracks err alike for a while,
+            which the filter, for which pixels err independently, does not know.
+        edge_share: likewise as a share of the way and of the turn: wheels are never quite round.
+        loop_reach: nodes of the own map nearer than this are tried for a loop closure, m.
+        loop_turn: and turned by less than this, rad.
+        loop_tries: at most this many, nearest first.
+        loop_sigma: a loop closure known no better than this is left to the server, m.
+        loop_gate: chi-square with 3 degrees of freedom by which a loop closure may miss what the robot has
+            measured on its way from the one node to the other: places may look alike.
+        loop_floor: error of that way that its covariance does not tell of, m and rad.
+    """
+
+    most_landmarks: int = 150
+    selection: SelectionSettings = field(default_factory=SelectionSettings)
+    least_landmarks: int = 6
+    depth_share: float = 0.25
+    depth_floor: tuple[float, float] = (0.01, 0.015)
+    most_chi2: float = 4.0
+    edge_floor: tuple[float, float] = (0.002, 0.004)
+    edge_share: tuple[float, float] = (0.005, 0.01)
+    loop_reach: float = 1.2
+    loop_turn: float = 0.7
+    loop_tries: int = 4
+    loop_sigma: float = 0.12
+    loop_gate: float = 25.0
+    loop_floor: tuple[float, float] = (0.05, 0.03)
+
+
+class KeyframeBuilder:
+    """Makes the nodes and edges of one map.
+
+    Attributes:
+        map: what was made so far.
+        map_from_anchor: pose of the current anchor.
+    """
+
+    def __init__(
+        self,
+        map_id: MapId,
+        description: RobotDescription,
+        settings: KeyframeBuilderSettings,
+        contents: Sequence[ChangeBody] = (),
+        next_number: int = 1,
+    ) -> None:
+        """Start an empty map whose frame is the first anchor's, or go on with one.
+
+        Args:
+            map_id: of the map.
+            description: of the robot.
+            settings: how.
+            contents: of a map that was begun.
+            next_number: the first that no node or edge has ever had.
+        """
+        self.map = HybridMap(contents)
+        self.map_from_anchor = HERE
+        self._map_id = map_id
+        self._description = description
+        self._camera = description.camera
+        self._settings = settings
+        self._last: AnchoredKeyframe | None = None
+        self._next_number = next_number
+        self._new: list[ChangeBody] = []
+        self._rng = np.random.default_rng(0)
+
+    def take_changes(self) -> tuple[ChangeBody, ...]:
+        """What was changed in the map since the last call, in order: it is to leave the robot."""
+        new, self._new = tuple(self._new), []
+        return new
+
+    def place(
+        self, anchor: View, leaves: list[View], tracking: Tracking, wayside: TrajectoryRecorder
+    ) -> Node | None:
+        """Make nodes of an episode's views, edges between them and to the episode before, and loop closures.
+
+        Args:
+            anchor: the view where the episode began.
+            leaves: views beside it.
+            tracking: what is known of the landmarks.
+            wayside: where the robot was since the last node: it is the anchor's wake, if that becomes a node.
+
+        Returns:
+            The anchor's node; None, and nothing is changed, if the anchor shows too little.
+        """
+        placed = self._node(anchor, tracking, wayside)
+        if placed is None:
+            return None
+        loops = self._close_loops(placed.node)
+        joined: list[Edge] = []
+        if self._last is not None and self._last.evidence and loops:
+            self._settle(placed, loops)
+        elif self._last is not None:
+            joined = [self._edge(self._last, placed, self._last.node_from_anchor)]
+        self._write(placed.node, *joined, *loops)
+        self._last = placed
+        for leaf in leaves:
+            beside = self._node(leaf, tracking)
+            if beside is not None:
+                self._write(beside.node, self._edge(placed, beside, self._sober(leaf.anchor_from_view)))
+        return placed.node
+
+    def recognise(self, node: Node, view: View, recognition: Recognition) -> None:
+        """The next episode begins at a view that shows a node of this map, however the robot came there.
+
+        Args:
+            node: of the map.
+            view: the anchor view, whose features all have tracks.
+            recognition: of the node in the view's features.
+        """
+        tracks = np.full(len(node.landmarks), -1, np.int64)
+        tracks[recognition.pairs[:, 0]] = view.tracks[recognition.pairs[:, 1]]
+        self.map_from_anchor = node.map_from_robot @ recognition.node_from_robot
+        self._last = AnchoredKeyframe(node, tracks, recognition.node_from_robot, recognition.evidence)
+
+    def lose(self, moved: PoseGaussian) -> None:
+        """Nobody knows any more where the robot is; `old_anchor_from_robot` is where it was thought to be.
+
+        A map without nodes may begin anywhere.
+        """
+        self.map_from_anchor = self.map_from_anchor @ moved if self.map.nodes else HERE
+        self._last = None
+
+    def move_anchor(self, moved: PoseGaussian) -> None:
+        """The next episode begins elsewhere: `old_anchor_from_new`, as the filter says."""
+        moved = self._sober(moved)
+        self.map_from_anchor = self.map_from_anchor @ moved
+        if self._last is not None:
+            self._last.node_from_anchor = self._last.node_from_anchor @ moved
+
+    def drove(self, traverse: Traverse | None, refined: Node | None) -> None:
+        """Write down what a drive has measured."""
+        if refined is not None:
+            self._write(refined)
+        if traverse is not None:
+            self._write(driven_edge(self.map, traverse, self._number))
+
+    def _write(self, *elements: Node | Edge) -> None:
+        """Put nodes and edges into the map."""
+        for element in elements:
+            change = NodePut(element) if isinstance(element, Node) else EdgePut(element)
+            self.map.apply(change)
+            self._new.append(change)
+
+    def _number(self) -> NodeId:
+        number = NodeId(self._map_id.agent, self._map_id.epoch, self._next_number)
+        self._next_number += 1
+        return number
+
+    def _node(
+        self, view: View, tracking: Tracking, wayside: TrajectoryRecorder | None = None
+    ) -> AnchoredKeyframe | None:
+        landmarks, tracks = self._landmarks(view, tracking)
+        if len(landmarks) < self._settings.least_landmarks:
+            return None
+        pose = self.map_from_anchor @ view.anchor_from_view
+        d = self._description
+        ranges = d.ranges(view.proximity)
+        wake = TrajectorySegment() if wayside is None else wayside.wake(view.stamp_ns, ranges)
+        node = Node(self._number(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius, ranges, wake)
+        return AnchoredKeyframe(node, tracks)
+
+    def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:
+        """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""
+        s, camera = self._settings, self._camera
+        depths, sigmas = np.full(len(view.tracks), np.nan), np.full(len(view.tracks), np.nan)
+        poses, pixels = tracking.history.sightings(view.tracks)
+        if len(poses) >= 2 and len(view.tracks):
+            solved = triangulate(poses, pixels, camera, reference=view.anchor_from_view.mean.vector)
+            fits = solved.chi2 < s.most_chi2
+            depths[fits], sigmas[fits] = solved.depths[fits], solved.depth_sigmas[fits]
+        view_from_robot = view.anchor_from_view.mean.inverse() @ tracking.pose.mean
+        known = tracking.landmarks()
+        shared, row, seat = np.intersect1d(known.ids, view.tracks, return_indices=True)
+        if len(shared):
+            ahead = view_from_robot.apply(known.points_in_robot[row])[:, 0] - camera.mount_forward
+            axis = view_from_robot.rotation[0]
+            spread = np.einsum("i,nij,j->n", axis, known.covariances_in_robot[row][:, :2, :2], axis)
+            # What the filter has followed for a moment only is known better by all its sightings.
+            sure = (ahead > 0.05) & (np.sqrt(np.maximum(spread, 0.0)) < s.depth_share * ahead)
+            depths[seat[sure]] = ahead[sure]
+            sigmas[seat[sure]] = np.sqrt(np.maximum(spread[sure], 1e-12))
+        with np.errstate(invalid="ignore"):
+            good = np.flatnonzero((depths > 0.05) & (sigmas < s.depth_share * depths))
+        # Tracks err alike for a while, which neither filter nor triangulation knows.
+        sigmas = np.hypot(sigmas, s.depth_floor[0] + s.depth_floor[1] * depths)
+        landmarks = Landmarks(
+            view.features.pixels[good].astype(np.float32), view.features.codes[good],
+            depths[good].astype(np.float32), sigmas[good].astype(np.float32),
+        )  # fmt: skip
+        seen = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
+        likely = worth(seen, good / max(len(view.tracks), 1))
+        kept = choose(landmarks, likely, camera, s.selection)[: s.most_landmarks]
+        # Rounded now, the robot works with the same numbers as everybody who gets the node.
+        landmarks, order = settle(landmarks.take(kept), camera)
+        return landmarks, view.tracks[good[kept[order]]]
+
+    def _edge(self, a: AnchoredKeyframe, b: AnchoredKeyframe, a_from_b: PoseGaussian) -> Edge:
+        _, in_a, in_b = np.intersect1d(a.tracks, b.tracks, return_indices=True)
+        driven = float(np.hypot(a_from_b.mean.x, a_from_b.mean.y))
+        kind = EdgeKind.TURNED if driven < TURN_ONLY else EdgeKind.MAPPED
+        if a.evidence:
+            kind = EdgeKind.LOOP
+        shared = np.stack([in_a, in_b], axis=1).astype(np.int64)
+        evidence = a.evidence or {"shared": float(len(shared))}
+        return Edge(self._number(), a.node.id, b.node.id, a_from_b, kind, shared, evidence)
+
+    def _settle(self, placed: AnchoredKeyframe, loops: list[Edge]) -> None:
+        """Correct where the first node after a recognition is, by the surest of its edges.
+
+        The recognition knew depths in the old node only; an edge between two nodes has them on both sides,
+        and is seldom off by as much.
+        """
+        best = min(loops, key=lambda edge: edge.evidence["sigma_xy"])
+        self.map_from_anchor = self.map.nodes[best.a].map_from_robot @ best.a_from_b
+        placed.node = replace(placed.node, map_from_robot=self.map_from_anchor)
+
+    def _sober(self, moved: PoseGaussian) -> PoseGaussian:
+        """A pose of the filter with the uncertainty that the filter cannot know."""
+        s = self._settings
+        way, turn = float(np.hypot(moved.mean.x, moved.mean.y)), abs(moved.mean.heading)
+        position = s.edge_floor[0] + s.edge_share[0] * way
+        heading = s.edge_floor[1] + s.edge_share[1] * turn
+        more = np.diag([position**2, position**2, heading**2])
+        return PoseGaussian(moved.mean, moved.covariance + more)
+
+    def _close_loops(self, node: Node) -> list[Edge]:
+        """Recognise places of the own map (paper, section 5): each gives a new edge."""
+        s, near = self._settings, []
+        for other in self.map.nodes.values():
+            between = other.map_from_robot.mean.inverse() @ node.map_from_robot.mean
+            reach = float(np.hypot(between.x, between.y))
+            joined = self._last is not None and other.id == self._last.node.id and not self._last.evidence
+            if not joined and reach < s.loop_reach and abs(between.heading) < s.loop_turn:
+                near.append((reach, other))
+        edges: list[Edge] = []
+        for _, other in sorted(near, key=lambda pair: pair[0])[: s.loop_tries]:
+            found = register(other, node, None, self._rng)
+            if found is None or found.evidence["sigma_xy"] >= s.loop_sigma:
+                continue
+            if self._credible(other, node, found.node_from_robot):
+                pose, pairs, evidence = found.node_from_robot, found.pairs, found.evidence
+                edges.append(Edge(self._number(), other.id, node.id, pose, EdgeKind.LOOP, pairs, evidence))
+        return edges
+
+    def _credible(self, earlier: Node, later: Node, found: PoseGaussian) -> bool:
+        """Whether a recognition agrees with the robot's own way from the earlier node to the later one.
+
+        The later pose is the earlier one and the way, L = E W; so the way's covariance is
+        W = L - Ad(w^-1) E Ad(w^-1)^T. Where the map was gone on with elsewhere in between, that is not so and
+        the difference may have no meaning: what is negative of it counts as nothing.
+        """
+        way = earlier.map_from_robot.mean.inverse() @ later.map_from_robot.mean
+        ad = way.inverse().adjoint
+        grown = later.map_from_robot.covariance - ad @ earlier.map_from_robot.covariance @ ad.T
+        values, vectors = np.linalg.eigh(0.5 * (grown + grown.T))
+        grown = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        xy, heading = self._settings.loop_floor
+        spread = grown + found.covariance + np.diag([xy**2, xy**2, heading**2])
+        return PoseGaussian(found.mean, spread).mahalanobis2(way) < self._settings.loop_gate

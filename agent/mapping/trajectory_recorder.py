@@ -1,0 +1,96 @@
+"""Wayside: what the robot keeps of its way between two nodes, for those who ask where it was when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.hybridmap.trajectory_segment import FURTHEST, LONGEST, MOST, TrajectorySegment
+
+
+@dataclass(frozen=True)
+class TrajectoryRecorderSettings:
+    """What is kept.
+
+    Attributes:
+        period: a moment each, s; twice as long whenever a wake grows too long.
+    """
+
+    period: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no time.
+
+        Raises:
+            InvalidValue: the period is not positive.
+        """
+        if not self.period > 0.0:
+            raise InvalidValue(f"wayside: a period of {self.period:g} s; it must be more than 0")
+
+
+class TrajectoryRecorder:
+    """Moments since the last node, seen from the mapper's anchor.
+
+    Nobody can compare the times of a robot whose clock has no name: it keeps nothing.
+    """
+
+    def __init__(self, description: RobotDescription, settings: TrajectoryRecorderSettings) -> None:
+        """Nothing yet."""
+        self._description = description
+        self._settings = settings
+        self.clear(0)
+
+    def clear(self, stamp_ns: int) -> None:
+        """Forget all: the moments are a node's now, or nobody knows any more where they were.
+
+        Args:
+            stamp_ns: of the anchor's image, which needs no moment beside it.
+        """
+        self._newest = stamp_ns
+        self._stamps: list[int] = []
+        self._poses: list[Pose2] = []
+        self._readings: list[Array] = []
+        self._period = self._settings.period
+
+    def step(self, observation: Observation, anchor_from_robot: Pose2) -> None:
+        """Keep this moment, if it is time."""
+        if not self._description.clock or observation.stamp_ns - self._newest < self._period * 1e9:
+            return
+        self._newest = observation.stamp_ns
+        self._stamps.append(observation.stamp_ns)
+        self._poses.append(anchor_from_robot)
+        self._readings.append(observation.proximity)
+        if len(self._stamps) > MOST:
+            for column in (self._stamps, self._poses, self._readings):
+                del column[1::2]
+            self._period *= 2.0
+
+    def move_anchor(self, old_from_new: Pose2) -> None:
+        """What comes is seen from the next anchor; so must be what was kept."""
+        new_from_old = old_from_new.inverse()
+        self._poses = [new_from_old @ pose for pose in self._poses]
+
+    def wake(self, stamp_ns: int, ranges: Ranges) -> TrajectorySegment:
+        """What was kept, for a node at the anchor.
+
+        Args:
+            stamp_ns: of the node's image.
+            ranges: what its proximity sensors saw; without any, the wake has no readings.
+        """
+        if not self._stamps:
+            return TrajectorySegment()
+        ages = (np.array(self._stamps, np.int64) - stamp_ns) * 1e-9
+        poses = np.array([pose.vector for pose in self._poses])
+        distances = np.zeros((len(ages), len(ranges)))
+        for k, one in enumerate(self._readings):
+            # What is missing is as if something stood before the sensor: it tells of nothing behind.
+            distances[k] = (
+                seen.distances if len(seen := self._description.ranges(one)) == len(ranges) else 0.0
+            )
+        good = (np.abs(ages) < LONGEST) & (np.abs(poses[:, :2]) < FURTHEST).all(axis=1)
+        return TrajectorySegment(ages[good], poses[good], distances[good])

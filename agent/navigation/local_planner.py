@@ -1,0 +1,123 @@
+"""Driving to a position between nodes: around what the rangers have seen on the way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mapweave.agent.navigation.grid_planner import GridPlanner
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.occupancy_grid import OccupancyGrid, OccupancyGridSettings
+from mapweave.agent.servo.dynamic_window import DynamicWindow, DynamicWindowSettings
+from mapweave.agent.servo.proximity import ranger_points
+from mapweave.hybridmap.pose import Array, Pose2
+
+
+@dataclass(frozen=True)
+class LocalPlannerSettings:
+    """How the robot drives between nodes.
+
+    Attributes:
+        speed: m/s.
+        turn_rate: rad/s.
+        replan_every: ticks between two plans.
+        floor: what it remembers, around where it is.
+        least: room beside the footprint that a way needs, m.
+        wished: room above which more is worth nothing, m.
+        ahead: the point of the way that it steers to is at most this far, m.
+        arcs: how it steers.
+        tight: something nearer than this counts as what is in the way, m.
+    """
+
+    speed: float = 0.26
+    turn_rate: float = 0.6
+    replan_every: int = 5
+    floor: OccupancyGridSettings = field(default_factory=lambda: OccupancyGridSettings(cell=0.05, side=6.4))
+    least: float = 0.065
+    wished: float = 0.20
+    ahead: float = 0.6
+    arcs: DynamicWindowSettings = field(default_factory=DynamicWindowSettings)
+    tight: float = 0.07
+
+
+class LocalPlanner:
+    """Remembers what the rangers have seen around, in the wheels' own frame.
+
+    That frame drifts, but the memory has to serve for a few metres only.
+    """
+
+    def __init__(self, description: RobotDescription, settings: LocalPlannerSettings | None = None) -> None:
+        """Know nothing of the floor yet."""
+        self._settings = s = settings or LocalPlannerSettings()
+        self._description = description
+        self._floor = OccupancyGrid(description, s.floor)
+        self._arcs = DynamicWindow(description, s.arcs)
+        self._odom_from_robot = Pose2()
+        self._way: Array = np.zeros((0, 2))
+        self._points: Array = np.zeros((0, 2))
+        self._tick = 0
+        self._replan_at = 0
+
+    @property
+    def around(self) -> bool:
+        """Whether the way leads around something."""
+        return bool(len(self._way))
+
+    def see(self, observation: Observation) -> None:
+        """Take in what the robot senses, every tick."""
+        self._tick += 1
+        self._odom_from_robot = here = self._odom_from_robot @ observation.odometry.motion()
+        self._floor.roll(np.array([here.x, here.y]))
+        self._floor.see(here, observation.proximity)
+        self._points = ranger_points(observation.proximity, self._description)
+
+    def toward(self, robot_from_target: Pose2) -> Command:
+        """Turn toward a position, then drive to it.
+
+        Args:
+            robot_from_target: where it is; its heading does not matter.
+        """
+        s, here = self._settings, self._odom_from_robot
+        start = np.array([here.x, here.y])
+        goal = here.apply(np.array([robot_from_target.x, robot_from_target.y]))
+        if self._tick >= self._replan_at:
+            self._replan_at = self._tick + s.replan_every
+            self._way = self._plan(start, goal)
+        ahead = here.inverse().apply(self._steered_to(start, goal))
+        speed = min(s.speed, 0.8 * float(np.hypot(*ahead)))
+        return self._arcs.toward(ahead, self._points, speed, s.turn_rate)
+
+    def _plan(self, start: Array, goal: Array) -> Array:
+        """(N, 2) m in odom, points of the way around; none if the straight way is free."""
+        s, room = self._settings, self._floor.room()
+        least, wished = (self._description.radius + extra for extra in (s.least, s.wished))
+        # The robot stands in the middle of the grid; what lies beyond its border nobody has seen.
+        goal = start + (goal - start) * min(1.0, 0.5 * s.floor.side / max(np.abs(goal - start).max(), 1e-9))
+        count = int(np.hypot(*(goal - start)) / (0.5 * s.floor.cell)) + 2
+        line = self._floor.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start))
+        if (room[line[:, 0], line[:, 1]] >= 0.5 * (least + wished)).all():
+            return np.zeros((0, 2))
+        first, last = self._floor.cells(np.stack([start, goal]))
+        passage = GridPlanner(room, (int(first[0]), int(first[1])), least, wished)
+        cells = passage.way_to((int(last[0]), int(last[1])))
+        return np.array([self._floor.centre((int(a), int(b))) for a, b in cells[1:]]).reshape(-1, 2)
+
+    def _steered_to(self, start: Array, goal: Array) -> Array:
+        """(2,) m in odom: the furthest point of the way to which a straight line keeps beside the way."""
+        if not len(self._way):
+            return goal
+        s = self._settings
+        nearest = int(np.hypot(*(self._way - start).T).argmin())
+        offsets = self._way[nearest:] - start
+        chosen = 0
+        for k in range(1, len(offsets)):
+            length = math.hypot(*offsets[k])
+            if length > s.ahead:
+                break
+            aside = offsets[:k] @ np.array([-offsets[k, 1], offsets[k, 0]]) / max(length, 1e-9)
+            if np.abs(aside).max() > s.floor.cell:
+                break
+            chosen = k
+        return np.asarray(start + offsets[chosen])

@@ -1,0 +1,306 @@
+"""Navigation in the large: find out where the robot is, get a route, follow it, and again if it is lost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from mapweave.agent.drive_statistics import DriveStatistics
+from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement, LandmarkRefinementSettings
+from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder, TraverseSettings
+from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
+from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
+from mapweave.agent.global_localization.settings import GlobalLocalizationSettings
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_localizer import NodeLocalizer, NodeLocalizerSettings
+from mapweave.agent.mission import Answer, Question, WhichWay
+from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
+from mapweave.agent.navigation.blocked_edges import BlockedEdges, BlockedEdgeSettings
+from mapweave.agent.navigation.local_planner import LocalPlanner, LocalPlannerSettings
+from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.route_follower import RouteFollower, RouteProgress
+from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import RouteAnswer, RouteLeg
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+
+HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
+NOTHING_NEAR = "it gets no further, though nothing is near"
+
+
+@dataclass(frozen=True)
+class NavigatorSettings:
+    """How the robot navigates.
+
+    Attributes:
+        localization: while it is lost.
+        localizer: tracking and filtering of the landmarks of the place that it has found.
+        follower: along a route.
+        detour: between nodes.
+        blocks: how long it remembers where it could not get through.
+        surveyor: what it measures on its way.
+        refinement: what it learns of landmarks.
+        answer_patience: ticks that an answer may take before the question counts as lost.
+        pause: seconds that it waits before what is in its way, and before it asks again for a route.
+        trusted: after a block it still knows where it is if it has driven less than this blindly, m.
+        further: where it looks in vain on its way, it drives on by wheels and looks again after this, m: they
+            are off by a few percent, and to turn back to what it knows, and about again, takes longer.
+        looks: so often in a row; then it is lost.
+    """
+
+    localization: GlobalLocalizationSettings = field(default_factory=GlobalLocalizationSettings)
+    localizer: NodeLocalizerSettings = field(default_factory=NodeLocalizerSettings)
+    follower: RouteFollowerSettings = field(default_factory=RouteFollowerSettings)
+    detour: LocalPlannerSettings = field(default_factory=LocalPlannerSettings)
+    blocks: BlockedEdgeSettings = field(default_factory=BlockedEdgeSettings)
+    surveyor: TraverseSettings = field(default_factory=TraverseSettings)
+    refinement: LandmarkRefinementSettings = field(default_factory=LandmarkRefinementSettings)
+    answer_patience: int = 100
+    pause: float = 2.0
+    trusted: float = 1.0
+    further: float = 1.0
+    looks: int = 2
+
+
+class Stage(StrEnum):
+    """What the navigator is doing while it follows no route."""
+
+    LOST = "looking around to find out where it is"
+    ASKING = "asking for a route"
+    BLOCKED = "standing before something in the way"
+    WAITING = "waiting for a way"
+    ARRIVED = "parked at the goal"
+
+
+class Navigator:
+    """Brings the robot to a goal node. The kidnapped robot of the paper is the same path: it starts lost.
+
+    Attributes:
+        stage: what it is doing, in words.
+        detail: why.
+        fix: where the robot is, or None while lost.
+        goal: where it shall be.
+        legs: nodes on the first route that was given.
+        tally: what the drive was made of so far.
+        traverse: from one node to another, if the last step has ended one.
+        refined: a node of the own map as it is known better after the last step, if it is.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        sift: Sift,
+        own_map: HybridMap,
+        goal: NodeId,
+        settings: NavigatorSettings | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Start lost, with a goal."""
+        self.stage: str = Stage.LOST
+        self.detail = ""
+        self.fix: Fix | None = None
+        self.goal = goal
+        self.legs = 0
+        self.tally = DriveStatistics()
+        self.traverse: Traverse | None = None
+        self.refined: Node | None = None
+        self._description = description
+        self._lens = lens
+        self._sift = sift
+        self._own_map = own_map
+        self._settings = s = settings or NavigatorSettings()
+        self._rng = np.random.default_rng(seed)
+        self._detour = LocalPlanner(description, s.detour)
+        self._motion = MotionPrimitives(description, s.answer_patience)
+        self._localization = GlobalLocalization(
+            description, sift, self._motion, OwnMap(own_map, self._rng), FleetMap(self._motion),
+            s.localization,
+        )  # fmt: skip
+        self._blocks = BlockedEdges(s.blocks)
+        self._surveyor = TraverseRecorder(description, s.surveyor)
+        self._refinement = LandmarkRefinement(own_map, s.refinement)
+        self._believed: Pose2 | None = None
+        self._vain_looks = 0
+        self._goal_hidden = False
+        self._following = self._searching = self._parked_anew = False
+        self._behaviour = self._go()
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the robot is parked at the goal."""
+        return self.stage == Stage.ARRIVED
+
+    def step(
+        self, observation: Observation, answers: tuple[Answer, ...], standing: bool = False
+    ) -> tuple[Command, list[Question]]:
+        """One tick: returns what the wheels shall do and what to ask the fleet's map.
+
+        Args:
+            observation: what the robot senses now.
+            answers: that have come.
+            standing: the robot must not move; the behaviour waits, and where the robot is is kept up.
+        """
+        self._motion.take_in(observation, answers)
+        self._detour.see(observation)
+        if self.fix is not None and (standing or not self._following):
+            self.fix.follow(observation, self._description)
+        command = Command() if standing else next(self._behaviour)
+        known = None if self._searching else self.fix
+        self.traverse = self._surveyor.see(known, observation)
+        self.refined = self._refinement.see(None if self.arrived else known)
+        if self._searching:
+            self.detail = self._localization.detail
+        return command, self._motion.questions()
+
+    # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.
+
+    def _go(self) -> Behaviour:
+        while not self.arrived:
+            if self.fix is None:
+                yield from self._find()
+            assert self.fix is not None, "the search ends with a fix"
+            route = yield from self._get_route(self.fix)
+            if route:
+                yield from self._follow(route, self.fix)
+            else:
+                yield from self._wait_for_a_way()
+        while True:
+            yield Command()
+
+    def _find(self) -> Behaviour:
+        self.stage, self._searching, self._goal_hidden = Stage.LOST, True, False
+        believed, self._believed = self._believed, None
+        place = yield from self._localization.search(believed)
+        self._found(place)
+
+    def _found(self, place: Candidate | None) -> None:
+        """Go on from the place that was found, if one was."""
+        self._searching, self.detail, self.fix = False, self._localization.detail, None
+        if place is None:
+            return
+        self.tally = self.tally.found()
+        if (seen := place.recognized) is None:
+            self.fix = Fix(place.node, place.node_from_robot)
+        else:
+            localizer = NodeLocalizer(
+                self._description, self._lens, seen.node, seen.image, seen.features, seen.recognition,
+                self._settings.localizer,
+            )  # fmt: skip
+            self.fix = Fix.of(localizer)
+
+    def _get_route(self, fix: Fix) -> Generator[Command, None, tuple[RouteLeg, ...]]:
+        """Ask the fleet's map; where nobody answers, the own map must do."""
+        self.stage = Stage.ASKING
+        here, blocked = fix.node_from_robot.mean, self._blocks.at(self._motion.now)
+        question = WhichWay(self._motion.number(), fix.node, self.goal, here, blocked)
+        answer = yield from self._motion.ask(question)
+        content, trouble = answer.content, ""
+        if not isinstance(content, RouteAnswer):
+            trouble = f"{answer.error or 'no answer'}; "
+            content = onboard_route(self._own_map, fix.node, self.goal, blocked)
+        self.detail = f"{trouble}{content.reason}"
+        self.legs = self.legs or len(content.legs)
+        return content.legs
+
+    def _wait_for_a_way(self) -> Behaviour:
+        """Without a route: what is in the way may go; without that the robot may not be where it thinks."""
+        self.stage = Stage.WAITING
+        if not self._blocks.at(self._motion.now):
+            self.fix = None
+        yield from self._motion.stand(self._settings.pause)
+
+    def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
+        """Follow a route until it is driven, or blocked, or the robot does not know where it is."""
+        follower = RouteFollower(
+            self._description, self._lens, self._sift, route, fix, self._detour, self._settings.follower,
+            self._rng,
+        )  # fmt: skip
+        self._following = True
+        while True:
+            leg = follower.leg
+            command = follower.step(self._motion.observation)
+            self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
+            self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
+            if follower.fix.in_sight:
+                self._vain_looks = 0
+            if follower.progress not in (RouteProgress.DRIVING, RouteProgress.PARKING):
+                break
+            yield command
+        self._following = False
+        match follower.progress:
+            case RouteProgress.ARRIVED:
+                self.tally = self.tally.passed([0.0])
+            case RouteProgress.BLOCKED if not self._parked_anew and self._only_parking(follower):
+                # Nothing keeps it from its goal but its own precision: that is no block for anybody.
+                self.detail, self._parked_anew = "parking came to no end: once more", True
+            case RouteProgress.BLOCKED:
+                yield from self._meet_block(*follower.blocked)
+                if self._parked_anew:
+                    # Twice: it begins from another heading, by what it sees then.
+                    self.fix, self._believed, self._parked_anew = None, self._on_own_map(self.fix), False
+            case RouteProgress.UNSURE if (
+                self._goal_hidden and follower.fix.blind < self._settings.follower.blind
+            ):
+                self.stage, self.detail = Stage.ARRIVED, HIDDEN
+                self.tally = self.tally.passed([0.0])
+            case RouteProgress.UNSURE:
+                # Not blind for long, it stands at the goal by what it has seen before, and sees none of it.
+                self._goal_hidden = follower.fix.blind < self._settings.follower.blind
+                yield from self._make_sure()
+
+    def _meet_block(self, a: NodeId, b: NodeId) -> Behaviour:
+        """Something is in the way: say what, give it time to go, then let another way be found."""
+        self._blocks.add(a, b, self._motion.now)
+        self.tally = self.tally.blocked()
+        where = f"between {a} and {b}" if a != b else f"on the way to {b}"
+        self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way() or NOTHING_NEAR}"
+        yield from self._motion.stand(self._settings.pause)
+        if self.fix is not None and not self.fix.in_sight and self.fix.blind > self._settings.trusted:
+            self.fix, self._believed = None, self._on_own_map(self.fix)
+
+    def _make_sure(self) -> Behaviour:
+        """No landmark was in sight for a while: one look from here; if in vain, on by wheels a little."""
+        self._searching, self._localization.detail = True, self.detail
+        yield from self._motion.stand(STILL)
+        before, s = self.fix, self._settings
+        place = yield from self._localization.look(LENIENT)
+        if place is None and before is not None and self._vain_looks < s.looks:
+            self._vain_looks, self._searching = self._vain_looks + 1, False
+            blind = max(s.follower.blind - s.further, 0.0)
+            self.fix = Fix(before.node, before.node_from_robot, None, blind)
+            return
+        if place is None:
+            self._believed = self._on_own_map(before)
+        self._vain_looks = 0
+        self._found(place)
+
+    def _on_own_map(self, fix: Fix | None) -> Pose2 | None:
+        """`map_from_robot` in the own map, if the fix is on one of its nodes."""
+        known = None if fix is None else self._own_map.nodes.get(fix.node)
+        if fix is None or known is None:
+            return None
+        return known.map_from_robot.mean @ fix.node_from_robot.mean
+
+    def _in_the_way(self) -> str:
+        """What keeps the robot from getting on; empty if nothing is near."""
+        ranges = self._motion.observation.proximity
+        bearings = self._description.ranger_bearings
+        if len(ranges) == len(bearings) and len(bearings):
+            nearest = int(np.argmin(ranges))
+            if ranges[nearest] < 2.0 * self._settings.detour.tight:
+                side = math.degrees(math.remainder(bearings[nearest], math.tau))
+                return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
+        return ""
+
+    def _only_parking(self, follower: RouteFollower) -> bool:
+        """Whether the robot is about at the route's last node, with nothing in its way."""
+        return follower.to_goal <= self._settings.follower.near and not self._in_the_way()

@@ -1,0 +1,44 @@
+"""A way through the robot's own map, for when no map server answers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from itertools import pairwise
+
+import numpy as np
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import RouteAnswer, RouteLeg
+from mapweave.hybridmap.reachability import closed_edges
+from mapweave.hybridmap.route import find_route
+
+
+def onboard_route(
+    own_map: HybridMap,
+    start: NodeId,
+    goal: NodeId,
+    blocked: Collection[tuple[NodeId, NodeId]] = (),
+) -> RouteAnswer:
+    """Find the cheapest way between two nodes of the own map.
+
+    Relative poses are those of the edges: nothing is optimised here, so a long way is as exact as its
+    hops together.
+
+    Args:
+        own_map: of this robot.
+        start: node that the robot knows itself by.
+        goal: where it shall be.
+        blocked: pairs of nodes, in either order, between which the robot cannot drive.
+    """
+    found = find_route(own_map, start, goal, blocked=blocked, closed=closed_edges(own_map))
+    if not found.nodes:
+        return RouteAnswer((), f"own map: {found.reason}")
+    here = PoseGaussian(Pose2(), np.zeros((3, 3)))
+    legs = [RouteLeg(own_map.nodes[start], here, None)]
+    for (before, node), edge in zip(pairwise(found.nodes), found.edges, strict=True):
+        relative = own_map.edge_between(before, node)
+        assert relative is not None, "the route runs along edges"
+        legs.append(RouteLeg(own_map.nodes[node], relative, own_map.edges[edge].kind))
+    return RouteAnswer(tuple(legs), f"own map: {found.reason}")

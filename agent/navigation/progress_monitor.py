@@ -1,0 +1,27 @@
+"""Whether the robot gets any nearer to where it wants to be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass
+class ProgressMonitor:
+    """How near the robot has come, and how long ago that was.
+
+    Attributes:
+        step: m, nearer by this counts.
+        best: m, the nearest so far.
+        stood: s since it last came nearer.
+    """
+
+    step: float = 0.03
+    best: float = math.inf
+    stood: float = 0.0
+
+    def take(self, distance: float, tick: float) -> None:
+        """Another tick (s) at a distance (m)."""
+        self.stood += tick
+        if distance < self.best - self.step:
+            self.best, self.stood = distance, 0.0

@@ -1,0 +1,285 @@
+"""Following one route: servo to the nodes in sight, drive to those that are not, park at the last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_detector import Expected, NodeDetector
+from mapweave.agent.localization.node_localizer import NodeLocalizer
+from mapweave.agent.navigation.local_planner import LocalPlanner
+from mapweave.agent.navigation.progress_monitor import ProgressMonitor
+from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.servo.odometry_drive import OdometryDrive
+from mapweave.agent.servo.proximity import ranger_points
+from mapweave.agent.servo.servo_step import State
+from mapweave.agent.servo.supervisor import Servo
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
+from mapweave.hybridmap.query import RouteLeg
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+
+MOST_LOOKED_FOR = 8
+"""Nodes tried in one image: a route may put any number of them into one place."""
+
+
+class RouteProgress(StrEnum):
+    """How far a follower is."""
+
+    DRIVING = "driving along the route"
+    PARKING = "parking at the goal"
+    ARRIVED = "parked at the goal"
+    UNSURE = "no landmark in sight for a while"
+    BLOCKED = "not getting on"
+
+
+class RouteFollower:
+    """Drives one route.
+
+    All poses are relative to the *reference*, the leg whose node the robot's fix is on; the route's
+    relative poses lead from there to the target.
+
+    Attributes:
+        progress: how far it is.
+        detail: in words.
+        fix: where the robot is.
+        leg: index of the leg that is driven to.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        lens: Lens,
+        sift: Sift,
+        route: tuple[RouteLeg, ...],
+        fix: Fix,
+        detour: LocalPlanner,
+        settings: RouteFollowerSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        """Start on a route.
+
+        Args:
+            description: of the robot.
+            lens: of its camera.
+            sift: finds features.
+            route: legs; the pose of the first is relative to the node of the fix.
+            fix: where the robot is.
+            detour: drives between nodes.
+            settings: how.
+            rng: for verification.
+        """
+        self.progress = RouteProgress.DRIVING
+        self.detail = ""
+        self.fix = fix
+        self._description = description
+        self._lookout = NodeDetector(description, lens, sift, settings.lookout, rng)
+        self._route = route
+        self._start_from_leg = [Pose2()]
+        for hop in route[1:]:
+            self._start_from_leg.append(self._start_from_leg[-1] @ hop.previous_from_node.mean)
+        self._detour = detour
+        self._settings = settings
+        self._servo = Servo(description)
+        self._servoing = -1
+        self._blind_drive = OdometryDrive(description)
+        self._start = fix.node
+        self._last = len(route) - 1
+        self._reference = 0
+        if fix.node != route[0].node.id:
+            pose = route[0].previous_from_node.inverse() @ fix.node_from_robot
+            self.fix = Fix(route[0].node.id, pose, None, fix.blind)
+        # The route may begin at a node that the robot does not stand at: then that is the first to reach.
+        self.leg = min(1 if self._off_reference() < settings.passed else 0, self._last)
+        self._tick = 0
+        self._progressed = ProgressMonitor()
+        self._headway = ProgressMonitor()
+        self._servo_barred = 0.0
+        self._approaching = False
+        self._hidden = 0.0
+        self._confirmed = False
+        self._looks: list[PoseGaussian] = []
+
+    @property
+    def blocked(self) -> tuple[NodeId, NodeId]:
+        """The pair of nodes between which the robot is, or is stuck."""
+        before = self._route[self.leg - 1].node.id if self.leg else self._start
+        return before, self._route[self.leg].node.id
+
+    @property
+    def to_goal(self) -> float:
+        """How far the robot is from the last node, m."""
+        return self.distance(self._last)
+
+    def distance(self, leg: int) -> float:
+        """How far the robot is from a leg's node, m."""
+        there = self._from_reference(leg) @ self.fix.node_from_robot.mean
+        return math.hypot(there.x, there.y)
+
+    def step(self, observation: Observation) -> Command:
+        """One tick; `progress` says whether it is the last one."""
+        s = self._settings
+        self._tick += 1
+        self.fix.follow(observation, self._description)
+        if self._tick % s.look_every == 0:
+            self._look_for(self._ahead(), observation)
+        self._pass_nodes()
+        target = self._target()
+        distance = math.hypot(target.x, target.y)
+        node = self._route[self.leg].node.id
+        self.detail = f"{distance:.2f} m to node {node}, {self._last - self.leg} further"
+        parking = self.leg == self._last
+        self.progress = RouteProgress.DRIVING
+        if self.fix.blind > s.blind and not (parking and distance < s.near):
+            self.progress = RouteProgress.UNSURE
+            return Command()
+        self._progressed.take(distance, self._description.tick)
+        if self._progressed.stood > (s.parking_patience if parking else s.patience):
+            self.progress = RouteProgress.BLOCKED
+            return Command()
+        return self._drive(target, distance, parking, observation)
+
+    # Driving
+
+    def _drive(self, target: Pose2, distance: float, parking: bool, observation: Observation) -> Command:
+        """Servo if the target's landmarks are in sight, else drive to its position, at the goal blindly."""
+        obstacles = ranger_points(observation.proximity, self._description)
+        localizer = self.fix.localizer
+        if localizer is not None and self._may_servo(target, distance, parking):
+            points = localizer.node.points_in_robot
+            if self._servoing != self.leg:
+                self._headway, self._servoing = ProgressMonitor(), self.leg
+                self._servo.start(target, points)
+            visible = np.zeros(len(points), np.bool_)
+            visible[localizer.visible] = True
+            step = self._servo.command(target, points, visible, obstacles)
+            if parking:
+                self.progress = RouteProgress.PARKING
+                self.detail = f"{step.reason}, {distance * 1000:.0f} mm off"
+                self._confirm(step.state, observation)
+            if step.state != "stuck":
+                self._approaching = False
+                return step.command
+        self._servoing = -1
+        if not parking or distance > self._settings.near:
+            self._approaching = False
+            command = self._detour.toward(target.inverse())
+            if self._detour.around:
+                self.detail += ", around an obstacle"
+            return command
+        if not self._approaching:
+            self._blind_drive.start(target)
+            self._approaching = True
+        step = self._blind_drive.command(target, obstacles)
+        self._hidden = self._hidden + self._description.tick if step.state == "arrived" else 0.0
+        if self._hidden > self._settings.hidden:
+            self.progress = RouteProgress.UNSURE
+        return step.command
+
+    def _look_at_goal(self, observation: Observation) -> NodeLocalizer | None:
+        if observation.image is None:
+            return None
+        found = self._lookout.find(observation.image, [self._expected(self._last)])
+        return None if found is None else found[1]
+
+    def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
+        """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
+        s, tick = self._settings, self._description.tick
+        self._servo_barred = max(self._servo_barred - tick, 0.0)
+        if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
+            return False
+        if self._servoing == self.leg and not (parking and distance <= s.near):
+            self._headway.take(distance, tick)
+            if self._headway.stood > (s.stalled_parking if parking else s.stalled):
+                self._servo_barred = s.barred
+        return self._servo_barred == 0.0
+
+    def _confirm(self, state: State, observation: Observation) -> None:
+        """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
+
+        A view from where the node's was taken shows its features at their own scale, so nothing tells better
+        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there.
+        """
+        if state != "arrived":
+            self._confirmed, self._hidden, self._looks = False, 0.0, []
+        elif self._confirmed:
+            self.progress = RouteProgress.ARRIVED
+        elif (localizer := self._look_at_goal(observation)) is not None:
+            self._looks.append(localizer.pose)
+            if len(self._looks) == self._settings.goal_looks:
+                localizer.restart(averaged(self._looks))
+                self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
+        else:
+            self._hidden += self._description.tick
+            if self._hidden > self._settings.hidden:
+                self.progress = RouteProgress.UNSURE
+
+    # Nodes ahead
+
+    def _pass_nodes(self) -> None:
+        """Go on to the next node where one is passed, or a later one is in sight already."""
+        before = self.leg
+        if self._reference > self.leg:
+            self.leg = self._reference
+        if self._reference == self.leg < self._last and self._off_reference() < 2 * self._settings.passed:
+            self.leg += 1
+        while self.leg < self._last and self.distance(self.leg) < self._settings.passed:
+            self.leg += 1
+        if self.leg != before:
+            self._progressed = ProgressMonitor()
+
+    def _look_for(self, wanted: Sequence[Expected], observation: Observation) -> bool:
+        """Look for landmarks, furthest first; returns whether some were found: then the fix is on them."""
+        if observation.image is None or not wanted:
+            return False
+        found = self._lookout.find(observation.image, wanted)
+        if found is not None:
+            self._reference, localizer = found
+            self.fix = Fix.of(localizer)
+        return found is not None
+
+    def _ahead(self) -> list[Expected]:
+        """Nodes whose landmarks may be in view, furthest first."""
+        s = self._settings
+        first = self._reference + 1 if self.fix.in_sight else 0
+        wanted: list[Expected] = []
+        for index in range(min(self.leg + s.skip, self._last), first - 1, -1):
+            if len(wanted) == MOST_LOOKED_FOR:
+                break
+            expected = self._expected(index)
+            there = expected.node_from_robot
+            if math.hypot(there.x, there.y) < s.sight_reach and abs(wrap_angle(there.heading)) < s.sight_turn:
+                wanted.append(expected)
+        # At the goal more of its landmarks come into view: a fresh look makes the last millimetres better.
+        if self._reference == self._last and self.fix.in_sight and self._tick % (3 * s.look_every) == 0:
+            tracked = len(self.fix.localizer.visible) if self.fix.localizer is not None else 0
+            wanted.append(self._expected(self._last)._replace(tracked=tracked))
+        return wanted
+
+    def _expected(self, index: int) -> Expected:
+        """A leg's node, with where the robot should be from it."""
+        there = self._from_reference(index) @ self.fix.node_from_robot.mean
+        return Expected(index, self._route[index].node, there, 1.0 + self.fix.blind)
+
+    def _target(self) -> Pose2:
+        """`target_from_robot`."""
+        return self._from_reference(self.leg) @ self.fix.node_from_robot.mean
+
+    def _from_reference(self, target: int) -> Pose2:
+        """`target_from_reference` along the route's relative poses."""
+        return self._start_from_leg[target].inverse() @ self._start_from_leg[self._reference]
+
+    def _off_reference(self) -> float:
+        return math.hypot(self.fix.node_from_robot.mean.x, self.fix.node_from_robot.mean.y)
+
+
+def _lies_ahead(target_from_robot: Pose2) -> bool:
+    """Whether a pose can be servoed to without a manoeuvre: ahead, and facing alike."""
+    there = target_from_robot.inverse()
+    return abs(target_from_robot.heading) < 0.5 and there.x > 0.1 and abs(there.y) < 0.6 * there.x

@@ -1,0 +1,238 @@
+"""The floor as the proximity sensors saw it: where the robot may drive, and where it has not looked yet."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.pose import Array, Pose2
+
+
+@dataclass(frozen=True)
+class OccupancyGridSettings:
+    """The grid.
+
+    Attributes:
+        cell: side of a cell, m.
+        side: side of the whole grid, m; its middle is where the map began.
+        clearance: kept between the footprint's edge and anything seen, m.
+        hit: log-odds that a cell gains when a ranger ends in it.
+        miss: log-odds that it loses when a ranger passes through.
+        most: log-odds are kept within plus and minus this, so that a thing that moved away is forgotten.
+    """
+
+    cell: float = 0.1
+    side: float = 48.0
+    clearance: float = 0.10
+    hit: float = 0.9
+    miss: float = 0.35
+    most: float = 3.0
+
+
+RAYS = 48
+"""Directions in which a look around is tried."""
+
+
+class OccupancyGrid:
+    """A grid of log-odds that a cell is occupied; 0 is unknown."""
+
+    def __init__(self, description: RobotDescription, settings: OccupancyGridSettings | None = None) -> None:
+        """Start with everything unknown."""
+        self._settings = settings or OccupancyGridSettings()
+        self._description = description
+        self._half = round(self._settings.side / 2 / self._settings.cell)
+        self._middle = np.zeros(2, np.int64)
+        self._odds: NDArray[np.float32] = np.zeros((2 * self._half, 2 * self._half), np.float32)
+        self._bearings = np.array(description.ranger_bearings)
+        self._steps = np.arange(0.5, description.ranger_reach / self._settings.cell) * self._settings.cell
+
+    def cells(self, points: Array) -> NDArray[np.int64]:
+        """(..., 2) m in map -> (..., 2) cell indices, clipped to the grid."""
+        index = np.floor(points / self._settings.cell).astype(np.int64) + self._half - self._middle
+        return np.asarray(np.clip(index, 0, 2 * self._half - 1), np.int64)
+
+    def centre(self, cell: tuple[int, int]) -> Array:
+        """(2,) m in map, middle of a cell."""
+        return (np.array(cell, dtype=np.float64) - self._half + self._middle + 0.5) * self._settings.cell
+
+    def roll(self, point: Array) -> None:
+        """Let the grid's middle be at a point, (2,) m in map; what falls over its border is forgotten."""
+        middle = np.round(np.asarray(point) / self._settings.cell).astype(np.int64)
+        rows, columns = (int(v) for v in middle - self._middle)
+        self._middle = middle
+        kept = np.zeros_like(self._odds)
+        size = len(kept)
+        if abs(rows) < size and abs(columns) < size:
+            into = slice(max(-rows, 0), size - max(rows, 0)), slice(max(-columns, 0), size - max(columns, 0))
+            from_ = slice(max(rows, 0), size - max(-rows, 0)), slice(max(columns, 0), size - max(-columns, 0))
+            kept[into] = self._odds[from_]
+        self._odds = kept
+
+    def see(self, map_from_robot: Pose2, proximity: Array) -> None:
+        """Enter what the rangers measure: free along the beam, occupied at its end.
+
+        Args:
+            map_from_robot: pose.
+            proximity: (K,) m from the robot's edge.
+        """
+        if len(proximity) != len(self._bearings) or not len(proximity):
+            return
+        s, radius = self._settings, self._description.radius
+        angles = map_from_robot.heading + self._bearings
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        here = np.array([map_from_robot.x, map_from_robot.y])
+        ends = proximity + radius
+        along = self._steps[None, :] < (ends - 0.5 * s.cell)[:, None]
+        points = here + directions[:, None, :] * self._steps[None, :, None]
+        free = np.unique(self.cells(points[along]), axis=0)
+        hits = proximity < self._description.ranger_reach - 0.05
+        ended = np.unique(self.cells(here + directions[hits] * ends[hits, None]), axis=0)
+        self._odds[free[:, 0], free[:, 1]] -= s.miss
+        self._odds[ended[:, 0], ended[:, 1]] += s.hit + s.miss
+        # Where the robot stands there is nothing.
+        own = self.cells(here + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
+        self._odds[own[:, 0], own[:, 1]] = -s.most
+        np.clip(self._odds, -s.most, s.most, out=self._odds)
+
+    def room(self) -> Array:
+        """For each cell the distance to the nearest thing seen, m."""
+        occupied = (self._odds > 0.3).astype(np.uint8)
+        return np.asarray(cv2.distanceTransform(1 - occupied, cv2.DIST_L2, 5) * self._settings.cell)
+
+    def drivable(self, unknown: bool = False) -> NDArray[np.bool_]:
+        """Cells that are known to be free, with clearance for the footprint; or that may be free."""
+        free = self._odds < (0.3 if unknown else -0.3)
+        return np.asarray(free & (self.room() >= self._enough))
+
+    @property
+    def _enough(self) -> float:
+        return self._description.radius + self._settings.clearance
+
+    def unknown_around(self, radius: float, told: Array) -> Array:
+        """For each cell the share of unknown cells around it: how much is to be seen from there.
+
+        Args:
+            radius: half the side of the square that is looked at, m.
+            told: (N, 2) m in map; somebody else knows the floor within the radius of these.
+        """
+        unknown = self._unknown(told, radius)
+        side = 2 * round(radius / self._settings.cell) + 1
+        return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
+
+    def unknown_in_sight(self, points: Array, told: Array, known: float, reach: float) -> Array:
+        """How much unknown floor would be seen from each of some points, looking all around, (N,) m^2.
+
+        What was seen to be occupied hides what is behind it; unknown floor hides nothing.
+
+        Args:
+            points: (N, 2) m in map.
+            told: (M, 2) m in map; somebody else knows the floor around these.
+            known: up to this far, m.
+            reach: how far one can see, m.
+        """
+        cell, unknown, hidden = self._settings.cell, self._unknown(told, known), self._odds > 0.3
+        angles = np.arange(RAYS) * (math.tau / RAYS)
+        along = np.arange(0.5 * cell, reach, cell)
+        ray = along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
+        pieces = along * cell * (math.tau / RAYS)
+        areas = np.zeros(len(points))
+        for k, point in enumerate(points):
+            at = self.cells(point + ray)
+            seen = ~np.logical_or.accumulate(hidden[at[..., 0], at[..., 1]], axis=1)
+            areas[k] = (unknown[at[..., 0], at[..., 1]] * seen * pieces).sum()
+        return areas
+
+    def _unknown(self, told: Array, radius: float) -> NDArray[np.float32]:
+        """1 where a cell is unknown and none of (N, 2) points in map is within the radius (m), else 0."""
+        unknown = (np.abs(self._odds) <= 0.3).astype(np.float32)
+        for row, column in self.cells(told):
+            cv2.circle(unknown, (int(column), int(row)), round(radius / self._settings.cell), 0.0, -1)
+        return unknown
+
+    def ways(self, start: Array, reach: float, drivable: NDArray[np.bool_] | None = None) -> DistanceField:
+        """Shortest ways over drivable cells to everything within reach of a position.
+
+        Args:
+            start: (2,) m in map.
+            reach: longest way, m.
+            drivable: where one may drive; by default where the floor is known to be free.
+        """
+        drivable = self.drivable() if drivable is None else drivable
+        first = tuple(int(v) for v in self.cells(start))
+        cost: dict[tuple[int, int], float] = {(first[0], first[1]): 0.0}
+        before: dict[tuple[int, int], tuple[int, int]] = {}
+        queue: list[tuple[float, tuple[int, int]]] = [(0.0, (first[0], first[1]))]
+        room = self.room()
+        while queue:
+            so_far, cell = heapq.heappop(queue)
+            if so_far > cost[cell] or so_far > reach:
+                continue
+            for dx, dy in _NEIGHBOURS:
+                there = (cell[0] + dx, cell[1] + dy)
+                if not (0 <= there[0] < drivable.shape[0] and 0 <= there[1] < drivable.shape[1]):
+                    continue
+                # Close to something already, the robot may still leave it, but come no closer.
+                if not drivable[there] and (drivable[cell] or room[there] < max(room[cell], 0.05)):
+                    continue
+                further = so_far + self._settings.cell * math.hypot(dx, dy)
+                if further < cost.get(there, math.inf):
+                    cost[there] = further
+                    before[there] = cell
+                    heapq.heappush(queue, (further, there))
+        return DistanceField(self, drivable, cost, before)
+
+
+_NEIGHBOURS = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy]
+
+
+class DistanceField:
+    """Shortest ways from one place."""
+
+    def __init__(
+        self,
+        floor: OccupancyGrid,
+        drivable: NDArray[np.bool_],
+        cost: dict[tuple[int, int], float],
+        before: dict[tuple[int, int], tuple[int, int]],
+    ) -> None:
+        """Take the result of a search."""
+        self._floor = floor
+        self._drivable = drivable
+        self._before = before
+        self.cells = np.array([c for c in cost if drivable[c]], np.int64).reshape(-1, 2)
+        self.lengths = np.array([cost[(int(a), int(b))] for a, b in self.cells])
+
+    @property
+    def positions(self) -> Array:
+        """(N, 2) m in map of the cells that can be reached."""
+        return np.array([self._floor.centre((int(a), int(b))) for a, b in self.cells]).reshape(-1, 2)
+
+    def path(self, cell: NDArray[np.int64]) -> list[Array]:
+        """Corners of the way to a cell, without the start: straight pieces over drivable cells."""
+        at = (int(cell[0]), int(cell[1]))
+        chain = [at]
+        while at in self._before:
+            at = self._before[at]
+            chain.append(at)
+        chain.reverse()
+        corners: list[Array] = []
+        here = 0
+        while here < len(chain) - 1:
+            there = len(chain) - 1
+            while there > here + 1 and not self._straight(chain[here], chain[there]):
+                there -= 1
+            corners.append(self._floor.centre(chain[there]))
+            here = there
+        return corners
+
+    def _straight(self, a: tuple[int, int], b: tuple[int, int]) -> bool:
+        count = 2 * max(abs(a[0] - b[0]), abs(a[1] - b[1])) + 1
+        rows = np.round(np.linspace(a[0], b[0], count)).astype(int)
+        columns = np.round(np.linspace(a[1], b[1], count)).astype(int)
+        return bool(self._drivable[rows[1:], columns[1:]].all())

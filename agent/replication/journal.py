@@ -1,0 +1,311 @@
+"""The agent's own disk: every change of its maps, written before anybody else hears of it."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mapweave.hybridmap.change import Change, ChangeBody, EdgeRetired, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId, check_name
+from mapweave.storage.database import Database
+from mapweave.wire.codec import decode_body, element_of, encode_body, wrap_body
+from mapweave.wire.keys import check_epoch
+
+APPLICATION_ID = 0x4D574A4C
+"""'MWJL' in the file's header."""
+
+VERSION = 1
+SCHEMA = """
+CREATE TABLE owner (agent TEXT NOT NULL);
+CREATE TABLE map (epoch INTEGER PRIMARY KEY, log_id INTEGER NOT NULL);
+CREATE TABLE change (
+    epoch INTEGER NOT NULL, sequence INTEGER NOT NULL, element INTEGER NOT NULL, put INTEGER NOT NULL,
+    stamp_ns INTEGER NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (epoch, sequence)
+) WITHOUT ROWID;
+CREATE INDEX change_element ON change (epoch, element, sequence);
+CREATE TABLE ack (
+    epoch INTEGER NOT NULL, server TEXT NOT NULL, watermark INTEGER NOT NULL, PRIMARY KEY (epoch, server)
+) WITHOUT ROWID
+"""
+
+READ_AT_ONCE = 256
+
+
+class Entry(NamedTuple):
+    """One change of a log: which node or edge it puts, or retires, and its body; None if that is damaged."""
+
+    sequence: int
+    element: NodeId
+    put: bool
+    body: ChangeBody | None
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A change that is encoded but has no number yet.
+
+    Attributes:
+        map: whose log it belongs to.
+        element: number of the node or edge that it is about.
+        put: whether it puts, or retires.
+        stamp_ns: when the agent made it.
+        encoded: the body.
+    """
+
+    map: MapId
+    element: int
+    put: bool
+    stamp_ns: int
+    encoded: bytes
+
+    @staticmethod
+    def of(body: ChangeBody, stamp_ns: int) -> Draft:
+        """Encode a body; raises InvalidValue if it cannot be encoded."""
+        element = element_of(body)
+        put = not isinstance(body, NodeRetired | EdgeRetired)
+        encoded = encode_body(body)
+        wrap_body(1, stamp_ns, encoded)
+        return Draft(element.map, element.number, put, stamp_ns, encoded)
+
+
+class Journal:
+    """The change logs of one agent in one SQLite file. Its methods may be called from any thread.
+
+    What is committed here outlasts a loss of power. The journal is also the robot's map after a restart, so
+    nothing that the map still needs is ever dropped.
+    """
+
+    def __init__(self, path: Path, agent: str | None = None) -> None:
+        """Open the journal, or begin one.
+
+        Args:
+            path: of the file.
+            agent: whose; None takes whose it is, and begins none.
+
+        Raises:
+            InvalidFile: damaged, of another kind, another agent's, nobody's, or in use.
+        """
+        if agent is not None:
+            check_name(agent)
+        self._lock = threading.RLock()
+        self._database = Database(path, "agent journal", APPLICATION_ID, VERSION, SCHEMA)
+        try:
+            with self._database.transaction() as rows:
+                owner = rows.execute("SELECT agent FROM owner").fetchone()
+                if owner is None and agent is not None:
+                    rows.execute("INSERT INTO owner VALUES (?)", (agent,))
+                elif owner is None:
+                    raise InvalidFile(f"{path}: is nobody's journal")
+                elif agent not in (None, owner[0]):
+                    raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
+            self.agent = str(owner[0]) if agent is None else agent
+        except BaseException:
+            self._database.close()
+            raise
+
+    def open_map(self, epoch: int | None) -> MapId:
+        """Begin a map or go on with one.
+
+        Args:
+            epoch: of the map; one that is there is resumed. None begins a fresh one with the next number.
+
+        Raises:
+            InvalidValue: the epoch is out of range.
+            InvalidFile: the disk does not take it.
+        """
+        if epoch is not None:
+            check_epoch(epoch)
+        with self._lock, self._database.transaction() as rows:
+            if epoch is None:
+                epoch = int(rows.execute("SELECT coalesce(max(epoch), 0) + 1 FROM map").fetchone()[0])
+            # A number that an agent with a lost disk will not draw again; SQLite's integers have a sign.
+            rows.execute("INSERT OR IGNORE INTO map VALUES (?, ?)", (epoch, secrets.randbits(63)))
+        return MapId(self.agent, epoch)
+
+    def maps(self) -> list[MapId]:
+        """All maps, oldest first."""
+        return [MapId(self.agent, epoch) for (epoch,) in self._read("SELECT epoch FROM map ORDER BY epoch")]
+
+    def log_id(self, map_id: MapId) -> int:
+        """What distinguishes this log from any other with the same name, see mapweave.wire.log_messages.Mark.
+
+        Raises:
+            InvalidValue: no such map was opened.
+        """
+        found = self._read("SELECT log_id FROM map WHERE epoch = ?", self._epoch(map_id))
+        if not found:
+            raise InvalidValue(f"map {map_id} was never opened in this journal")
+        return int(found[0][0])
+
+    def head(self, map_id: MapId) -> int:
+        """Sequence number of the newest change, 0 if there is none."""
+        query = "SELECT coalesce(max(sequence), 0) FROM change WHERE epoch = ?"
+        return int(self._read(query, self._epoch(map_id))[0][0])
+
+    def append(self, map_id: MapId, bodies: Iterable[ChangeBody], stamp_ns: int) -> list[Change]:
+        """Write changes in one transaction; they are on the disk when this returns.
+
+        Raises:
+            InvalidValue: a body cannot be encoded or belongs to another map; nothing was written.
+            InvalidFile: the disk does not take it; nothing was written.
+        """
+        bodies = list(bodies)
+        first = self.write(map_id, [Draft.of(body, stamp_ns) for body in bodies])
+        return [Change(map_id, first + k, stamp_ns, body) for k, body in enumerate(bodies)]
+
+    def write(self, map_id: MapId, drafts: Sequence[Draft]) -> int:
+        """Write encoded changes in one transaction.
+
+        Returns:
+            The first one's sequence number; the others follow without gaps.
+
+        Raises:
+            InvalidValue: one belongs to another map, or the map was never opened; nothing was written.
+            InvalidFile: the disk does not take it; nothing was written.
+        """
+        self.log_id(map_id)
+        for draft in drafts:
+            if draft.map != map_id:
+                raise InvalidValue(f"a change of {draft.map} does not belong into the log of {map_id}")
+        with self._lock, self._database.transaction() as rows:
+            first = self.head(map_id) + 1
+            rows.executemany(
+                "INSERT INTO change VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (
+                    (map_id.epoch, first + k, d.element, d.put, d.stamp_ns, d.encoded, zlib.crc32(d.encoded))
+                    for k, d in enumerate(drafts)
+                ),
+            )
+        return first
+
+    def rows(self, map_id: MapId, first: int, last: int) -> list[tuple[int, bytes]]:
+        """Changes first to last, both included, as (sequence, encoded change).
+
+        An empty one stands for a change that the disk has damaged: servers refuse it and go on behind it.
+        """
+        return [
+            (sequence, b"" if body is None else wrap_body(sequence, stamp_ns, body))
+            for sequence, stamp_ns, body in self._bodies(map_id, first, last)
+        ]
+
+    def changes(self, map_id: MapId, first: int, last: int) -> list[Change]:
+        """Changes first to last, both included.
+
+        Raises:
+            InvalidFile: a change is damaged.
+        """
+        return [
+            Change(map_id, sequence, stamp_ns, self._decode(sequence, body))
+            for sequence, stamp_ns, body in self._bodies(map_id, first, last)
+        ]
+
+    def replay(self, map_id: MapId) -> Iterator[ChangeBody]:
+        """The map's content, change by change.
+
+        Raises:
+            InvalidFile: a change is damaged.
+        """
+        head = self.head(map_id)
+        for begin in range(1, head + 1, READ_AT_ONCE):
+            for change in self.changes(map_id, begin, min(begin + READ_AT_ONCE - 1, head)):
+                yield change.body
+
+    def entries(self, map_id: MapId) -> Iterator[Entry]:
+        """Every change that is still there, in order; damaged ones without a body."""
+        query = "SELECT sequence, element, put, body, crc FROM change WHERE epoch = ? ORDER BY sequence"
+        for sequence, number, put, body, crc in self._read(query, self._epoch(map_id)):
+            try:
+                decoded = self._decode(sequence, body if zlib.crc32(body) == crc else None)
+            except InvalidFile:
+                decoded = None
+            yield Entry(sequence, NodeId(*map_id, number), bool(put), decoded)
+
+    def acknowledge(self, server: str, map_id: MapId, watermark: int, anew: bool = False) -> None:
+        """Remember that a server has every change up to the watermark; it never goes back.
+
+        Args:
+            server: which.
+            map_id: which map.
+            watermark: up to which change.
+            anew: the server has lost its store, so it may go back.
+
+        Raises:
+            InvalidValue: the log is not that long.
+            InvalidFile: the disk does not take it.
+        """
+        with self._lock:
+            head = self.head(map_id)
+            if not 0 <= watermark <= head:
+                raise InvalidValue(f"{server} acknowledges {watermark} changes of {map_id}, there are {head}")
+            with self._database.transaction() as rows:
+                rows.execute(
+                    "INSERT INTO ack VALUES (?, ?, ?) ON CONFLICT (epoch, server) "
+                    "DO UPDATE SET watermark = max(watermark * ?, excluded.watermark)",
+                    (map_id.epoch, check_name(server), watermark, not anew),
+                )
+
+    def acknowledged(self, map_id: MapId) -> dict[str, int]:
+        """Up to which change which server has the log."""
+        query = "SELECT server, watermark FROM ack WHERE epoch = ? ORDER BY server"
+        return dict(self._read(query, self._epoch(map_id)))
+
+    def prune(self, map_id: MapId, servers: Iterable[str]) -> int:
+        """Drop changes that every one of the servers has and that a later change of the same log undoes.
+
+        The replay gives the same map before and after (its nodes perhaps in another order). Retirements stay:
+        they also take away edges.
+
+        Returns:
+            How many were dropped.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        with self._lock:
+            known = self.acknowledged(map_id)
+            limit = min((known.get(server, 0) for server in servers), default=0)
+            with self._database.transaction() as rows:
+                dropped = rows.execute(
+                    "DELETE FROM change WHERE epoch = :epoch AND sequence <= :limit AND put AND EXISTS ("
+                    "SELECT 1 FROM change AS later WHERE later.epoch = :epoch AND later.element = "
+                    "change.element AND later.sequence > change.sequence AND later.sequence <= :limit)",
+                    {"epoch": map_id.epoch, "limit": limit},
+                )
+                return dropped.rowcount
+
+    def close(self) -> None:
+        """Let go of the file."""
+        with self._lock:
+            self._database.close()
+
+    def _epoch(self, map_id: MapId) -> tuple[int]:
+        if map_id.agent != self.agent:
+            raise InvalidValue(f"the journal of {self.agent} has no map {map_id}")
+        return (map_id.epoch,)
+
+    def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
+        with self._lock, self._database.guard():
+            return self._database.connection.execute(query, values).fetchall()
+
+    def _bodies(self, map_id: MapId, first: int, last: int) -> Iterator[tuple[int, int, bytes | None]]:
+        """Sequence, stamp and encoded body of each change; None for a body that is not what was written."""
+        query = (
+            "SELECT sequence, stamp_ns, body, crc FROM change "
+            "WHERE epoch = ? AND sequence BETWEEN ? AND ? ORDER BY sequence"
+        )
+        for sequence, stamp_ns, body, crc in self._read(query, (*self._epoch(map_id), first, last)):
+            yield sequence, stamp_ns, body if zlib.crc32(body) == crc else None
+
+    def _decode(self, sequence: int, body: bytes | None) -> ChangeBody:
+        if body is None:
+            raise InvalidFile(f"{self._database.path}: change {sequence} is damaged")
+        try:
+            return decode_body(body)
+        except InvalidMessage as error:
+            raise InvalidFile(f"{self._database.path}: change {sequence}: {error}") from None

@@ -1,0 +1,79 @@
+"""What is known of one of the agent's own logs: how long it is, and who has how much of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from mapweave.agent.replication.journal import Journal
+from mapweave.hybridmap.node import MapId
+from mapweave.wire.log_messages import Ack, Head
+
+
+@dataclass
+class LogState:
+    """One log.
+
+    Attributes:
+        map: whose.
+        log_id: which, see mapweave.wire.log_messages.Mark.
+        newest: sequence number of the newest committed change.
+        acknowledged: what is on which server's disk.
+        refusals: what servers have refused for good: (server, sequence) to reason.
+        failure: why servers do not take this log at all; empty if they do.
+        stores: by which id each server's store was known last, see mapweave.wire.log_messages.Ack.
+    """
+
+    map: MapId
+    log_id: int
+    newest: int
+    acknowledged: dict[str, int]
+    refusals: dict[tuple[str, int], str] = field(default_factory=dict)
+    failure: str = ""
+    stores: dict[str, int] = field(default_factory=dict)
+
+    @staticmethod
+    def of(journal: Journal, map_id: MapId) -> LogState:
+        """As the journal has it; raises InvalidValue if the map was never opened."""
+        return LogState(map_id, journal.log_id(map_id), journal.head(map_id), journal.acknowledged(map_id))
+
+    def settled(self, servers: Sequence[str]) -> int:
+        """Up to which change all of these servers have the log; without any, the server that has most."""
+        if servers:
+            return min(self.acknowledged.get(server, 0) for server in servers)
+        return max(self.acknowledged.values(), default=0)
+
+    def unsettled(self, servers: Sequence[str]) -> int:
+        """How many changes they still lack."""
+        return max(0, self.newest - self.settled(servers))
+
+    def head(self) -> Head:
+        """The beacon."""
+        return Head(self.log_id, self.newest, dict(self.acknowledged))
+
+    def lost(self, server: str, ack: Ack) -> bool:
+        """Whether a server has less than it once acknowledged: it has another store now."""
+        if not ack.store or self.stores.get(server) == ack.store:
+            return False
+        self.stores[server] = ack.store
+        return ack.watermark < self.acknowledged.get(server, 0)
+
+    def take(self, server: str, ack: Ack) -> list[str]:
+        """Note what an acknowledgement says besides its watermark.
+
+        Returns:
+            What is new and worth a line in the log.
+        """
+        news = []
+        for refusal in ack.refusals:
+            if (server, refusal.sequence) not in self.refusals:
+                self.refusals[server, refusal.sequence] = refusal.reason
+                news.append(f"{server} refuses {self.map} {refusal.sequence}: {refusal.reason}")
+            if refusal.sequence == 0:
+                self.failure = f"{server}: {refusal.reason}"
+        if ack.watermark > self.newest and not self.failure:
+            # This disk was put back to an older state. New changes would take numbers that the server has
+            # seen, and it would drop them as doubles.
+            self.failure = f"{server} has more of {self.map} than this disk: begin a fresh map"
+            news.append(self.failure)
+        return news

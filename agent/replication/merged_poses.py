@@ -1,0 +1,94 @@
+"""Where an agent's nodes lie in the merged map, as its server tells it.
+
+It is kept beside the map and changes nothing in it. What is told may be lost on the way; each news says which
+one must be known before it, and where one is missing all are asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.wire.bus import Bus, Sample
+from mapweave.wire.keys import Keys
+from mapweave.wire.pose_messages import MergedPose, PoseNews
+
+log = logging.getLogger(__name__)
+
+
+class MergedPoses:
+    """Listens to one server. A thread of its own asks when something is missing."""
+
+    def __init__(self, bus: Bus, keys: Keys, agent: str, server: str, timeout: float = 3.0) -> None:
+        """Begin to listen.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            agent: whose nodes.
+            server: that is believed.
+            timeout: how long a question may take, s.
+        """
+        self._bus, self._agent, self._timeout = bus, agent, timeout
+        self._key = keys.poses(server, agent)
+        self._places: dict[NodeId, MergedPose] = {}
+        self._run: int | None = None
+        self._sequence = 0
+        self._work: queue.SimpleQueue[Sample | bool | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._listen, name=f"poses-{agent}", daemon=True)
+        self._thread.start()
+        self._closing = [
+            bus.subscribe(self._key, self._work.put),
+            bus.watch(keys.server_alive(server), lambda _, alive: self._work.put(alive)),
+        ]
+
+    def of(self, node: NodeId) -> MergedPose | None:
+        """Where a node lies, as far as was told; None if it is not known."""
+        return self._places.get(node)
+
+    def count(self, map_id: MapId) -> int:
+        """How many nodes of a map are known to lie somewhere."""
+        return sum(node.map == map_id for node in tuple(self._places))
+
+    def close(self) -> None:
+        """Stop listening."""
+        for closing in self._closing:
+            closing.close()
+        self._work.put(None)
+        self._thread.join(self._timeout + 1.0)
+
+    def _listen(self) -> None:
+        while (item := self._work.get()) is not None:
+            if isinstance(item, bool):
+                if item:
+                    self._ask()
+                continue
+            try:
+                self._take(PoseNews.decode(item.payload, self._agent))
+            except InvalidMessage as error:
+                log.warning("%s", error)
+                self._ask()
+
+    def _take(self, news: PoseNews) -> None:
+        if news.run != self._run or news.after > self._sequence:
+            self._ask()
+        elif news.after == self._sequence < news.sequence:
+            gone = frozenset(news.gone)
+            left = {node: place for node, place in self._places.items() if node not in gone}
+            self._places, self._sequence = left | dict(news.placed), news.sequence
+
+    def _ask(self) -> None:
+        """Ask for all of it. Without an answer it stays as it is: the next news will show the gap again."""
+        for reply in self._bus.ask(self._key, b"", self._timeout):
+            if reply.error:
+                log.info("no merged poses: %s", reply.error)
+                continue
+            try:
+                whole = PoseNews.decode(reply.payload, self._agent)
+            except InvalidMessage as error:
+                log.warning("%s", error)
+                continue
+            self._places, self._run, self._sequence = dict(whole.placed), whole.run, whole.sequence

@@ -1,0 +1,71 @@
+"""Questions to the map server and their answers as messages."""
+
+from __future__ import annotations
+
+import math
+
+from mapweave.agent.mission import Question, WhatIsKnown, WhereAmI
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import KnownAnswer, RelocalizeAnswer, RouteAnswer
+from mapweave.wire.keys import Keys
+from mapweave.wire.messages import (
+    KnownRequest,
+    RouteRequest,
+    decode_known_answer,
+    decode_relocalize_answer,
+    decode_route_answer,
+    encode_known_request,
+    encode_route_request,
+    encode_view,
+)
+
+FARTHEST = 100.0
+"""m; no robot sees a node, or drives from one node to the next, from further away. Nodes of recordings from
+cars lie up to ten metres apart."""
+
+
+def encode_query(keys: Keys, question: Question) -> tuple[str, bytes]:
+    """Whom to ask, and how.
+
+    Args:
+        keys: of the fleet.
+        question: any.
+
+    Raises:
+        InvalidValue: no message can hold it.
+    """
+    if isinstance(question, WhereAmI):
+        return keys.any_relocalize(), encode_view(question.view)
+    if isinstance(question, WhatIsKnown):
+        around = KnownRequest(question.map, question.x, question.y, question.reach)
+        return keys.any_known(), encode_known_request(around)
+    request = RouteRequest(question.start, question.goal, question.blocked, question.start_from_robot)
+    return keys.any_route(), encode_route_request(request)
+
+
+def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | RouteAnswer | KnownAnswer:
+    """What a server says to a question.
+
+    Raises:
+        InvalidMessage: it is no answer to it, or one that no robot can act on.
+    """
+    if isinstance(question, WhereAmI):
+        found = decode_relocalize_answer(payload)
+        for best in found.candidates[:1]:
+            _check_near(best.node_from_robot.mean, f"whereabouts: the robot, seen from node {best.node},")
+        return found
+    if isinstance(question, WhatIsKnown):
+        return decode_known_answer(payload)
+    route = decode_route_answer(payload)
+    for leg in route.legs:
+        _check_near(leg.previous_from_node.mean, f"route: the leg to node {leg.node.id}")
+    if route.legs and route.legs[-1].node.id != question.goal:
+        raise InvalidMessage(f"route: it ends at node {route.legs[-1].node.id}, not at {question.goal}")
+    return route
+
+
+def _check_near(pose: Pose2, what: str) -> None:
+    distance = math.hypot(pose.x, pose.y)
+    if distance > FARTHEST:
+        raise InvalidMessage(f"{what} is {distance:.0f} m away, more than {FARTHEST:g} m")

@@ -1,0 +1,313 @@
+"""Carries an agent's changes to its disk and from there to the servers, beside the robot's loop.
+
+The loop only hands changes over. One thread does the rest, in this order: commit to the journal, publish
+best-effort, and let servers pull whatever got lost. What makes that lossless is not the publishing but the
+beacon, which tells servers how long the log is, and the log itself, which answers for any range. That goes
+for every map in the journal: one that was left for a fresh map before a server had it is still handed over.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from mapweave.agent.replication.journal import Draft, Journal
+from mapweave.agent.replication.log_state import LogState
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
+from mapweave.hybridmap.node import MapId, check_name
+from mapweave.wire.bus import Bus, Request, Sample
+from mapweave.wire.codec import wrap_body
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import MAX_ROWS, Ack, LogAnswer, LogRequest, Mark
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplicationSettings:
+    """How changes are carried.
+
+    Attributes:
+        beacon_interval: between two beacons of a map of which servers lack something, s.
+        settled_beacons: of so many beacons, an older map that is complete sends one; a server that is new
+            learns of it so.
+        answer_bytes: a log answer ends after so many bytes, since a link may be slow.
+        retry_interval: after a failed commit (disk full), s.
+    """
+
+    beacon_interval: float = 0.5
+    settled_beacons: int = 20
+    answer_bytes: int = 1 << 20
+    retry_interval: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReplicationStatus:
+    """For the status line.
+
+    Attributes:
+        newest: sequence number of the newest committed change of the map that is being made.
+        waiting: changes that are not yet on the own disk.
+        unacknowledged: committed changes, of all maps, that are not on every required server's disk.
+        bytes_sent: of changes, published or pulled.
+        since_ack: seconds since a server last acknowledged something; infinite if none has.
+        refused: changes that a server has refused for good.
+        failure: why nothing is committed or taken at present; empty if all is well.
+    """
+
+    newest: int
+    waiting: int
+    unacknowledged: int
+    bytes_sent: int
+    since_ack: float
+    refused: int
+    failure: str
+
+
+class Replicator:
+    """Replicates the logs of one agent; changes are added to one of them."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        journal: Journal,
+        map_id: MapId,
+        servers: Sequence[str] = (),
+        settings: ReplicationSettings | None = None,
+    ) -> None:
+        """Start. The bus and the journal stay the caller's, and are closed after the replicator.
+
+        Args:
+            bus: the connection; may be down.
+            keys: of the fleet.
+            journal: where changes are committed.
+            map_id: the map that is being made; it must be open.
+            servers: which must have a change before it counts as acknowledged. Without any, one server that
+                has acknowledged will do.
+            settings: how.
+
+        Raises:
+            InvalidValue: the map was never opened, or a server's name is none.
+        """
+        self._bus = bus
+        self._keys = keys
+        self._journal = journal
+        self._map = map_id
+        self._servers = tuple(check_name(server) for server in servers)
+        self._settings = settings or ReplicationSettings()
+        self._changed = threading.Condition()
+        self._current = LogState.of(journal, map_id)
+        self._logs = {one: LogState.of(journal, one) for one in journal.maps()} | {map_id: self._current}
+        self._submitted = 0
+        self._committed = 0
+        self._bytes_sent = 0
+        self._last_ack: float | None = None
+        self._disk_failure = ""
+        # Only the thread touches these.
+        self._pending: list[Draft] = []
+        self._retry_at = 0.0
+        self._beacons = 0
+        for one in self._logs:
+            journal.prune(one, self._servers)
+        self._work: queue.SimpleQueue[list[Draft] | Sample | Request | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
+        self._thread.start()
+        self._declared = [
+            bus.subscribe(keys.acks(map_id.agent), self._work.put),
+            bus.serve(keys.logs(map_id.agent), self._work.put),
+        ]
+
+    @property
+    def map_id(self) -> MapId:
+        """The map whose changes are taken."""
+        return self._map
+
+    def submit(self, bodies: Iterable[ChangeBody], stamp_ns: int) -> None:
+        """Hand over changes. Encodes them, and waits for neither disk nor network.
+
+        Raises:
+            InvalidValue: a change cannot be encoded or belongs to another map; none of them was taken.
+        """
+        drafts = [Draft.of(body, stamp_ns) for body in bodies]
+        for draft in drafts:
+            if draft.map != self._map:
+                raise InvalidValue(f"a change of {draft.map} does not belong into the log of {self._map}")
+        with self._changed:
+            self._submitted += len(drafts)
+            self._work.put(drafts)
+
+    def flush(self, timeout: float) -> bool:
+        """Wait until all that was submitted is on the own disk; False if the time is over first."""
+        with self._changed:
+            goal = self._submitted
+            return self._changed.wait_for(lambda: self._committed >= goal, timeout)
+
+    def wait_acknowledged(self, timeout: float) -> bool:
+        """Wait until every map is on every required server's disk; False if the time is over first."""
+        with self._changed:
+            goal = self._submitted
+            return self._changed.wait_for(
+                lambda: self._committed >= goal and self._unacknowledged() == 0, timeout
+            )
+
+    def status(self) -> ReplicationStatus:
+        """Where things stand."""
+        with self._changed:
+            since = float("inf") if self._last_ack is None else time.monotonic() - self._last_ack
+            return ReplicationStatus(
+                newest=self._current.newest,
+                waiting=self._submitted - self._committed,
+                unacknowledged=self._unacknowledged(),
+                bytes_sent=self._bytes_sent,
+                since_ack=since,
+                refused=sum(len(one.refusals) for one in self._logs.values()),
+                failure=self._disk_failure or self._current.failure,
+            )
+
+    def unacknowledged(self) -> int:
+        """Changes that were submitted and are not yet on every required server's disk."""
+        with self._changed:
+            return self._unacknowledged() + self._submitted - self._committed
+
+    def refusals(self) -> dict[tuple[str, int], str]:
+        """What servers have refused for good of the map that is being made: (server, sequence) to reason."""
+        with self._changed:
+            return dict(self._current.refusals)
+
+    def close(self) -> None:
+        """Commit what was submitted and stop. Twice is no error."""
+        for declared in self._declared:
+            declared.close()
+        self._work.put(None)
+        self._thread.join()
+
+    def _unacknowledged(self) -> int:
+        return sum(one.unsettled(self._servers) for one in self._logs.values())
+
+    def _run(self) -> None:
+        next_beacon = time.monotonic()
+        stop = False
+        while not stop:
+            questions: list[Request] = []
+            try:
+                item = self._work.get(timeout=max(0.0, self._next_turn(next_beacon) - time.monotonic()))
+                while True:
+                    if item is None:
+                        stop = True
+                    elif isinstance(item, list):
+                        self._pending += item
+                    elif isinstance(item, Sample):
+                        self._take_ack(item)
+                    else:
+                        questions.append(item)
+                    item = self._work.get_nowait()
+            except queue.Empty:
+                pass
+            now = time.monotonic()
+            if self._pending and (stop or now >= self._retry_at):
+                self._commit()
+            for question in questions:
+                self._answer(question)
+            if now >= next_beacon:
+                self._send_beacons()
+                next_beacon = now + self._settings.beacon_interval
+        if self._pending:
+            log.error("%s: %d changes never reached the disk", self._map, len(self._pending))
+
+    def _next_turn(self, next_beacon: float) -> float:
+        return min(next_beacon, self._retry_at) if self._pending else next_beacon
+
+    def _commit(self) -> None:
+        """Disk first, then the network: whoever hears of a change may rely on it."""
+        drafts, self._pending = self._pending, []
+        try:
+            first = self._journal.write(self._map, drafts)
+        except InvalidFile as error:
+            # A full disk can be emptied: keep the changes and try again, and say so once.
+            self._pending = drafts
+            self._retry_at = time.monotonic() + self._settings.retry_interval
+            with self._changed:
+                if not self._disk_failure:
+                    log.error("%s; %d changes wait in memory", error, len(drafts))
+                self._disk_failure = str(error)
+            return
+        encoded = [(first + k, wrap_body(first + k, d.stamp_ns, d.encoded)) for k, d in enumerate(drafts)]
+        with self._changed:
+            self._current.newest = first + len(drafts) - 1
+            self._committed += len(drafts)
+            self._bytes_sent += sum(len(change) for _, change in encoded)
+            self._disk_failure = ""
+            self._changed.notify_all()
+        for sequence, change in encoded:
+            self._bus.publish(self._keys.change(self._map), change, self._mark(sequence))
+
+    def _mark(self, sequence: int) -> bytes:
+        return Mark(sequence, self._current.log_id).encode()
+
+    def _send_beacons(self) -> None:
+        everyone = self._beacons % self._settings.settled_beacons == 0
+        self._beacons += 1
+        for one in self._logs.values():
+            if everyone or one is self._current or one.unsettled(self._servers):
+                self._bus.publish(self._keys.head(one.map), one.head().encode())
+
+    def _take_ack(self, sample: Sample) -> None:
+        try:
+            server, _ = self._keys.parse_ack(sample.key)
+            ack = Ack.decode(sample.payload)
+        except InvalidMessage as error:
+            log.warning("%s", error)
+            return
+        one = self._logs.get(ack.map)
+        if one is None or ack.log_id != one.log_id:
+            return
+        with self._changed:
+            news = one.take(server, ack)
+            lost = one.lost(server, ack)
+        for line in news:
+            log.warning("%s", line)
+        if lost:
+            log.warning(
+                "%s has lost what it had of %s after %d: it gets it again", server, one.map, ack.watermark
+            )
+        elif not one.acknowledged.get(server, 0) < ack.watermark <= one.newest:
+            return
+        try:
+            self._journal.acknowledge(server, one.map, ack.watermark, anew=lost)
+        except MapweaveError as error:
+            # The server says it again, because the next beacon shows that it was not noted.
+            log.warning("%s", error)
+            return
+        with self._changed:
+            one.acknowledged[server] = ack.watermark
+            self._last_ack = time.monotonic()
+            self._changed.notify_all()
+
+    def _answer(self, question: Request) -> None:
+        try:
+            asked = LogRequest.decode(question.payload)
+            one = self._logs.get(self._keys.parse_log(question.key))
+            if one is None:
+                raise InvalidMessage(f"{question.key}: no such log")
+            last = min(asked.last, asked.first + MAX_ROWS - 1, one.newest)
+            rows = self._journal.rows(one.map, asked.first, last)
+        except MapweaveError as error:
+            question.refuse(str(error))
+            return
+        total = 0
+        for count, (_, change) in enumerate(rows):
+            total += len(change)
+            if total > self._settings.answer_bytes and count > 0:
+                # The last one that fits is how far the answer reaches.
+                rows, last = rows[:count], rows[count - 1][0]
+                break
+        answer = LogAnswer(one.log_id, asked.first, max(last, asked.first - 1), tuple(rows))
+        with self._changed:
+            self._bytes_sent += sum(len(change) for _, change in rows)
+        question.reply(answer.encode())

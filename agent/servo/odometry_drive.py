@@ -1,0 +1,126 @@
+"""Driving without a view: turn to the goal's position, drive straight, turn to its heading."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.servo.laws import saturate
+from mapweave.agent.servo.leg_controller import clip
+from mapweave.agent.servo.servo_step import ServoStep, State
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryDriveSettings:
+    """Settings of the blind drive.
+
+    Attributes:
+        position_tolerance: m, nearer than this the robot only turns.
+        heading_tolerance: rad, of the last turn.
+        forward_gain: 1/s.
+        turn_gain: 1/s.
+        clearance: m, room between the footprint and obstacle points that stops the drive.
+        backward: whether it may drive backward when that needs less turning.
+        cruise: share of the speed limits that is used.
+        patience_ticks: how long an obstacle in the way is waited for before the drive is stuck.
+    """
+
+    position_tolerance: float = 0.02
+    heading_tolerance: float = 0.02
+    forward_gain: float = 1.5
+    turn_gain: float = 2.5
+    clearance: float = 0.04
+    backward: bool = True
+    cruise: float = 0.8
+    patience_ticks: int = 20
+
+
+class OdometryDrive:
+    """Turn, drive, turn. For edges whose far end is not in view, such as turns on the spot.
+
+    The pose it is given comes from odometry or a filter; it is corrected whenever that is.
+    """
+
+    def __init__(self, description: RobotDescription, settings: OdometryDriveSettings | None = None) -> None:
+        """Prepare for a robot; `start` must come before each drive."""
+        self.settings = settings or OdometryDriveSettings()
+        self._description = description
+        self._max_forward = max(description.max_forward, 1e-3) * self.settings.cruise
+        self._max_turn = max(description.max_turn, 1e-3) * self.settings.cruise
+        self.start(Pose2())
+
+    def start(self, goal_from_robot: Pose2) -> None:
+        """Begin a drive: forward or backward is decided once, by which needs less turning in all."""
+        self._blocked = 0
+        self._at_goal = False
+        toward = math.atan2(-goal_from_robot.y, -goal_from_robot.x)
+        self._direction = 1.0
+        if self.settings.backward:
+            ahead = _turning(goal_from_robot.heading, toward)
+            astern = _turning(goal_from_robot.heading, toward + math.pi)
+            self._direction = -1.0 if astern < ahead - 1e-6 else 1.0
+        self._aligned = False
+
+    def command(self, goal_from_robot: Pose2, obstacles: NDArray[Any]) -> ServoStep:
+        """One tick.
+
+        Args:
+            goal_from_robot: where the robot is now, in the goal's robot frame.
+            obstacles: (K, 2) m, in robot, points that the rangers hit now.
+        """
+        settings, pose = self.settings, goal_from_robot
+        rho = math.hypot(pose.x, pose.y)
+        heading = wrap_angle(pose.heading)
+        reach = settings.position_tolerance * (2.0 if self._at_goal else 1.0)
+        self._at_goal = rho <= reach
+        if self._at_goal:
+            if abs(heading) <= settings.heading_tolerance:
+                return _step(Command(), "arrived", "at the goal")
+            turn = clip(-settings.turn_gain * heading, self._max_turn)
+            return _step(Command(0.0, turn), "turning", "turning to the goal's heading")
+        toward = math.atan2(-self._direction * pose.y, -self._direction * pose.x)
+        error = wrap_angle(toward - heading)
+        if (
+            rho < 0.1 and abs(error) > 0.5 * math.pi
+        ):  # just driven past the goal: come back, do not turn about
+            self._direction = -self._direction
+            error = wrap_angle(error - math.pi)
+        if abs(error) > (0.3 if self._aligned else 0.05):
+            self._aligned = False
+            return _step(
+                Command(0.0, clip(settings.turn_gain * error, self._max_turn)),
+                "turning",
+                "turning to drive " + ("forward" if self._direction > 0 else "backward"),
+            )
+        self._aligned = True
+        if self._in_the_way(obstacles, min(rho, 0.25)):
+            self._blocked += 1
+            stuck = self._blocked > settings.patience_ticks
+            return _step(Command(), "stuck" if stuck else "driving", "an obstacle is in the way")
+        self._blocked = 0
+        speed = self._direction * min(max(settings.forward_gain * rho, 0.015), self._max_forward)
+        speeds = saturate(speed, settings.turn_gain * error, self._max_forward, self._max_turn)
+        return _step(Command(*speeds), "driving", "driving straight to the goal")
+
+    def _in_the_way(self, obstacles: NDArray[Any], way: float) -> bool:
+        """Whether the footprint, driven `way` (m) straight on, comes too near a point ahead of it."""
+        points = np.asarray(obstacles, dtype=np.float64).reshape(-1, 2)
+        along, aside = self._direction * points[:, 0], points[:, 1]
+        beyond = np.maximum(along - way, 0.0)
+        near = np.hypot(beyond, aside) < self._description.radius + self.settings.clearance
+        return bool((near & (along > 0.0)).any())
+
+
+def _step(command: Command, state: State, reason: str) -> ServoStep:
+    return ServoStep(command, state, None, reason, 0)
+
+
+def _turning(heading: float, toward: float) -> float:
+    """Turning in all, rad: from a heading to the direction of the drive, and from there to 0."""
+    return abs(wrap_angle(toward - heading)) + abs(wrap_angle(toward))

@@ -1,0 +1,73 @@
+"""Points that were lost while they should still be in view: somebody walks past, and they come back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.vision.template import TemplateMatcher, Templates, TemplateSettings
+from mapweave.hybridmap.pose import Array
+
+
+@dataclass(frozen=True, slots=True)
+class OccludedTrackSettings:
+    """How long and how hidden points are looked for.
+
+    Attributes:
+        images: a point that has not come back after so many images is given up.
+        template: how its patch is found again: further from the expected place than that of a point that is
+            tracked, and therefore only if it looks more like what it was.
+    """
+
+    images: int = 60
+    template: TemplateSettings = field(
+        default_factory=lambda: TemplateSettings(iterations=6, agree_px=4.0, least_correlation=0.9)
+    )
+
+
+class OccludedTracks:
+    """Remembers the patches of lost points, and finds them again where they are expected.
+
+    Attributes:
+        ids: (N,) of the points that are hidden now.
+    """
+
+    def __init__(self, settings: OccludedTrackSettings | None = None) -> None:
+        """Start with nothing hidden."""
+        self.ids: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._settings = settings or OccludedTrackSettings()
+        self._matcher = TemplateMatcher(self._settings.template)
+        self._templates = self._matcher.none()
+        self._waited: NDArray[np.int64] = np.zeros(0, np.int64)
+
+    def take(self, ids: NDArray[np.int64], templates: Templates) -> None:
+        """Look for (N,) lost points and their patches from now on."""
+        self.ids = np.concatenate([self.ids, ids])
+        self._templates = self._templates.joined(templates)
+        self._waited = np.concatenate([self._waited, np.zeros(len(ids), np.int64)])
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Give up those that a (N,) mask does not select."""
+        if not mask.all():
+            self.ids, self._waited = self.ids[mask], self._waited[mask]
+            self._templates = self._templates.chosen(mask)
+
+    def seek(self, image: NDArray[np.uint8], expected: Array) -> tuple[NDArray[np.int64], Array, Templates]:
+        """Look for the points in an image; those found, and those looked for too long, are hidden no more.
+
+        Args:
+            image: (H, W) grey.
+            expected: (N, 2) px in the real image, where they should be; NaN for those out of view.
+
+        Returns:
+            Of those found: ids (K,), where they are, (K, 2) px in the real image, and their patches.
+        """
+        inside: NDArray[np.bool_] = np.asarray(np.isfinite(expected).all(axis=1))
+        match = self._matcher.match(self._templates, image, np.where(inside[:, None], expected, -1e3))
+        found = inside & match.held
+        out = self.ids[found], match.raw[found], match.templates.chosen(found)
+        self._waited = self._waited + 1
+        self.keep(~found & (self._waited < self._settings.images))
+        return out

@@ -1,0 +1,36 @@
+"""What has happened to a merged map, with dates: plain values, no transport."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class MapEventKind(StrEnum):
+    """What sort of thing has happened."""
+
+    JOINED = "joined"
+    PARTED = "parted"
+    """What was one map is no longer; the words say what took its links away."""
+    KEPT_APART = "kept apart"
+    """Links between two maps were found, and refused: two robots cannot have been where they say."""
+    SET_APART = "set apart"
+    """The merge fails with a map, and is made without it; or it is taken in again."""
+    RULED = "ruled"
+    """A person has decided."""
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class MapEvent:
+    """Something that happened.
+
+    Attributes:
+        stamp_ns: when it was noticed, wall time since 1970.
+        kind: what sort of thing.
+        words: what, and why; one printable line.
+    """
+
+    stamp_ns: int
+    kind: MapEventKind
+    words: str

@@ -1,0 +1,188 @@
+"""Workers for questions that take long. Whoever would wait too long is told at once when to come again."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+from mapweave.hybridmap.errors import Busy, SettingsError
+
+LATENESS = 0.5
+"""Who comes so much after or before the appointment still has it, s: the way there and back takes time."""
+MOST_BOOKED = 1024
+"""Appointments that are kept in mind; beyond, nobody has precedence."""
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class AdmissionSettings:
+    """How questions are shared out.
+
+    Attributes:
+        workers: questions that are worked on at once.
+        in_time: a question that would have its answer later than this, as far as is known, is refused, unless
+            a worker is free, s.
+        too_late: one whose turn comes so late that its answer would take so many times as long is refused
+            as well: the others behind it are answered in time then.
+        first_guess: how long a question takes, before any was answered, s.
+        smoothing: weight of the newest question in the mean time that one takes.
+        longest_pause: nobody is sent away for longer, s.
+    """
+
+    workers: int = min(os.cpu_count() or 1, 4)
+    in_time: float = 0.7
+    too_late: float = 1.25
+    first_guess: float = 0.1
+    smoothing: float = 0.2
+    longest_pause: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work.
+
+        Raises:
+            SettingsError: a number out of range.
+        """
+        if not 1 <= self.workers <= 64:
+            raise SettingsError(f"{self.workers} workers; use 1 to 64")
+        if not (self.in_time > 0.0 and self.first_guess > 0.0 and self.longest_pause > 0.0):
+            raise SettingsError("in_time, first_guess and longest_pause must be positive")
+        if not self.too_late >= 1.0:
+            raise SettingsError(f"too_late {self.too_late:g} must be 1 or more")
+        if not 0.0 < self.smoothing <= 1.0:
+            raise SettingsError(f"smoothing {self.smoothing:g} must be above 0 and at most 1")
+
+
+class AdmissionControl:
+    """A pool of workers with a queue that is never longer than can be worked off in time.
+
+    Those who are refused get appointments one after the other, so that a crowd does not come back as a crowd.
+    Who comes back with the same question has precedence over who comes for the first time.
+    """
+
+    def __init__(
+        self,
+        settings: AdmissionSettings | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        executor: Executor | None = None,
+    ) -> None:
+        """Start the workers.
+
+        Args:
+            settings: how many, and what is too long.
+            clock: tells the time, s.
+            executor: does the work; threads of its own if not given. It is shut down with this.
+        """
+        self._settings = settings or AdmissionSettings()
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._open = 0
+        self._answered = 0
+        self._refused = 0
+        self._seconds = self._settings.first_guess
+        self._appointment = -math.inf
+        self._booked: dict[int, float] = {}
+        workers = self._settings.workers
+        self._pool = executor or ThreadPoolExecutor(workers, thread_name_prefix="desk")
+
+    def submit(self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True) -> Future[_T]:
+        """Have something done.
+
+        Args:
+            work: to be done.
+            ticket: the same when the same question comes again, and hardly ever that of another one; without
+                one it never has precedence.
+            usual: whether it takes as long as other questions do: else the desk learns nothing of it.
+
+        Returns:
+            Its result, or what it raised, some time later; Busy if it has waited too long.
+
+        Raises:
+            Busy: it would wait too long; nothing was done.
+        """
+        with self._lock:
+            s, now, wait = self._settings, self._clock(), self._wait()
+            latest = s.too_late * s.in_time
+            kept = self._keeps_appointment(ticket, now)
+            allowed = latest if kept else s.in_time - self._expected(now)
+            if wait > 0.0 and wait + self._seconds > allowed:
+                self._refused += 1
+                raise Busy(self._next_appointment(wait, ticket, kept))
+            self._open += 1
+        by = now + latest if wait > 0.0 else math.inf
+        return self._pool.submit(self._unless_late, work, ticket, by, usual)
+
+    def counters(self) -> dict[str, int | float]:
+        """Questions answered and refused so far, those open now, and how long one takes, ms."""
+        with self._lock:
+            return {
+                "answered": self._answered,
+                "busy": self._refused,
+                "open": self._open,
+                "answer_ms": round(1e3 * self._seconds, 1),
+            }
+
+    def close(self) -> None:
+        """Finish what was taken on. Twice is no error."""
+        self._pool.shutdown()
+
+    def _wait(self) -> float:
+        """How long a question that comes now would wait for a worker, s."""
+        workers = self._settings.workers
+        return max(self._open - workers + 1, 0) * self._seconds / workers
+
+    def _keeps_appointment(self, ticket: int | None, now: float) -> bool:
+        """Whether somebody comes when told, give or take. Who does not come in time has lost the place."""
+        late = [one for one, due in self._booked.items() if due < now - LATENESS]
+        for one in late:
+            del self._booked[one]
+        if ticket is None or self._booked.get(ticket, math.inf) > now + LATENESS:
+            return False
+        del self._booked[ticket]
+        return True
+
+    def _expected(self, now: float) -> float:
+        """How long those will take who have an appointment as long as a new question would wait, s."""
+        soon = sum(due <= now + self._settings.in_time for due in self._booked.values())
+        return soon * self._seconds / self._settings.workers
+
+    def _next_appointment(self, wait: float, ticket: int | None, again: bool) -> float:
+        """In how many seconds somebody may come again: when the queue is half empty, behind all others.
+
+        Who has come in vain when told, or was taken on in vain, need not go to the end once more.
+        """
+        s, now = self._settings, self._clock()
+        due = now + max(wait - 0.5 * s.in_time, 0.0) + self._seconds / s.workers
+        if not again:
+            due = self._appointment = max(due, self._appointment + self._seconds / s.workers)
+        due = min(due, now + s.longest_pause)
+        self._appointment = min(self._appointment, now + s.longest_pause)
+        if ticket is not None and len(self._booked) < MOST_BOOKED:
+            self._booked[ticket] = due
+        return due - now
+
+    def _unless_late(self, work: Callable[[], _T], ticket: int | None, latest: float, usual: bool) -> _T:
+        """What a worker does with a question when its turn has come."""
+        with self._lock:
+            if self._clock() + self._seconds > latest:
+                self._open -= 1
+                self._refused += 1
+                raise Busy(self._next_appointment(self._wait(), ticket, True))
+        return self._timed(work, usual)
+
+    def _timed(self, work: Callable[[], _T], usual: bool) -> _T:
+        began = self._clock()
+        try:
+            return work()
+        finally:
+            with self._lock:
+                self._open -= self._pool is not None
+                self._answered += 1
+                if usual:
+                    self._seconds += self._settings.smoothing * (self._clock() - began - self._seconds)

@@ -1,0 +1,135 @@
+"""Merged maps as map files, and back: a file holds the parts, so that it can be explained or merged anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.node import Edge, MapId
+from mapweave.merge.manual_constraints import apply_constraints
+from mapweave.merge.merging import MergeSettings
+from mapweave.merge.outlier_rejection.link_probability import link_probabilities
+from mapweave.merge.outlier_rejection.segmentation import fragments_of
+from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
+from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.storage.map_file import MapFile, RefusedPair
+from mapweave.wire.codec import element_of
+
+PROBABILITY = "probability"
+"""Name among the evidence of a link in a file: see mapweave.merge.outlier_rejection.link_probability."""
+
+
+def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
+    """All that a merged map is: nodes, edges, links with their probabilities, refusals, rulings, poses.
+
+    Args:
+        merged: the map.
+        history: what has become of its maps by itself.
+    """
+    whole = merged.union()
+    probabilities = link_probabilities(merged)
+    for link in merged.links:
+        edge = link.edge()
+        evidence = {**edge.evidence, PROBABILITY: probabilities[link.pair]}
+        whole.edges[edge.id] = replace(edge, evidence=evidence)
+    return MapFile(
+        "merged",
+        merged.summary(),
+        tuple(whole.contents()),
+        dict(merged.poses),
+        tuple(RefusedPair(r.a, r.b, r.reason, _edge(merged, r)) for r in merged.refused),
+        merged.rulings.made,
+        merged.superseded,
+        merged.faded,
+        tuple(history),
+    )
+
+
+def maps_of(content: MapFile) -> dict[MapId, HybridMap]:
+    """The robots' own maps in a file, with what was refused of their edges; links are not theirs."""
+    maps: dict[MapId, HybridMap] = {}
+    refused = (EdgePut(r.edge) for r in content.refused if r.edge is not None)
+    for body in (*content.changes, *refused):
+        element = element_of(body)
+        if not (isinstance(body, EdgePut) and _is_link(body.edge)):
+            maps.setdefault(element.map, HybridMap()).apply(body)
+    return maps
+
+
+def merged_of(content: MapFile, settings: MergeSettings | None = None) -> MergedMap:
+    """The merged map that a file holds: links and refusals as they are, poses and covariances solved anew.
+
+    Nothing is judged again, so a file is explained by what was decided when it was made.
+
+    Args:
+        content: of the file.
+        settings: with which it was merged.
+
+    Raises:
+        InvalidFile: its measurements determine no poses.
+    """
+    s = settings or MergeSettings()
+    maps, rulings = maps_of(content), ManualConstraints(content.rulings)
+    links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
+    try:
+        parts = fragments_of(apply_constraints(maps, (), rulings).maps, s.consistency, s.strain)
+        solved = ComponentSolver(parts).solve(links)
+    except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
+        # The solver's RuntimeError says that a system is singular.
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InvalidFile(f"the poses of this map cannot be solved ({reason})") from None
+    poses = {
+        node: Placement(number, pose)
+        for number, graph in enumerate(solved)
+        for node, pose in graph.poses().items()
+    }
+    refused = tuple(_refused(pair) for pair in content.refused)
+    components = tuple(frozenset(graph.nodes) for graph in solved)
+    superseded = {node: fate for node, fate in content.superseded.items() if node in poses}
+    faded = {node: gone for node, gone in content.faded.items() if node in poses}
+    return MergedMap(
+        dict(sorted(maps.items())),
+        links,
+        refused,
+        components,
+        poses,
+        tuple(solved),
+        rulings,
+        superseded,
+        faded,
+    )
+
+
+def _is_link(edge: Edge) -> bool:
+    return edge.id.map == MapId(MERGE_AUTHOR, 0)
+
+
+def _links(edges: Iterable[Edge]) -> list[Link]:
+    found = []
+    for edge in edges:
+        if _is_link(edge):
+            evidence = {name: value for name, value in edge.evidence.items() if name != PROBABILITY}
+            found.append(link_of(replace(edge, evidence=evidence)))
+    return sorted(found, key=lambda link: link.pair)
+
+
+def _edge(merged: MergedMap, refused: RefusedLink) -> Edge | None:
+    if refused.edge is not None:
+        return merged.maps[refused.edge.map].edges[refused.edge]
+    return None if refused.link is None else refused.link.edge()
+
+
+def _refused(pair: RefusedPair) -> RefusedLink:
+    if pair.edge is None:
+        return RefusedLink(pair.a, pair.b, pair.reason)
+    return RefusedLink(
+        pair.a, pair.b, pair.reason, link_of(pair.edge), None if _is_link(pair.edge) else pair.edge.id
+    )

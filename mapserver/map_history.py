@@ -1,0 +1,188 @@
+"""The server's record of what has become of the maps: what joined, what came apart and why, with dates."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Sequence
+
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.store import Store
+from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.history_codec import MAX_WORDS, KeptHistory, decode_kept_history, encode_kept_history
+
+log = logging.getLogger(__name__)
+
+NAME = "history"
+"""In the store."""
+MOST = 500
+"""Happenings that are kept: the newest."""
+MOST_APART = 2000
+"""Pairs of maps that are remembered as kept apart, so that it is told once."""
+MOST_AT_ONCE = 50
+"""Happenings of one sort that one merge adds one by one: a thousand maps may join at once."""
+Pair = tuple[MapId, MapId]
+BODIES = ("would have seen", "would have been at the same place", "show nothing of what the other one mapped")
+"""What a refusal says where two robots cannot have been where the links put them."""
+
+
+class MapHistory:
+    """Compares each merge with the one before, also across restarts. Written by the merging thread alone."""
+
+    def __init__(
+        self, store: Store | None = None, most: int = MOST, clock: Callable[[], int] = time.time_ns
+    ) -> None:
+        """Read what was kept; a record that is damaged is begun anew, and that is said.
+
+        Args:
+            store: where it is kept; None: it ends with the process.
+            most: happenings that are kept.
+            clock: wall time, ns.
+        """
+        self._store, self._most, self._clock = store, most, clock
+        self._lock = threading.Lock()
+        self._kept = KeptHistory()
+        self._links: Collection[Link] | None = None
+        found = None if store is None else store.result(NAME)
+        if found is not None:
+            try:
+                self._kept = decode_kept_history(found)
+            except InvalidMessage as error:
+                self.failed(f"the record of what happened before was damaged ({error}); a new one begins")
+
+    @property
+    def happenings(self) -> tuple[MapEvent, ...]:
+        """In order; for any thread."""
+        with self._lock:
+            return self._kept.happenings
+
+    @property
+    def newest(self) -> str:
+        """Words of what last became of the maps; empty if nothing has."""
+        return next(
+            (one.words for one in reversed(self.happenings) if one.kind is not MapEventKind.FAILED), ""
+        )
+
+    @property
+    def set_apart(self) -> frozenset[MapId]:
+        """Maps that were set apart by the last merge that was followed, also of another process."""
+        return self._kept.set_apart
+
+    def follow(self, merged: MergedMap) -> None:
+        """Take note of what has changed with a merge, and keep it."""
+        if not merged.maps and not merged.set_apart:
+            return  # Nothing is read yet: what was one is no less so.
+        before, now = self._kept.parts, tuple(joined_maps(merged))
+        same = now == before
+        joined = () if same else joinings(before, merged)
+        parted = () if same else partings(before, self._links, merged)
+        apart = _kept_apart(merged, now)
+        was_in, is_in = _part_of(before), _part_of(now)
+        # Until two maps are one nothing new is told of them, and beyond the most nothing at all.
+        still = {(a, b) for a, b in self._kept.apart if is_in.get(a, -1) != is_in.get(b, -2)}
+        new = [pair for pair in apart if pair not in still][: MOST_APART - len(still)]
+        # Of what has just parted it is told already what stands between.
+        held = [apart[a, b] for a, b in new if was_in.get(a, -1) != was_in.get(b, -2)]
+        bad, before_bad = merged.set_apart, self._kept.set_apart
+        left_out = [f"map {one} is set apart: {bad[one]}" for one in sorted(bad.keys() - before_bad)]
+        taken_in = [f"map {one} is no longer set apart" for one in sorted(before_bad - bad.keys())]
+        for words in (*joined, *taken_in):
+            log.info("%s", words)
+        for words in (*parted, *held, *left_out):
+            log.warning("%s", words)
+        # Of what happens at once, that something came apart is what people must see last.
+        fresh = [
+            *_briefly(MapEventKind.JOINED, joined),
+            *_briefly(MapEventKind.KEPT_APART, held),
+            *_briefly(MapEventKind.PARTED, parted),
+            *_briefly(MapEventKind.SET_APART, taken_in),
+            *_briefly(MapEventKind.SET_APART, left_out),
+        ]
+        known = frozenset(still | set(new))
+        self._links = merged.links
+        if fresh or now != before or known != self._kept.apart:
+            self._keep(fresh, now, known, frozenset(bad))
+
+    def failed(self, words: str) -> None:
+        """Take note that something could not be done; the same twice is told once."""
+        if not self._kept.happenings or self._kept.happenings[-1].words != words:
+            self._keep(
+                [(MapEventKind.FAILED, words)], self._kept.parts, self._kept.apart, self._kept.set_apart
+            )
+
+    def _keep(
+        self,
+        fresh: list[tuple[MapEventKind, str]],
+        parts: tuple[frozenset[MapId], ...],
+        apart: frozenset[Pair],
+        set_apart: frozenset[MapId],
+    ) -> None:
+        """Add to the record; it is on the disk when this returns, unless the disk does not take it."""
+        now = self._clock()
+        more = [MapEvent(now, kind, _one_line(words)) for kind, words in fresh]
+        kept = KeptHistory((*self._kept.happenings, *more)[-self._most :], parts, apart, set_apart)
+        with self._lock:
+            self._kept = kept
+        if self._store is None:
+            return
+        try:
+            self._store.put_result(NAME, encode_kept_history(kept))
+        except (InvalidFile, InvalidValue) as error:
+            log.warning("what has happened to the maps is not kept: %s", error)
+
+
+def between(before: MergedMap, after: MergedMap, stamp_ns: int) -> tuple[MapEvent, ...]:
+    """What has become of the maps from one merge to another, with the time at which that was asked for."""
+    parts = joined_maps(before)
+    joined, parted = joinings(parts, after), partings(parts, before.links, after)
+    fresh = [*_briefly(MapEventKind.JOINED, joined), *_briefly(MapEventKind.PARTED, parted)]
+    return tuple(MapEvent(stamp_ns, kind, _one_line(words)) for kind, words in fresh)
+
+
+def _part_of(parts: Iterable[frozenset[MapId]]) -> dict[MapId, int]:
+    return {one: number for number, part in enumerate(parts) for one in part}
+
+
+def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pair, str]:
+    """Maps that are not one, since robots cannot have been where the links between them say, or one is
+    wrong.
+    """
+    part_of = _part_of(parts)
+    reasons: dict[Pair, Counter[str]] = {}
+    speaks_of_bodies: dict[str, bool] = {}
+    for r in merged.refused:
+        if r.link is None or r.edge is not None:
+            continue
+        if r.reason not in speaks_of_bodies:
+            speaks_of_bodies[r.reason] = any(words in r.reason for words in BODIES)
+        first, second = sorted((r.a.map, r.b.map))
+        if speaks_of_bodies[r.reason] and part_of.get(first) != part_of.get(second):
+            reasons.setdefault((first, second), Counter())[r.reason] += 1
+    # One line for a map with wrong geometry, under its pair with the first of those that it contradicts.
+    out: dict[Pair, str] = {}
+    for wrong in merged.wrong.values():
+        first, second = sorted((wrong.which, wrong.agreeing[0]))
+        out[first, second] = wrong.reason
+    for (first, second), found in sorted(reasons.items()):
+        count = sum(found.values())
+        links = "1 link" if count == 1 else f"{count} links"
+        out[first, second] = (
+            f"{first} and {second} are kept apart: {links} refused ({found.most_common(1)[0][0]})"
+        )
+    return out
+
+
+def _briefly(kind: MapEventKind, told: Sequence[str]) -> list[tuple[MapEventKind, str]]:
+    """Of very much at once the number."""
+    more = [f"and {len(told) - MOST_AT_ONCE} more at once"] if len(told) > MOST_AT_ONCE else []
+    return [(kind, words) for words in (*told[:MOST_AT_ONCE], *more)]
+
+
+def _one_line(words: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in words)[:MAX_WORDS]

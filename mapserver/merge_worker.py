@@ -1,0 +1,282 @@
+"""Keeps the answers up to date: takes changes in and merges in the background, piece by piece."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterable
+from functools import partial
+from itertools import islice
+
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.map_history import MapHistory
+from mapweave.mapserver.merging.merger import Merger, MergerSettings
+from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.schedule import Job, Schedule
+from mapweave.merge.merging import MergeSettings
+from mapweave.merge.pose_graph.merged_map import MergedMap
+
+log = logging.getLogger(__name__)
+
+READ_AT_ONCE = 1024
+"""Changes of a store that are taken in at once: while these are, the next are decoded."""
+LOOK_AT_ONCE = 20
+"""Nodes for which is looked what is like them, before what has come meanwhile is taken in."""
+PREPARED_AT_ONCE = 4
+"""Nodes of which is found out what they look like, likewise."""
+MOST_WORDS = 1000
+"""Characters of an event in a status message."""
+
+
+class MergeWorker:
+    """Merges beside the questions. Only its jobs touch the merger; new answers replace those before."""
+
+    def __init__(
+        self,
+        schedule: Schedule,
+        share: float = 0.4,
+        index: PlaceIndex | None = None,
+        merge: MergeSettings | None = None,
+        keeper: VerificationCacheKeeper | None = None,
+        chronicle: MapHistory | None = None,
+    ) -> None:
+        """Begin with nothing.
+
+        Args:
+            schedule: runs the work, all of it one after the other.
+            share: at most this share of the time is spent making the merged map anew.
+            index: is filled with the nodes that come; may have them already.
+            merge: how maps are merged.
+            keeper: of what comparing nodes has found.
+            chronicle: of what becomes of the maps.
+        """
+        self._schedule = schedule
+        self._keeper = keeper
+        self._chronicle = chronicle or MapHistory()
+        self._share = share
+        self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
+        self._fresh: dict[NodeId, Node] = {}
+        self._answers = self._answers_from(MergedMap.empty())
+        self._dirty = self._reading = self._curious = False
+        self._plight = ""
+        self._merger.suspect(self._chronicle.set_apart)
+        self._counting = threading.Lock()
+        self._came = self._applied = self._done = 0
+        schedule.idle(self._idle)
+
+    @property
+    def answers(self) -> Answers:
+        """From the newest merged map."""
+        return self._answers
+
+    @property
+    def event(self) -> str:
+        """What holds up merging; else the newest of what has become one map, or is no longer one, and why."""
+        return (self._plight or self._chronicle.newest)[:MOST_WORDS]
+
+    @property
+    def settled(self) -> bool:
+        """Whether everything that has come is merged, or could not be."""
+        return self._done == self._came
+
+    def current(self) -> Answers:
+        """Answers that know all that a question may expect them to know (see Schedule.catch_up)."""
+        self._schedule.catch_up()
+        return self._answers
+
+    def start(self) -> None:
+        """Begin to merge."""
+        self._schedule.post(self._restore)
+        self._schedule.start()
+
+    def take(self, change: Change) -> None:
+        """Take note of a change, in the order of its log. Returns at once.
+
+        A new place can be found from now on, however long a merge goes on: whoever merges takes the change in
+        when its turn comes, and what it makes of the index then is what holds.
+        """
+        self._schedule.observe(change.stamp_ns)
+        if isinstance(change.body, NodePut):
+            self._fresh[change.body.node.id] = change.body.node
+            try:
+                self._merger.index.add(change.body.node)
+            except Exception:  # it is tried once more when its turn comes
+                log.exception("change %s of %s cannot be found yet", change.sequence, change.map)
+        self._post(lambda: self._take(change))
+
+    def read(self, changes: Iterable[Change]) -> None:
+        """Take in all that is in a store, map by map in the order of its log, once this has started.
+
+        Returns when every place can be found, and lies in the frame of its own map. Maps are compared
+        with each other afterwards.
+
+        Raises:
+            InvalidFile: the store is damaged.
+        """
+        rest, taken = iter(changes), threading.Event()
+        self._reading = True
+        try:
+            while some := list(islice(rest, READ_AT_ONCE)):
+                self._post(partial(self._read, some))
+        finally:
+            self._schedule.post(lambda: self._end_reading(taken))
+        self._schedule.catch_up()
+        taken.wait()
+
+    def rule(self, rulings: ManualConstraints) -> None:
+        """Heed these rulings of people from now on, and no others. Returns at once."""
+        self._post(lambda: self._merger.rule(rulings))
+
+    def settle(self, timeout: float) -> bool:
+        """Wait until everything that came before this call is merged; False if the time is over first."""
+        merged = threading.Event()
+        self._schedule.post(lambda: self._settle(merged))
+        self._schedule.catch_up()
+        return merged.wait(timeout)
+
+    def close(self) -> None:
+        """Stop after what has come."""
+        self._schedule.post(lambda: self._save(last=True))
+        self._schedule.close()
+
+    def _post(self, job: Job) -> None:
+        """Post a job after which the merged map is out of date."""
+        with self._counting:
+            self._came += 1
+
+        def change() -> None:
+            try:
+                job()
+            finally:
+                self._applied += 1
+                self._dirty = True
+
+        self._schedule.post(change)
+
+    def _restore(self) -> None:
+        if self._keeper:
+            try:
+                self._keeper.restore(self._merger)
+            except Exception:  # it can all be found out again
+                log.exception("what was found before cannot be read: nodes are compared again")
+
+    def _save(self, last: bool = False) -> None:
+        if self._keeper:
+            try:
+                self._keeper.save(self._merger, last)
+            except Exception:  # the next start takes longer
+                log.exception("what was found is not kept")
+
+    def _idle(self) -> float | None:
+        """A piece of the work that can wait: compare nodes, merge, prepare answers."""
+        # What comes in pieces is merged when it is whole.
+        if self._reading or not (self._dirty or self._curious):
+            return None
+        if self._merger.uncompared:
+            self._look_around()
+            return 0.0
+        began = self._schedule.monotonic()
+        if self._dirty:
+            self._merge()
+        else:
+            self._prepare(PREPARED_AT_ONCE)
+        spent = self._schedule.monotonic() - began
+        self._save()
+        return spent * (1.0 / self._share - 1.0)
+
+    def _settle(self, merged: threading.Event) -> None:
+        if self._dirty:
+            self._merge()
+        merged.set()
+        self._save()
+
+    def _end_reading(self, taken: threading.Event) -> None:
+        self._reading = False
+        if self._merger.uncompared:
+            self._tell_apart()
+        taken.set()
+
+    def _take(self, change: Change) -> None:
+        if isinstance(change.body, NodePut):
+            newest = self._fresh.get(change.body.node.id)
+            if newest is not None and newest is not change.body.node:
+                return  # The same node is put again by a change that waits: the last one counts.
+            self._apply(change)
+            self._forget(change.body.node)
+        else:
+            self._apply(change)
+
+    def _forget(self, node: Node) -> None:
+        if self._fresh.get(node.id) is node:
+            del self._fresh[node.id]
+
+    def _read(self, changes: list[Change]) -> None:
+        try:
+            self._merger.read((change.map, change.body) for change in changes)
+        except Exception:  # a log may be replayed: whatever is wrong with one change, the others are taken
+            log.exception("the changes in the store are taken in one by one")
+            for change in changes:
+                self._apply(change)
+
+    def _apply(self, change: Change) -> None:
+        try:
+            self._merger.on_change(change)
+        except MapweaveError as error:
+            log.warning("change %s of %s is not merged: %s", change.sequence, change.map, error)
+        except Exception:  # a defect with one change must not end all merging
+            log.exception("change %s of %s is not merged", change.sequence, change.map)
+
+    def _answers_from(self, merged: MergedMap) -> Answers:
+        return Answers.of(self._merger, merged, self._node)
+
+    def _node(self, node_id: NodeId) -> Node | None:
+        """A node, also one that is not with the merger yet."""
+        return self._fresh.get(node_id) or self._merger.node(node_id)
+
+    def _look_around(self) -> None:
+        """A little of what comes before the first merge: it must not hold up what comes."""
+        self._plight = f"{self._merger.uncompared} nodes are still to be compared with others"
+        try:
+            self._merger.look_around(LOOK_AT_ONCE)
+        except Exception:  # the merge tries again, and says so if it cannot
+            log.exception("nodes could not be compared")
+            self._merge()
+
+    def _tell_apart(self) -> None:
+        """Answer from each map by itself, as its robot made it, until all are compared with each other."""
+        try:
+            self._answers = self._answers_from(self._merger.apart())
+        except Exception:  # as below
+            log.exception("the maps could not be told of one by one")
+
+    def _prepare(self, most: int) -> None:
+        """Find out what nodes look like, so that who asks where he is need not wait for that."""
+        self._curious = False
+        try:
+            self._curious = self._answers.relocalizer.prepare(most) > 0
+        except Exception:  # it is found out when somebody asks
+            log.exception("what nodes look like could not be found out beforehand")
+
+    def _merge(self) -> None:
+        self._dirty = False
+        made: list[Answers] = []
+        try:
+            merged = self._merger.merged(lambda merged: made.append(self._answers_from(merged)))
+            self._answers = made[-1] if made else self._answers_from(merged)
+        except Exception:  # questions are answered from the map before; the next change is the next chance
+            log.exception("the merged map could not be made anew")
+            self._plight = "the merged map could not be made anew: see the server's log"
+            self._chronicle.failed(self._plight)
+            return
+        finally:
+            self._done = self._applied
+        self._curious, self._plight = True, ""
+        try:
+            self._chronicle.follow(merged)
+        except Exception:  # a defect here must not end all merging
+            log.exception("what has become of the maps could not be told")

@@ -1,0 +1,82 @@
+"""Succession: superseded nodes leave the place index, so that a new node costs the same on every drive.
+
+A robot's nodes of today stay in it for the time being, superseded or not: while maps are being made, links
+between all of them tell true merges from false ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.mapserver.retrieval import voting
+from mapweave.mapserver.retrieval.place_index import PlaceIndex, bounded
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.pairs import PairTable
+
+SETTLED = 3600.0
+"""s on the robot's own clock after which what it saw is no longer of today."""
+SECOND = 1_000_000_000
+
+
+class SupersededNodes:
+    """Keeps old superseded nodes out of the place index. What they were compared with is kept."""
+
+    def __init__(self, index: PlaceIndex, pairs: PairTable, node_of: Callable[[NodeId], Node | None]) -> None:
+        """Begin with nothing superseded.
+
+        Args:
+            index: of places that are looked for.
+            pairs: that are compared; revived nodes are put into it.
+            node_of: gives a node by its id.
+        """
+        self._index, self._pairs, self._node_of = index, pairs, node_of
+        self._left_out: set[NodeId] = set()
+        self._newest: dict[str, tuple[int, int]] = {}
+
+    def overlaps(self, node: Node, before: Iterable[Pair]) -> dict[NodeId, float]:
+        """Which nodes a node is compared with: those in the index, and those left out that it was before.
+
+        Args:
+            node: has just come.
+            before: pairs that it was in, if it was known already.
+        """
+        found, s = self._index.overlaps(node, self._node_of), self._index.settings.candidates
+        for other_id in {one for pair in before for one in pair} & self._left_out:
+            other = self._node_of(other_id)
+            if other is not None and other_id != node.id:
+                codes, others = (bounded(one).landmarks.codes for one in (node, other))
+                value = voting.pair_overlap(codes, others, s.alike)
+                if value >= s.least_overlap:
+                    found[other_id] = value
+        return found
+
+    def put(self, node: Node) -> None:
+        """A node has come, or has been put anew, and into the index."""
+        self._left_out.discard(node.id)
+        told = node.id.epoch, node.stamp_ns
+        self._newest[node.id.agent] = max(told, self._newest.get(node.id.agent, told))
+
+    def drop(self, node_id: NodeId) -> None:
+        """A node has gone."""
+        self._left_out.discard(node_id)
+
+    def follow(self, superseded: Collection[NodeId]) -> None:
+        """These nodes are superseded now, and no others."""
+        past = {node_id for node_id in superseded if self._is_past(node_id)}
+        for node_id in self._left_out - past:
+            if (node := self._node_of(node_id)) is not None:
+                self._index.add(node)
+                self._pairs.put(node_id, self._index.overlaps(node, self._node_of))
+        for node_id in past - self._left_out:
+            node = self._node_of(node_id)
+            self._index.remove(node_id, None if node is None else node.landmarks.codes)
+        self._left_out = past
+
+    def _is_past(self, node_id: NodeId) -> bool:
+        """Whether its robot is in a later epoch by now, or was there long after it."""
+        node = self._node_of(node_id)
+        if node is None:
+            return True
+        epoch, stamp_ns = self._newest.get(node_id.agent, (node_id.epoch, node.stamp_ns))
+        return epoch > node_id.epoch or stamp_ns - node.stamp_ns > SETTLED * SECOND

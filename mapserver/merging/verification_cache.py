@@ -1,0 +1,82 @@
+"""What comparing nodes has found: how alike they look, and the verdicts on pairs of them.
+
+All of it depends on two nodes alone. So it outlives the process that found it, as long as both nodes are
+just so; which they are is told by prints of all that a comparison looks at.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.verdicts import Verdict
+
+PRINT_BYTES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationCache:
+    """Of some nodes.
+
+    Attributes:
+        prints: of the nodes that were compared with all others that there were.
+        overlaps: between them; pairs that are left out share too little.
+        verdicts: on pairs of them.
+    """
+
+    prints: Mapping[NodeId, bytes] = field(default_factory=dict)
+    overlaps: Mapping[Pair, float] = field(default_factory=dict)
+    verdicts: Mapping[Pair, Verdict] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """How many pairs were compared."""
+        return len(self.verdicts)
+
+
+class CachedVerifications:
+    """Findings of another process, as far as the nodes are still what they were."""
+
+    def __init__(self, findings: VerificationCache) -> None:
+        """Take them."""
+        self._findings = findings
+        self._overlaps: dict[NodeId, dict[NodeId, float]] = {}
+        for (a, b), value in findings.overlaps.items():
+            self._overlaps.setdefault(a, {})[b] = value
+            self._overlaps.setdefault(b, {})[a] = value
+        self._checked: dict[NodeId, tuple[Node, bool]] = {}
+
+    def knows(self, node: Node) -> bool:
+        """Whether this very node was compared."""
+        known = self._checked.get(node.id)
+        if known is None or known[0] is not node:
+            before = self._findings.prints.get(node.id)
+            known = self._checked[node.id] = node, before is not None and before == fingerprint_of(node)
+        return known[1]
+
+    def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
+        """Of a node that it knows, with others that it knows."""
+        out = {}
+        for other_id, value in self._overlaps.get(node.id, {}).items():
+            other = node_of(other_id)
+            if other is not None and self.knows(other):
+                out[other_id] = value
+        return out
+
+    def verdicts(self, node_of: Callable[[NodeId], Node | None]) -> Iterable[tuple[Pair, Verdict]]:
+        """On pairs of nodes that it knows."""
+        for pair, verdict in self._findings.verdicts.items():
+            a, b = node_of(pair[0]), node_of(pair[1])
+            if a is not None and b is not None and self.knows(a) and self.knows(b):
+                yield pair, verdict
+
+
+def fingerprint_of(node: Node) -> bytes:
+    """A number by which all that a comparison looks at is known again."""
+    seen = node.landmarks
+    digest = hashlib.blake2b(f"{node.id} {node.camera}".encode(), digest_size=PRINT_BYTES)
+    for column in (seen.pixels, seen.codes, seen.depths, seen.depth_sigmas):
+        digest.update(column.tobytes())
+    return digest.digest()

@@ -1,0 +1,140 @@
+"""The findings as a file (see mapweave.mapserver.checksummed_file), so that a server that starts again need
+not compare again.
+
+header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON), links ...
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.landmark_tables import VERSION as TABLES
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.checksummed_file import seal, unseal
+from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, VerificationCache
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.verdicts import Verdict
+
+MAGIC = b"mapweave verdicts\n"
+FORMAT = 3
+
+
+def save(path: Path, findings: VerificationCache, made_by: str) -> None:
+    """Write the file, or replace it at once.
+
+    Args:
+        path: of the file.
+        findings: to be kept.
+        made_by: settings and version of what found them, in words.
+
+    Raises:
+        InvalidFile: the disk does not take it.
+    """
+    seal(path, MAGIC, _parts(findings, made_by))
+
+
+def load(path: Path, made_by: str) -> VerificationCache:
+    """Read the file.
+
+    Args:
+        path: of the file.
+        made_by: as it was saved; what others have found is not believed.
+
+    Raises:
+        InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
+    """
+    parts = unseal(path, MAGIC)
+    try:
+        if _words(next(parts)) != _header(made_by):
+            raise InvalidFile(f"{path}: of another version of this program, or with other settings")
+        return _read(parts)
+    except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
+        raise InvalidFile(f"{path}: are no verdicts of this version ({error})") from None
+
+
+def _header(made_by: str) -> dict[str, Any]:
+    return {"format": FORMAT, "tables": TABLES, "made_by": made_by}
+
+
+def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
+    nodes = sorted(findings.prints)
+    row = {node: k for k, node in enumerate(nodes)}
+    agents = sorted({node.agent for node in nodes})
+    number = {agent: k for k, agent in enumerate(agents)}
+    yield _text(_header(made_by))
+    yield _text(agents)
+    yield np.array([(number[n.agent], n.epoch, n.number) for n in nodes], np.int64).reshape(-1, 3)
+    yield np.frombuffer(b"".join(findings.prints[n] for n in nodes), np.uint8).reshape(-1, PRINT_BYTES)
+    overlaps = _known(findings.overlaps.items(), row)
+    yield _rows([pair for pair, _ in overlaps], row)
+    yield np.array([value for _, value in overlaps], np.float64)
+    verdicts = _known(findings.verdicts.items(), row)
+    refused = [(pair, v.reason) for pair, v in verdicts if isinstance(v, RefusedLink)]
+    links = [(pair, v) for pair, v in verdicts if isinstance(v, Link)]
+    reasons = {reason: k for k, reason in enumerate(sorted({reason for _, reason in refused}))}
+    yield _text(list(reasons))
+    yield _rows([pair for pair, _ in refused], row)
+    yield np.array([reasons[reason] for _, reason in refused], np.int64)
+    yield _rows([pair for pair, _ in links], row)
+    yield np.array([link.a_from_b.mean.vector for _, link in links], np.float64).reshape(-1, 3)
+    yield np.array([link.a_from_b.covariance for _, link in links], np.float64).reshape(-1, 3, 3)
+    yield np.cumsum([0, *(len(link.shared) for _, link in links)])
+    yield np.concatenate([np.zeros((0, 2), np.int64), *(link.shared for _, link in links)])
+    kinds = {kind: k for k, kind in enumerate(sorted({tuple(link.evidence) for _, link in links}))}
+    yield _text([list(kind) for kind in kinds])
+    yield np.array([kinds[tuple(link.evidence)] for _, link in links], np.int64)
+    yield np.cumsum([0, *(len(link.evidence) for _, link in links)])
+    yield np.array([value for _, link in links for value in link.evidence.values()], np.float64)
+
+
+def _read(parts: Iterator[NDArray[Any]]) -> VerificationCache:
+    agents = _words(next(parts))
+    nodes = [NodeId(agents[a], epoch, number) for a, epoch, number in next(parts).tolist()]
+    prints = {node: one.tobytes() for node, one in zip(nodes, next(parts), strict=True)}
+    overlaps = dict(zip(_pairs(next(parts), nodes), next(parts).tolist(), strict=True))
+    reasons = _words(next(parts))
+    refused = zip(_pairs(next(parts), nodes), next(parts).tolist(), strict=True)
+    verdicts: dict[Pair, Verdict] = {pair: RefusedLink(*pair, reasons[k]) for pair, k in refused}
+    pairs = _pairs(next(parts), nodes)
+    means, covariances = next(parts).tolist(), next(parts)
+    shared_at, shared = next(parts).tolist(), next(parts)
+    kinds, kind = _words(next(parts)), next(parts).tolist()
+    evidence_at, evidence = next(parts).tolist(), next(parts).tolist()
+    for k, (pair, (i, j), (m, n)) in enumerate(
+        zip(pairs, pairwise(shared_at), pairwise(evidence_at), strict=True)
+    ):
+        told = dict(zip(kinds[kind[k]], evidence[m:n], strict=True))
+        pose = PoseGaussian(Pose2(*means[k]), covariances[k])
+        verdicts[pair] = Link(*pair, pose, shared[i:j], told)
+    return VerificationCache(prints, overlaps, verdicts)
+
+
+def _known(found: Iterable[tuple[Pair, Any]], row: dict[NodeId, int]) -> list[tuple[Pair, Any]]:
+    """Of pairs of which both nodes are among those that are kept, in the order of ids."""
+    return sorted(((p, v) for p, v in found if p[0] in row and p[1] in row), key=lambda item: item[0])
+
+
+def _rows(pairs: Sequence[Pair], row: dict[NodeId, int]) -> NDArray[np.int64]:
+    return np.array([(row[a], row[b]) for a, b in pairs], np.int64).reshape(-1, 2)
+
+
+def _pairs(rows: NDArray[np.int64], nodes: Sequence[NodeId]) -> list[Pair]:
+    return [(nodes[a], nodes[b]) for a, b in rows.tolist()]
+
+
+def _text(words: Any) -> NDArray[np.uint8]:
+    return np.frombuffer(json.dumps(words).encode(), np.uint8)
+
+
+def _words(part: NDArray[Any]) -> Any:
+    return json.loads(part.tobytes())

@@ -1,0 +1,85 @@
+"""Keeps what comparing nodes has found on the disk beside the store."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.verification_cache import VerificationCache
+from mapweave.mapserver.merging.verification_cache_file import load, save
+
+log = logging.getLogger(__name__)
+
+SUFFIX = ".verdicts"
+"""Of the file, behind the store's name."""
+SHARE = 0.05
+"""Of the time that it may take to save."""
+WORTHWHILE = 0.02
+"""Share of the pairs that must be new before a running server saves them."""
+
+
+class VerificationCacheKeeper:
+    """Brings them back at the start, and saves them after merges. Only the merging thread may call it."""
+
+    def __init__(self, path: Path, fresh: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take note of where they lie.
+
+        Args:
+            path: of the store's file; they lie beside it.
+            fresh: the store is new: nobody need be told that nothing is known of its nodes.
+            clock: tells the time, s.
+        """
+        self._clock = clock
+        self._path = path.with_name(path.name + SUFFIX)
+        self._fresh = fresh
+        self._saved: tuple[int, int] = (0, 0)
+        self._rest_until = 0.0
+
+    def restore(self, merger: Merger) -> None:
+        """Let a merger that begins have what is known, if the file is there and sound."""
+        began = self._clock()
+        try:
+            findings = load(self._path, _made_by(merger))
+        except InvalidFile as error:
+            if self._path.exists() or not self._fresh:
+                log.info("nodes are compared anew: %s", error)
+            findings = VerificationCache()
+        else:
+            log.info(
+                "%d nodes were compared with each other before, %d pairs; %.1f s",
+                len(findings.prints), len(findings), self._clock() - began,
+            )  # fmt: skip
+        merger.recollect(findings)
+        self._saved = len(findings.prints), len(findings)
+
+    def save(self, merger: Merger, last: bool = False) -> None:
+        """Save them, if that is worth while.
+
+        Args:
+            merger: has compared nodes.
+            last: nobody asks again: whatever is new is worth it.
+        """
+        if merger.recollecting:
+            return  # The file knows more than this process yet.
+        now, least = merger.compared, 0.0 if last else WORTHWHILE
+        new = max(abs(one - before) for one, before in zip(now, self._saved, strict=True))
+        if not new or new < least * max(now) or (self._clock() < self._rest_until and not last):
+            return
+        began = self._clock()
+        try:
+            save(self._path, merger.findings(), _made_by(merger))
+        except InvalidFile as error:
+            log.warning("%s; the next start takes longer", error)
+            return
+        self._saved = now
+        self._rest_until = self._clock() + (self._clock() - began) / SHARE
+
+
+def _made_by(merger: Merger) -> str:
+    settings = merger.settings
+    return f"{version('mapweave')} {settings.candidates} {settings.verification} {settings.merging}"

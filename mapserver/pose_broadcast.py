@@ -1,0 +1,161 @@
+"""Tells each agent where its nodes lie in the merged map, when that has changed noticeably.
+
+An agent's own map stays as it is: its nodes keep their poses, and routes come as answers. What it is told
+here it keeps beside its map.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.mapserver.services import guarded
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.wire.bus import Bus, Request
+from mapweave.wire.keys import Keys
+from mapweave.wire.pose_messages import MergedPose, PoseNews
+
+
+@dataclass(frozen=True)
+class PoseBroadcastSettings:
+    """What is worth telling, and how often.
+
+    Attributes:
+        distance: a node that lies less far from where its agent was told that it lies is not told anew, m;
+        turn: and is turned by less, rad.
+        every: s between two news of one agent, at least.
+        beat: s after which it is told the number of the last news again, so that lost ones are missed.
+        most: nodes in one message.
+    """
+
+    distance: float = 0.05
+    turn: float = math.radians(1.0)
+    every: float = 2.0
+    beat: float = 15.0
+    most: int = 2048
+
+
+@dataclass
+class _Told:
+    """What one agent was told."""
+
+    places: dict[NodeId, MergedPose] = field(default_factory=dict)
+    sequence: int = 0
+    last: float = -math.inf
+
+
+class PoseBroadcast:
+    """Publishes news when it is bidden to, and gives all that it has told to whoever asks."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: Keys,
+        name: str,
+        settings: PoseBroadcastSettings | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin to answer.
+
+        Args:
+            bus: the connection; stays the caller's.
+            keys: of the fleet.
+            name: of the server in the fleet.
+            settings: what is worth telling.
+            clock: only grows, s.
+        """
+        self._clock = clock
+        self._bus, self._keys, self._name = bus, keys, name
+        self._settings = settings or PoseBroadcastSettings()
+        self._run = secrets.randbits(64)
+        self._lock = threading.Lock()
+        self._told: dict[str, _Told] = {}
+        self._graphs: tuple[PoseGraph, ...] = ()
+        self._looked = -math.inf
+        self._serving = bus.serve(keys.all_poses(name), self._answer)
+
+    def close(self) -> None:
+        """Stop answering."""
+        self._serving.close()
+
+    def tell(self, merged: MergedMap, now: float | None = None) -> None:
+        """Tell what has changed since it was told, if it is time.
+
+        Args:
+            merged: the newest merged map.
+            now: monotonic, s.
+        """
+        now = self._clock() if now is None else now
+        if now - self._looked < self._settings.every:
+            return
+        self._looked = now
+        with self._lock:
+            if merged.graphs != self._graphs:
+                self._tell_news(merged, now)
+            for agent, told in self._told.items():
+                if now - told.last >= self._settings.beat:
+                    self._send(agent, PoseNews(self._run, told.sequence, told.sequence), now)
+
+    def _tell_news(self, merged: MergedMap, now: float) -> None:
+        known, there = set(map(id, self._graphs)), set(map(id, merged.graphs))
+        gone = [
+            node
+            for graph in self._graphs
+            if id(graph) not in there
+            for node in graph.nodes
+            if node not in merged.poses
+        ]
+        moved = self._moved(graph for graph in merged.graphs if id(graph) not in known)
+        self._graphs = merged.graphs
+        news: dict[str, tuple[dict[NodeId, MergedPose], list[NodeId]]] = {}
+        for node, place in moved:
+            news.setdefault(node.agent, ({}, []))[0][node] = place
+        for node in gone:
+            news.setdefault(node.agent, ({}, []))[1].append(node)
+        for agent, (places, lost) in sorted(news.items()):
+            told = self._told.setdefault(agent, _Told())
+            rest, left = iter(places.items()), iter(lost)
+            while True:
+                some = dict(islice(rest, self._settings.most))
+                less = tuple(islice(left, self._settings.most))
+                if not some and not less:
+                    break
+                told.sequence += 1
+                told.places |= some
+                for node in less:
+                    told.places.pop(node, None)
+                self._send(agent, PoseNews(self._run, told.sequence - 1, told.sequence, some, less), now)
+
+    def _moved(self, graphs: Iterable[PoseGraph]) -> Iterator[tuple[NodeId, MergedPose]]:
+        """Nodes that lie noticeably elsewhere than where their agents were told that they lie."""
+        s, nobody = self._settings, _Told()
+        for graph in graphs:
+            for node, (x, y, heading) in zip(graph.nodes, graph.means.tolist(), strict=True):
+                before = self._told.get(node.agent, nobody).places.get(node)
+                if before is not None and before.frame == graph.anchor:
+                    pose = before.merged_from_node
+                    near = math.hypot(x - pose.x, y - pose.y) <= s.distance
+                    if near and abs(wrap_angle(heading - pose.heading)) <= s.turn:
+                        continue
+                yield node, MergedPose(graph.anchor, Pose2(x, y, heading))
+
+    def _send(self, agent: str, news: PoseNews, now: float) -> None:
+        self._told[agent].last = now
+        self._bus.publish(self._keys.poses(self._name, agent), news.encode(agent))
+
+    def _answer(self, request: Request) -> None:
+        guarded(lambda _: self._whole(request.key))(request)
+
+    def _whole(self, key: str) -> bytes:
+        _, agent = self._keys.parse_poses(key)
+        with self._lock:
+            told = self._told.get(agent, _Told())
+            return PoseNews(self._run, 0, told.sequence, dict(told.places)).encode(agent)

@@ -1,0 +1,156 @@
+"""Places that were recognised in one view: what says so, how sure it is, and estimates put together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.relocalization.calibration import HypothesisSupport
+from mapweave.registration.recognition import Recognition
+
+THING_SIGMA = 0.35
+"""Largest standard deviation of the landmarks on one thing, seen from above, m: of a table of 1.2 m."""
+BESIDE = 0.35
+"""What is farther from all landmarks on a thing is not of it, m."""
+MISSING_BY_CHANCE = 0.05
+HIDDEN_WIDTH, HIDDEN_AGREEING, HIDDEN_FEATURES = 0.4, 0.1, 3
+"""A person before the camera hides at most this share of an image's width, from top to bottom: at most this
+share of what agrees is seen there, and at least so many features of his own."""
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMatch:
+    """A node that was recognised in the view.
+
+    Attributes:
+        node: which.
+        recognition: how.
+        alike: the node that it looks like, if that one was recognised in the view and this one in that one.
+        lonely: it rests on one thing, and nothing is seen of what should be seen beside that.
+    """
+
+    node: NodeId
+    recognition: Recognition
+    alike: NodeId | None = None
+    lonely: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceHypothesis:
+    """Sightings that agree on one pose, best first.
+
+    Attributes:
+        sightings: of one place.
+        best_from_robot: pose in the first one's frame, combined.
+        features: of the view that they explain together.
+        nodes_around: another place, that tell of this one by what they look like; 0 if it was recognised.
+    """
+
+    sightings: list[NodeMatch]
+    best_from_robot: PoseGaussian
+    features: frozenset[int]
+    nodes_around: int = 0
+
+    @property
+    def best(self) -> NodeMatch:
+        """The one of most landmarks."""
+        return self.sightings[0]
+
+    @property
+    def is_double(self) -> bool:
+        """Whether it looks like a place that was recognised."""
+        return any(one.alike is not None for one in self.sightings)
+
+
+def is_lonely(node: Node, view: View, found: Recognition) -> bool:
+    """Whether a recognition rests on one thing, and nothing is seen of what should be seen beside it.
+
+    A thing can be moved, and takes all that is told from it along. Landmarks away from it, of which each
+    would be seen as often as those on it are, are then missing. What one person may hide is not.
+
+    Args:
+        node: the place.
+        view: the image's features.
+        found: that the view shows the place.
+    """
+    points = node.landmarks.points_in_robot(node.camera)
+    agreeing = np.zeros(len(points), np.bool_)
+    agreeing[found.pairs[:, 0]] = True
+    on_it = points[agreeing & np.isfinite(points[:, 0])]
+    if len(on_it) < 3 or extent(on_it) > THING_SIGMA:
+        return False
+    there = found.node_from_robot.mean.inverse().apply(points)
+    pixels = view.camera.project(there)
+    expected = view.camera.contains(pixels) & ~agreeing
+    away = np.linalg.norm(points[expected][:, None] - on_it[None], axis=2).min(axis=1) > BESIDE
+    missing = pixels[expected][away]
+    seen = min(found.evidence["seen"], 0.9)
+    count = len(missing) - hidden(missing[:, 0], view, found)
+    return count * math.log(1.0 - seen) < math.log(MISSING_BY_CHANCE)
+
+
+def hidden(missing: Array, view: View, found: Recognition) -> int:
+    """How many landmarks one person who stands in the view may hide, at most.
+
+    Args:
+        missing: (M,) px, how far to the right they should be seen.
+        view: the image's features.
+        found: that the view shows the place.
+    """
+    agreeing = np.zeros(len(view), np.bool_)
+    agreeing[found.pairs[:, 1]] = True
+    starts = missing[:, None]
+    ends = starts + HIDDEN_WIDTH * view.camera.width
+
+    def inside(across: Array) -> NDArray[np.int64]:
+        return np.asarray(((across >= starts) & (across <= ends)).sum(axis=1), np.int64)
+
+    own, others = inside(view.pixels[agreeing, 0]), inside(view.pixels[~agreeing, 0])
+    possible = (own <= HIDDEN_AGREEING * agreeing.sum()) & (others >= HIDDEN_FEATURES)
+    return int(inside(missing)[possible].max(initial=0))
+
+
+def extent(points: Array) -> float:
+    """m, largest standard deviation of (K, 3) points seen from above."""
+    if len(points) < 2:
+        return 0.0
+    return math.sqrt(max(float(np.linalg.eigvalsh(np.cov(points[:, :2].T))[-1]), 0.0))
+
+
+def supported(places: Sequence[PlaceHypothesis]) -> list[HypothesisSupport]:
+    """What speaks for each of the places that were recognised in one view."""
+    found = []
+    for place in places:
+        one = place.best.recognition
+        others = max((len(other.features) for other in places if other is not place), default=0)
+        share, against = one.inliers / max(one.usable, 1), others / len(place.features)
+        found.append(
+            HypothesisSupport(one.inliers, share, one.evidence["seen"], len(place.sightings), against)
+        )
+    return found
+
+
+def fuse(first: PoseGaussian, second: PoseGaussian) -> PoseGaussian:
+    """Combine two estimates of one pose whose errors may have anything in common.
+
+    Covariance intersection (Julier and Uhlmann 1997) with the weight that gives the smallest trace: the same
+    view and often the same landmarks are behind both, so adding their information would count them twice.
+    """
+    difference = (first.mean.inverse() @ second.mean).vector
+    information = [np.linalg.inv(one.covariance + 1e-12 * np.eye(3)) for one in (first, second)]
+    best: tuple[float, float] = (math.inf, 0.0)
+    for weight in np.linspace(0.0, 1.0, 11):
+        together = np.linalg.inv((1 - weight) * information[0] + weight * information[1])
+        best = min(best, (float(together.trace()), float(weight)))
+    weight = best[1]
+    covariance = np.linalg.inv((1 - weight) * information[0] + weight * information[1])
+    step = covariance @ (weight * information[1] @ difference)
+    mean = first.mean @ type(first.mean).from_vector(step)
+    return PoseGaussian(mean, 0.5 * (covariance + covariance.T))

@@ -1,0 +1,251 @@
+"""The nearest of all landmarks of the fleet: one by one while they are few, by cells that grow when many.
+
+Cells are learned anew as landmarks come; until new ones are ready the old ones serve, with all that has come.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import faiss
+import numpy as np
+
+from mapweave.hybridmap.descriptor import decode, quantise
+from mapweave.hybridmap.landmark_tables import DIMENSIONS
+from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantizer, Codes, Ids, Vectors
+from mapweave.mapserver.retrieval.inverted_file import Block, InvertedFile
+
+log = logging.getLogger(__name__)
+
+MOST_WITHIN = 256
+"""Landmarks that are told as alike to one: where thousands are all alike, pairs of them grow by the square.
+While `within` works there are about 200 nodes, and each shows a thing once."""
+AT_ONCE = 1 << 19
+"""Landmarks that are copied at once when new cells are filled from old ones."""
+
+
+@dataclass(frozen=True)
+class LandmarkIndexSettings:
+    """How landmarks are found.
+
+    Attributes:
+        small: up to as many every one is compared; beyond, those of some cells.
+        exact: up to as many `within` works.
+        growth: cells are learned anew when there are so many times as many landmarks.
+        fill: landmarks in a cell when it is learned, on average.
+        most_cells: with as many, cells are not learned again: filling new ones takes the memory twice. These
+            are learned at 40 million landmarks, where twice is still less than a million nodes take once.
+        probes: cells that are searched for a feature of a view.
+        patience: landmarks beyond which cells are learned beside the questions, not between them.
+    """
+
+    small: int = 10_000
+    exact: int = 30_000
+    growth: float = 4.0
+    fill: int = 100
+    most_cells: int = 1 << 18
+    probes: int = 8
+    patience: int = 1_000_000
+
+
+class AddedRows(NamedTuple):
+    """Landmarks that came while cells were learned."""
+
+    codes: Codes
+    ids: Ids
+
+
+class RemovedRows(NamedTuple):
+    """Ids that went while cells were learned, the last one left out, and their codes if they are known."""
+
+    first: int
+    last: int
+    codes: Codes | None
+
+
+class LandmarkIndex:
+    """Codes with ids. Ids rise: what comes later has greater ones.
+
+    Attributes:
+        lock: of all that is in it; may be taken again by who holds it.
+    """
+
+    def __init__(self, settings: LandmarkIndexSettings | None = None) -> None:
+        """Start empty."""
+        self.lock = threading.RLock()
+        self._settings = settings or LandmarkIndexSettings()
+        self._flat: Any = faiss.IndexIDMap2(faiss.IndexFlatL2(DIMENSIONS))
+        self._cells: InvertedFile | None = None
+        self._learned = 0
+        self._learner: threading.Thread | None = None
+        self._missed: list[AddedRows | RemovedRows] = []
+        self._end = 0
+
+    def __len__(self) -> int:
+        """How many landmarks."""
+        return len(self._cells) if self._cells is not None else int(self._flat.ntotal)
+
+    @property
+    def means(self) -> CoarseQuantizer | None:
+        """What the cells are about; None as long as there are none."""
+        return None if self._cells is None else self._cells.means
+
+    def add(self, codes: Codes, ids: Ids) -> None:
+        """Take in (N, 32) codes with (N,) ids."""
+        if not len(codes):
+            return
+        with self.lock:
+            self._end = int(ids[-1]) + 1
+            if self._learner is not None:
+                self._missed.append(AddedRows(codes, ids))
+            if self._cells is not None:
+                self._cells.add(codes, ids)
+            if self._flat is not None:
+                self._flat.add_with_ids(decode(codes), ids)
+            self._grow()
+
+    def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
+        """Forget the ids from first to last, that one left out; quickly, if all their codes are known."""
+        with self.lock:
+            if self._learner is not None:
+                self._missed.append(RemovedRows(first, last, codes))
+            if self._flat is not None:
+                self._flat.remove_ids(faiss.IDSelectorRange(first, last))
+            if self._cells is not None:
+                self._cells.remove(first, last, codes)
+
+    def nearest(self, codes: Codes, k: int) -> tuple[Vectors, Ids]:
+        """(N, k) squared distances and ids of the nearest landmarks, nearest first; id -1 is none."""
+        with self.lock:
+            k = max(min(k, len(self)), 1)
+            if self._cells is not None:
+                return self._cells.nearest(codes, k, self._settings.probes)
+            squared, ids = self._flat.search(decode(codes), k)
+            return squared, ids
+
+    def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids] | None:
+        """(M,) row of the code, squared distance and id of the `MOST_WITHIN` nearest landmarks within reach.
+
+        Returns:
+            None if there are too many landmarks for that.
+        """
+        with self.lock:
+            if self._flat is None:
+                return None
+            # Where there are fewer, the rest of a row has the greatest distance there is.
+            squared, ids = self._flat.search(decode(codes), MOST_WITHIN)
+        rows, places = np.nonzero(squared < reach**2)
+        return rows.astype(np.int64), squared[rows, places], ids[rows, places]
+
+    def keep_up(self) -> None:
+        """Wait for cells that are being learned if too much has come meanwhile: it is kept twice."""
+        with self.lock:
+            missed = sum(len(one.ids) for one in self._missed if isinstance(one, AddedRows))
+        if missed > self._settings.patience:
+            self.settle()
+
+    def settle(self) -> None:
+        """Wait until cells that are being learned are in use."""
+        learner = self._learner
+        if learner is not None:
+            learner.join()
+
+    def blocks(self, size: int = AT_ONCE) -> Iterator[Block]:
+        """Landmarks by cells, about `size` at once, as they are when their turn comes; without cells, all."""
+        return self.contents(size)[1]
+
+    def contents(self, size: int = AT_ONCE) -> tuple[CoarseQuantizer | None, Iterator[Block]]:
+        """What the cells are about, None without cells, and the landmarks in just these, see `blocks`."""
+        with self.lock:
+            blocks = iter([self._everything()]) if self._cells is None else self._cells.blocks(size)
+            return self.means, self._in_turn(blocks)
+
+    def _in_turn(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        while True:
+            with self.lock:
+                block = next(blocks, None)
+            if block is None:
+                return
+            yield block
+
+    def restore(self, means: CoarseQuantizer, blocks: Iterator[Block]) -> None:
+        """Hold these, in these cells. Only an empty index can do that."""
+        cells, end = InvertedFile(means), 0
+        for block in blocks:
+            cells.put(block)
+            end = max(end, int(block.ids.max(initial=-1)) + 1)
+        with self.lock:
+            if len(cells) <= self._settings.exact:
+                for block in cells.blocks(AT_ONCE):
+                    self._flat.add_with_ids(decode(block.codes), block.ids)
+            self._learned, self._end = len(cells), end
+            self._swap(cells)
+
+    def _grow(self) -> None:
+        """Learn cells if there are many more landmarks than when it was last done."""
+        s, n = self._settings, len(self)
+        few = self._cells is None or len(self._cells.means) < s.most_cells
+        if n <= s.small or n < s.growth * self._learned or self._learner is not None or not few:
+            return
+        self._learned, self._missed = n, []
+        if n <= s.patience:
+            self._swap(self._new(n, self._end))
+            return
+        self._learner = threading.Thread(target=self._learn, args=(n, self._end), name="cells", daemon=True)
+        self._learner.start()
+
+    def _learn(self, n: int, end: int) -> None:
+        """In a thread of its own: make new cells, catch up with what came meanwhile, and hand over."""
+        try:
+            cells = self._new(n, end)
+            while True:
+                with self.lock:
+                    missed, self._missed = self._missed, []
+                    if not missed:
+                        self._swap(cells)
+                        self._learner = None
+                        return
+                _catch_up(cells, missed)
+        except Exception:  # the old cells go on serving, more slowly
+            log.exception("the place index could not be made faster")
+            with self.lock:
+                self._learner, self._missed = None, []
+
+    def _new(self, n: int, end: int) -> InvertedFile:
+        """Cells for the landmarks below an id, which are n; what has come since is among what was missed."""
+        s = self._settings
+        count = min(max(2 ** round(math.log2(n / s.fill)), 16), s.most_cells)
+        step = max(n // (SAMPLE * count), 1)
+        # A part of a block would keep the whole of it.
+        sample = np.concatenate([block.codes[::step].copy() for block in self.blocks()])
+        cells = InvertedFile(CoarseQuantizer.learn(sample, count))
+        for block in self.blocks():
+            old = block.ids < end
+            cells.add(block.codes[old], block.ids[old])
+        return cells
+
+    def _swap(self, cells: InvertedFile) -> None:
+        """Use new cells."""
+        self._cells = cells
+        if len(cells) > self._settings.exact:
+            self._flat = None
+
+    def _everything(self) -> Block:
+        """All that is in the flat index, in the order of the ids."""
+        ids = faiss.vector_to_array(self._flat.id_map)
+        order = np.argsort(ids, kind="stable")
+        codes = quantise(self._flat.index.reconstruct_n(0, len(ids))[order])
+        return Block(codes, ids[order], np.zeros(len(ids), np.int64))
+
+
+def _catch_up(cells: InvertedFile, missed: list[AddedRows | RemovedRows]) -> None:
+    for one in missed:
+        if isinstance(one, AddedRows):
+            cells.add(one.codes, one.ids)
+        else:
+            cells.remove(one.first, one.last, one.codes)

@@ -1,0 +1,276 @@
+"""Which nodes look like a view: a growing index over the descriptors of all landmarks of the fleet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.node import CODE_BYTES, Node, NodeId
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.retrieval import voting
+from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
+from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
+from mapweave.merge.pose_graph.candidates import CandidateSettings
+
+SLOT_BITS = 16
+"""A landmark's id in the index: its node's slot, then its number in the node."""
+FEW_GONE = 20
+"""Of more nodes that go at once, the index is read through once for where they lie."""
+MOST_LANDMARKS = 400
+"""Of a node with more the first ones are compared, see `bounded`: a robot's nodes have up to 150."""
+AT_ONCE = 1024
+"""Nodes that are taken in at once."""
+
+
+@dataclass(frozen=True)
+class PlaceIndexSettings:
+    """How places are found.
+
+    Attributes:
+        candidates: what counts as alike and how much overlap is worth noting.
+        landmarks: how landmarks are found.
+        votes: descriptors of the fleet that each feature of a view votes for.
+        reach: distance of two decoded descriptors at which a vote counts nothing.
+        compared: nodes of a large fleet that are compared with one whose overlaps are wanted.
+    """
+
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    landmarks: LandmarkIndexSettings = field(default_factory=LandmarkIndexSettings)
+    votes: int = 16
+    reach: float = 0.6
+    compared: int = 64
+
+
+def bounded(node: Node) -> Node:
+    """A node with at most `MOST_LANDMARKS`, the very same one if it has no more.
+
+    Two nodes take as much time to compare as the product of their landmarks.
+    """
+    if len(node.landmarks) <= MOST_LANDMARKS:
+        return node
+    return replace(node, landmarks=node.landmarks.take(np.arange(MOST_LANDMARKS)))
+
+
+class PlaceIndex:
+    """Nodes by the looks of their landmarks. A node is searchable as soon as it is added.
+
+    One thread may fill it while others search. It is locked for a search, or for a few nodes that come.
+    """
+
+    def __init__(self, settings: PlaceIndexSettings | None = None) -> None:
+        """Start empty."""
+        self._settings = settings or PlaceIndexSettings()
+        self._landmarks = LandmarkIndex(self._settings.landmarks)
+        self._lock = self._landmarks.lock
+        self._slots: dict[NodeId, int] = {}
+        self._nodes: dict[int, NodeId] = {}
+        self._prints: dict[int, int] = {}
+        self._next = 0
+
+    def __len__(self) -> int:
+        """How many nodes."""
+        return len(self._slots)
+
+    def __contains__(self, node_id: NodeId) -> bool:
+        """Whether a node is in the index."""
+        return node_id in self._slots
+
+    @property
+    def settings(self) -> PlaceIndexSettings:
+        """How places are found."""
+        return self._settings
+
+    @property
+    def landmarks(self) -> LandmarkIndex:
+        """What the nodes' landmarks are in; their ids are slot << SLOT_BITS, plus their number."""
+        return self._landmarks
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Something else whenever a node has come, gone or changed its looks."""
+        with self._lock:
+            return self._next, len(self._slots)
+
+    @property
+    def slots(self) -> Mapping[NodeId, int]:
+        """Where each node's landmarks are: a copy."""
+        with self._lock:
+            return dict(self._slots)
+
+    def add(self, node: Node) -> None:
+        """Add a node, or replace it."""
+        self.extend([node])
+
+    def extend(self, nodes: Iterable[Node]) -> None:
+        """Add nodes, or replace them; many at once cost less than one by one.
+
+        A node that is there with the very same descriptors costs next to nothing.
+        """
+        rest = iter(nodes)
+        while some := list(islice(rest, AT_ONCE)):
+            self._landmarks.keep_up()
+            with self._lock:
+                self._take(some)
+
+    def remove(self, node_id: NodeId, codes: NDArray[np.uint8] | None = None) -> None:
+        """Forget a node. One that is not there is no error.
+
+        Args:
+            node_id: which.
+            codes: (N, 32) of its landmarks, if they are known: they say where in the index it is.
+        """
+        with self._lock:
+            slot = self._slots.pop(node_id, None)
+            if slot is not None:
+                seal = self._prints.pop(slot)
+                del self._nodes[slot]
+                # Others than those that are there would leave some behind.
+                codes = None if codes is None else codes[:MOST_LANDMARKS]
+                codes = codes if codes is not None and fingerprint(codes) == seal else None
+                self._landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS, codes)
+
+    def retain(self, node_ids: Collection[NodeId]) -> int:
+        """Forget all nodes but these, and say how many they were."""
+        kept = frozenset(node_ids)
+        gone = {slot: node_id for node_id, slot in self.slots.items() if node_id not in kept}
+        codes = self._codes_of(gone) if len(gone) > FEW_GONE else {}
+        for slot, node_id in gone.items():
+            self.remove(node_id, codes.get(slot))
+        return len(gone)
+
+    def _codes_of(self, slots: Collection[int]) -> dict[int, NDArray[np.uint8]]:
+        """The descriptors of some nodes, by their slots: read out of the index in one pass."""
+        wanted = np.zeros(max(slots) + 2, np.bool_)
+        wanted[list(slots)] = True
+        ids, codes = [np.zeros(0, np.int64)], [np.zeros((0, CODE_BYTES), np.uint8)]
+        for block in self._landmarks.blocks():
+            chosen = wanted[np.minimum(block.ids >> SLOT_BITS, len(wanted) - 1)]
+            ids.append(block.ids[chosen])
+            codes.append(block.codes[chosen])
+        found = np.concatenate(ids)
+        order = np.argsort(found)
+        slot = found[order] >> SLOT_BITS
+        parts = np.split(np.concatenate(codes)[order], np.flatnonzero(np.diff(slot)) + 1)
+        return dict(zip(np.unique(slot).tolist(), parts, strict=False))
+
+    def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
+        """Rank nodes by how much they look like a view, see mapweave.mapserver.retrieval.voting.votes.
+
+        Args:
+            view: the image's features.
+            k: nodes wanted at most.
+            exclude: nodes that are not wanted.
+
+        Returns:
+            Nodes with a positive score, best first.
+        """
+        return self._ranked(view.codes, k, exclude)
+
+    def _ranked(
+        self, codes: NDArray[np.uint8], k: int, exclude: Collection[NodeId]
+    ) -> list[tuple[NodeId, float]]:
+        with self._lock:
+            if len(codes) == 0 or len(self._landmarks) == 0:
+                return []
+            squared, ids = self._landmarks.nearest(codes, self._settings.votes)
+            # -1 is nobody's, shifted too.
+            found, scores = voting.votes(squared, ids >> SLOT_BITS, self._settings.reach)
+            if len(exclude):
+                unwanted = [self._slots[node_id] for node_id in exclude if node_id in self._slots]
+                found, scores = found[wanted := ~np.isin(found, unwanted)], scores[wanted]
+            if not len(scores):
+                return []
+            best = np.flatnonzero(scores >= np.sort(scores)[-min(k, len(scores))])
+            ranked = [(self._nodes[int(found[i])], float(scores[i])) for i in best]
+        return sorted(ranked, key=lambda item: (-item[1], item[0]))[:k]
+
+    def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
+        """Which nodes share how many alike descriptors with a node, see mapweave.merge.pose_graph.candidates.
+
+        Every overlap is exact. Up to `exact` landmarks all nodes are compared; of a larger fleet those that
+        most landmarks vote for, see `query`.
+
+        Args:
+            node: may be in the index itself; it does not overlap with itself.
+            node_of: gives another node by its id; one that it does not give is left out.
+
+        Returns:
+            Overlaps of at least `least_overlap`.
+        """
+        s, node = self._settings.candidates, bounded(node)
+        if len(node.landmarks) == 0 or len(self._landmarks) == 0:
+            return {}
+        with self._lock:
+            alike = self._landmarks.within(node.landmarks.codes, s.alike)
+            if alike is not None:
+                rows, squared, ids = alike
+                columns, slots = ids & ((1 << SLOT_BITS) - 1), ids >> SLOT_BITS
+                found, values = voting.overlaps(rows, columns, squared, slots, s.alike, s.least_overlap)
+                told = zip(found.tolist(), values.tolist(), strict=True)
+                others = {self._nodes[slot]: value for slot, value in told}
+        if alike is None:
+            return self._voted(node, node_of)
+        others.pop(node.id, None)
+        return others
+
+    def _voted(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
+        s, codes = self._settings, node.landmarks.codes
+        told: dict[NodeId, float] = {}
+        for other_id, _ in self._ranked(codes, s.compared, [node.id]):
+            other = node_of(other_id)
+            if other is not None:
+                others = bounded(other).landmarks.codes
+                told[other_id] = voting.pair_overlap(codes, others, s.candidates.alike)
+        return {other: value for other, value in told.items() if value >= s.candidates.least_overlap}
+
+    def settle(self) -> None:
+        """Wait until cells that are being learned are in use."""
+        self._landmarks.settle()
+
+    def adopt(self, slots: Mapping[NodeId, int], landmarks: LandmarkIndex) -> None:
+        """Take the place of an empty index by what was kept of another; its nodes may yet be replaced.
+
+        Args:
+            slots: where each node's landmarks are. Landmarks of no node are forgotten.
+            landmarks: filled, with the ids of those slots.
+        """
+        ours = np.zeros(max(slots.values(), default=-1) + 2, np.bool_)
+        ours[np.fromiter(slots.values(), np.int64, len(slots))] = True
+        prints, strays = np.zeros(len(ours), np.uint64), set[int]()
+        for block in landmarks.blocks():
+            # The last one is nobody's.
+            slot = np.minimum(block.ids >> SLOT_BITS, len(ours) - 1)
+            np.add.at(prints, slot, landmark_prints(block.codes, block.ids & ((1 << SLOT_BITS) - 1)))
+            strays.update((block.ids[~ours[slot]] >> SLOT_BITS).tolist())
+        for stray in sorted(strays):
+            landmarks.remove(stray << SLOT_BITS, (stray + 1) << SLOT_BITS)
+        self._landmarks, self._lock = landmarks, landmarks.lock
+        self._slots = dict(slots)
+        self._nodes = {slot: node_id for node_id, slot in slots.items()}
+        self._prints = {slot: int(prints[slot]) for slot in self._nodes}
+        self._next = max(self._nodes, default=-1) + 1
+
+    def _take(self, nodes: list[Node]) -> None:
+        """Take in nodes at once."""
+        codes, ids = [np.zeros((0, CODE_BYTES), np.uint8)], [np.zeros(0, np.int64)]
+        for node in map(bounded, nodes):
+            known, seal = self._slots.get(node.id), fingerprint(node.landmarks.codes)
+            if known is not None:
+                if self._prints[known] == seal:
+                    continue
+                self._put(codes, ids)
+                self.remove(node.id)
+            slot, self._next = self._next, self._next + 1
+            self._slots[node.id], self._nodes[slot], self._prints[slot] = slot, node.id, seal
+            codes.append(node.landmarks.codes)
+            ids.append((np.int64(slot) << SLOT_BITS) + np.arange(len(node.landmarks), dtype=np.int64))
+        self._put(codes, ids)
+
+    def _put(self, codes: list[NDArray[np.uint8]], ids: list[NDArray[np.int64]]) -> None:
+        """Take in what was collected, and empty the lists."""
+        self._landmarks.add(np.concatenate(codes), np.concatenate(ids))
+        del codes[1:], ids[1:]

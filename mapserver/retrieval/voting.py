@@ -1,0 +1,89 @@
+"""From landmarks that are alike to nodes that are: the votes for a view, and the overlaps of a node."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.landmark_tables import landmark_tables
+from mapweave.merge.pose_graph.candidates import overlap
+from mapweave.registration.matching import squared_distances
+
+Whole = NDArray[np.int64]
+Real = NDArray[np.float64]
+
+
+def votes(squared: NDArray[np.float32], slots: Whole, reach: float) -> tuple[Whole, Real]:
+    """What the features of a view say together.
+
+    Each feature votes for the nodes of its nearest descriptors, by nearness and once a node. What it has to
+    give is divided by the root of the number of nodes it votes for, as rare words weigh more in a text; a
+    feature that half the fleet sees says little about where it is.
+
+    Args:
+        squared: (N, k) squared distances of N features' nearest landmarks, nearest first.
+        slots: (N, k) whose landmarks they are; below 0 is nobody's.
+        reach: distance at which a vote counts nothing.
+
+    Returns:
+        (M,) slots, rising, and (M,) scores above 0.
+    """
+    weights = np.where(slots >= 0, 1.0 - squared.astype(np.float64) / reach**2, 0.0)
+    feature, place = np.nonzero(weights > 0)
+    whose = slots[feature, place]
+    # The nearest descriptor comes first, so the first vote of a feature for a node is its best.
+    _, first = np.unique(feature * (whose.max(initial=0) + 1) + whose, return_index=True)
+    feature, whose, given = feature[first], whose[first], weights[feature[first], place[first]]
+    given /= np.sqrt(np.bincount(feature, minlength=len(squared)))[feature]
+    found, which = np.unique(whose, return_inverse=True)
+    scores: NDArray[Any] = np.bincount(which, given, minlength=len(found))
+    return found, scores.astype(np.float64)
+
+
+def overlaps(
+    rows: Whole, columns: Whole, squared: NDArray[Any], slots: Whole, alike: float, least: float
+) -> tuple[Whole, Real]:
+    """How many landmarks a node seems to share with each of many others, see
+    mapweave.merge.pose_graph.candidates.overlap.
+
+    Args:
+        rows: (K,) landmark of the node.
+        columns: (K,) landmark of the other that is alike.
+        squared: (K,) squared distances, all below alike^2.
+        slots: (K,) which other.
+        alike: distance at which a pair counts nothing.
+        least: overlap from which on it is told.
+
+    Returns:
+        (M,) slots, rising, and (M,) overlaps of at least `least`.
+    """
+    found, which, hits = np.unique(slots, return_inverse=True, return_counts=True)
+    # A node with fewer hits than the least overlap cannot reach it.
+    enough = hits[which] >= least
+    rows, columns, which = rows[enough], columns[enough], which[enough]
+    weights = 1.0 - np.asarray(squared[enough], np.float64) / alike**2
+    sums = np.minimum(*(_best(which, side, weights, len(found)) for side in (rows, columns)))
+    told = np.flatnonzero(sums >= least)
+    return found[told], sums[told]
+
+
+def pair_overlap(codes: NDArray[np.uint8], others: NDArray[np.uint8], alike: float) -> float:
+    """The same of two nodes' (N, 32) and (M, 32) codes, all compared with all."""
+    squared = squared_distances(codes.astype(np.float32), others.astype(np.float32))
+    squared *= np.float32(landmark_tables().step ** 2)
+    rows, columns = np.nonzero(squared < alike**2)
+    return overlap(rows, columns, squared[rows, columns], alike)
+
+
+def _best(which: Whole, side: Whole, weights: Real, count: int) -> Real:
+    """(count,) sums, over the landmarks of one side, of the best weight of each."""
+    if not len(which):
+        return np.zeros(count)
+    keys = which * (int(side.max()) + 1) + side
+    order = np.argsort(keys, kind="stable")
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(keys[order])) + 1])
+    best = np.maximum.reduceat(weights[order], starts)
+    sums: NDArray[Any] = np.bincount(which[order[starts]], best, minlength=count)
+    return sums.astype(np.float64)

@@ -1,0 +1,230 @@
+"""Pictures of maps: nodes, edges and links over a floor plan."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.sim.floorplan import FloorPlan
+from mapweave.storage.atomic_file import write_whole
+
+WIDTH = 12.0
+"""Of a picture, inches."""
+_PARTS = re.compile(r"[0-9]+|[^0-9]+")
+COLOURS = (
+    "#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0", "#b8860b", "#555555",
+    "#7fb3d5", "#f5b041", "#82c99a", "#c39bd3", "#6e2c00", "#0b5345", "#1a237e", "#9aa7b0",
+)  # fmt: skip
+
+
+def colours_of(robots: Iterable[str]) -> dict[str, str]:
+    """A colour like `#1f77b4` for each robot, the same in every picture and film: r2 comes before r10."""
+    ordered = sorted(
+        set(robots), key=lambda n: [(len(p), p) if p.isdigit() else (0, p) for p in _PARTS.findall(n)]
+    )
+    return {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(ordered)}
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A floor plan to draw under a map.
+
+    Attributes:
+        rooms: name and (N, 2) m corners.
+        solids: (N, 2) m corners of walls and furniture.
+    """
+
+    rooms: tuple[tuple[str, Array], ...] = ()
+    solids: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A drive of a robot that was put down somewhere, to draw over a map.
+
+    Attributes:
+        positions: (N, 2) m.
+        start: where it was put down.
+        goal: where it shall end, if it was sent anywhere.
+        label: for the legend.
+        robot: its name, written where it was put down.
+        begun: for the legend, what its start is.
+    """
+
+    positions: Array
+    start: Pose2
+    goal: Pose2 | None
+    label: str
+    robot: str = ""
+    begun: str = "put down here"
+
+
+@dataclass(frozen=True, eq=False)
+class MapPicture:
+    """What to draw; all in one frame.
+
+    Attributes:
+        title: above the picture.
+        poses: of each node.
+        edges: between nodes; those of kind MERGED are drawn as links between maps.
+        outline: floor plan, may be empty.
+        drives: of lost robots.
+        landmarks: (N, 2) m, points that nodes see.
+        starts: where each robot began.
+        false: links that are known to be false; they stand out.
+    """
+
+    title: str
+    poses: Mapping[NodeId, Pose2]
+    edges: Sequence[Edge]
+    outline: Outline = field(default_factory=Outline)
+    drives: Sequence[Drive] = ()
+    landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    starts: Mapping[str, Pose2] = field(default_factory=dict)
+    false: frozenset[EdgeId] = frozenset()
+
+
+def outline_of(plan: FloorPlan) -> Outline:
+    """The outline of a simulated building."""
+    rooms = tuple((r.name if not r.name.startswith("door") else "", r.corners) for r in plan.rooms)
+    return Outline(rooms, tuple(box.corners for box in (*plan.walls, *plan.furniture)))
+
+
+def draw_map(picture: MapPicture, path: Path) -> None:
+    """Write a PNG.
+
+    Args:
+        picture: what to draw.
+        path: where; its folder is made if need be.
+    """
+    # Matplotlib takes half a second to import and is an extra: only who draws pays for it.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, _height(picture)), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    _draw_outline(axes, picture.outline)
+    if len(picture.landmarks):
+        axes.plot(*picture.landmarks.T, ".", color="#999999", markersize=1.2, zorder=1, alpha=0.6)
+    colours = colours_of([*(n.agent for n in picture.poses), *picture.starts])
+    _draw_edges(axes, picture, colours)
+    _draw_nodes(axes, picture, colours)
+    _draw_starts(axes, picture.starts, colours)
+    _draw_drives(axes, picture.drives)
+    axes.set_aspect("equal")
+    _draw_scale(axes)
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+    axes.set_title(picture.title)
+    if axes.get_legend_handles_labels()[0]:
+        # Below the plan, wherever that ends: the layout makes room for what the figure owns.
+        figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = io.BytesIO()
+    figure.savefig(image, format="png")
+    write_whole(path, image.getvalue())
+
+
+def _height(picture: MapPicture) -> float:
+    """Of the figure, inches: as the building needs it, within reason."""
+    shown = [corners for _, corners in picture.outline.rooms] + list(picture.outline.solids)
+    shown.append(np.array([[p.x, p.y] for p in picture.poses.values()]).reshape(-1, 2))
+    points = np.concatenate(shown)
+    width, height = np.ptp(points, axis=0) if len(points) else (1.0, 1.0)
+    legend = 0.25 * math.ceil((len(picture.starts) + 6) / 6)
+    return float(np.clip(0.92 * WIDTH * height / max(width, 1e-6), 4.5, 12.0) + 1.0 + legend)
+
+
+def _draw_outline(axes: Any, outline: Outline) -> None:
+    for name, corners in outline.rooms:
+        axes.fill(*corners.T, color="#f6f3ec", zorder=0)
+        middle = corners.mean(axis=0)
+        axes.text(*middle, name, color="#b8b0a0", fontsize=13, ha="center", va="center", zorder=0.2)
+    for corners in outline.solids:
+        axes.fill(*corners.T, color="#cfc8ba", edgecolor="#a79f8f", linewidth=0.5, zorder=0.4)
+
+
+def _draw_scale(axes: Any) -> None:
+    """A bar of a round length at the lower right, within the picture."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    length = max((m for m in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if m < (right - left) / 6), default=0.1)
+    end, height = right - 0.02 * (right - left), bottom + 0.02 * (top - bottom)
+    # The bar must not make the picture larger.
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    axes.plot([end - length, end], [height, height], "-", color="#222222", linewidth=4, solid_capstyle="butt")
+    axes.annotate(
+        f"{length:g} m", (end - length, height), (-4, 0), textcoords="offset points", ha="right", va="center",
+        fontsize=9, color="#222222",
+    )  # fmt: skip
+
+
+def _draw_edges(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> None:
+    labelled = set()
+    for edge in picture.edges:
+        if edge.a not in picture.poses or edge.b not in picture.poses:
+            continue
+        a, b = picture.poses[edge.a], picture.poses[edge.b]
+        if edge.id in picture.false:
+            label, colour, width, alpha, order, style = "false link", "#000000", 2.2, 1.0, 4.5, ":"
+        elif edge.kind is EdgeKind.MERGED:
+            label, colour, width, alpha, order, style = "link between maps", "#e6007e", 1.6, 0.9, 4.0, "-"
+        elif edge.kind is EdgeKind.LOOP:
+            label, colour, width, alpha, order, style = "loop within a map", "#7a7a7a", 1.0, 0.6, 2.0, "-"
+        else:
+            label, colour, width, alpha, order, style = "", colours[edge.a.agent], 1.0, 0.6, 2.0, "-"
+        axes.plot(
+            [a.x, b.x], [a.y, b.y], style, color=colour, linewidth=width, alpha=alpha, zorder=order,
+            label=None if label in labelled else label or None,
+        )  # fmt: skip
+        labelled.add(label)
+
+
+def _draw_nodes(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> None:
+    for agent, colour in colours.items():
+        own = np.array([p.vector for n, p in picture.poses.items() if n.agent == agent])
+        if not len(own):
+            continue
+        axes.quiver(
+            own[:, 0], own[:, 1], np.cos(own[:, 2]), np.sin(own[:, 2]), color=colour,
+            angles=np.degrees(own[:, 2]), scale=42, width=0.0022, headwidth=4, zorder=3,
+        )  # fmt: skip
+        label = f"{agent}: {len(own)} nodes"
+        axes.plot(own[:, 0], own[:, 1], "o", color=colour, markersize=4, zorder=3, label=label)
+
+
+def _draw_starts(axes: Any, starts: Mapping[str, Pose2], colours: Mapping[str, str]) -> None:
+    for k, (robot, pose) in enumerate(starts.items()):
+        axes.plot(
+            pose.x, pose.y, "s", color=colours[robot], markersize=9, markeredgecolor="white", zorder=5,
+            label="start" if k == 0 else None,
+        )  # fmt: skip
+
+
+def _draw_drives(axes: Any, drives: Sequence[Drive]) -> None:
+    labelled = set()
+    for drive in drives:
+        axes.plot(*drive.positions.T, "--", color="black", linewidth=1.8, zorder=5, label=drive.label)
+        for pose, mark, label in ((drive.start, "X", drive.begun), (drive.goal, "*", "goal")):
+            if pose is None:
+                continue
+            axes.plot(
+                pose.x, pose.y, mark, color="black", markersize=14, markerfacecolor="gold", zorder=6,
+                label=None if label in labelled else label,
+            )  # fmt: skip
+            labelled.add(label)
+        if drive.robot:
+            axes.annotate(
+                drive.robot, (drive.start.x, drive.start.y), (9, 6), textcoords="offset points", fontsize=10,
+                fontweight="bold", zorder=7,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1},
+            )  # fmt: skip

@@ -1,0 +1,168 @@
+"""A drive with odometry: one robot of its splits.toml maps as it does when carried, the others ask."""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.mission import Carried
+from mapweave.agent.observation import RobotDescription
+from mapweave.agent.pipeline import Pipeline, PipelineSettings
+from mapweave.evaluation.verdict import LEVELS, Verdict
+from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.hybridmap.query import Certainty
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+
+REACH = 1.5
+"""A place counts as mapped if the mapping robot has been this near to it, m,"""
+TURN = math.radians(20.0)
+"""and looked into that direction, within this, rad."""
+NEAR = (LEVELS[-1][0], math.degrees(TURN))
+"""A node is the right place if it is that near, m and degrees."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Where the camera was.
+
+    Attributes:
+        stamps_ns: (N,) ascending.
+        poses: one each.
+    """
+
+    stamps_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
+    poses: list[Pose2]
+
+    @classmethod
+    def read(cls, path: Path) -> Truth:
+        """Read a truth.csv; one that is missing is empty.
+
+        Raises:
+            DeviceError: it is there, but wrong.
+        """
+        if not path.exists():
+            return cls(np.zeros(0, np.int64), [])
+        try:
+            with path.open(newline="") as file:
+                rows = [[float(row[name]) for name in COLUMNS] for row in csv.DictReader(file)]
+            poses = [Pose2(x, y, heading) for _, x, y, heading in rows]
+            stamps = np.array([round(row[0] * 1e9) for row in rows], np.int64)
+        except KeyError as missing:
+            raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
+        except (OSError, ValueError, TypeError, OverflowError, csv.Error, InvalidValue) as error:
+            raise DeviceError(f"{path}: {error}") from None
+        if (np.diff(stamps) <= 0).any():
+            raise DeviceError(f"{path}: stamps must ascend")
+        return cls(stamps, poses)
+
+    def at(self, stamp_ns: int) -> Pose2 | None:
+        """The pose at a stamp, if there is one within a millisecond."""
+        if not self.poses:
+            return None
+        nearest = int(np.abs(self.stamps_ns - stamp_ns).argmin())
+        return self.poses[nearest] if abs(int(self.stamps_ns[nearest]) - stamp_ns) <= 1_000_000 else None
+
+
+COLUMNS = ("stamp_s", "x_m", "y_m", "heading_rad")
+
+
+class DriveMap:
+    """What the mapping robot has left behind, and the places where it was.
+
+    Attributes:
+        description: of the robot.
+        nodes: how many were made.
+        covered: truth of all its images.
+    """
+
+    def __init__(self, robot: Replay, truth: Truth, settings: PipelineSettings, ticks: Iterable[int]) -> None:
+        """Map.
+
+        Args:
+            robot: the recording of the first pass; read to its end.
+            truth: for scoring alone.
+            settings: of the pipeline.
+            ticks: as many numbers as there are images; going through them shows progress.
+        """
+        self.description: RobotDescription = robot.describe()
+        self.covered: list[Pose2] = []
+        map_id = MapId("map", 1)
+        pipeline = Pipeline(map_id, self.description, settings)
+        pipeline.set_mission(Carried())
+        merger, sequence = Merger(), 0
+        for _, observation in zip(ticks, iter(robot.sense, None), strict=False):
+            assert observation is not None, "the recording ends the loop"
+            if (pose := truth.at(observation.stamp_ns)) is not None:
+                self.covered.append(pose)
+            for body in pipeline.step(observation, ()).changes:
+                sequence += 1
+                merger.on_change(Change(map_id, sequence, observation.stamp_ns, body))
+        merged = merger.merged()
+        self.nodes = len(merged.poses)
+        self._truth = truth
+        self._merger = merger
+        self._relocalizer = Relocalizer(merger.index, merger.node, merged)
+        self._sift = Sift(Lens(self.description.camera, self.description.distortion))
+
+    def questions(self, robot: Replay) -> Iterator[Verdict]:
+        """Ask where each image of another pass was taken."""
+        while (observation := robot.sense()) is not None:
+            assert observation.image is not None, "a recording has all its images"
+            began = time.perf_counter()
+            view = self._sift.extract(observation.image).view(self.description.camera)
+            extracted = time.perf_counter()
+            answer = self._relocalizer.answer(view)
+            done = time.perf_counter()
+            true = self._truth.at(observation.stamp_ns)
+            error_m, error_deg, place = math.nan, math.nan, ""
+            if answer.certainty is Certainty.FOUND:
+                best = answer.candidates[0]
+                place = str(best.node)
+                error_m, error_deg = self._error(best.node, best.node_from_robot.mean, true)
+            elif answer.certainty is Certainty.PLACE:
+                best = answer.candidates[0]
+                place = str(best.node)
+                error_m, error_deg = self._error(best.node, Pose2(), true)
+            known = math.isfinite(error_m)
+            coarse = (
+                LEVELS[-1] if answer.certainty is Certainty.FOUND else (LEVELS[-1][0], math.degrees(TURN))
+            )
+            yield Verdict(
+                query=f"{observation.stamp_ns / 1e9:.3f} s",
+                expected=None if true is None else self._covers(true),
+                certainty=answer.certainty,
+                place=place,
+                right=error_m <= coarse[0] and error_deg <= coarse[1] if known else None,
+                error_m=error_m,
+                error_deg=error_deg,
+                extract_ms=1e3 * (extracted - began),
+                answer_ms=1e3 * (done - extracted),
+            )
+
+    def _covers(self, true: Pose2) -> bool:
+        return any(
+            pose.distance(true) <= REACH and abs(wrap_angle(pose.heading - true.heading)) <= TURN
+            for pose in self.covered
+        )
+
+    def _error(self, node_id: NodeId, node_from_robot: Pose2, true: Pose2 | None) -> tuple[float, float]:
+        """Of the position, m, and of the heading, degrees; NaN without truth."""
+        node = self._merger.node(node_id)
+        at_node = None if node is None else self._truth.at(node.stamp_ns)
+        if true is None or at_node is None:
+            return math.nan, math.nan
+        told = at_node @ node_from_robot
+        return told.distance(true), math.degrees(abs(wrap_angle(told.heading - true.heading)))

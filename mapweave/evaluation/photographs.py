@@ -1,0 +1,222 @@
+"""Photographs of a walk without odometry: images of the first pass are places, those of the second ask.
+
+Depths cannot be had from one image every few metres without a known focal length, so the places are nodes
+whose landmarks have none: appearance alone. A candidate is verified by epipolar geometry, which leaves the
+camera free in all six directions.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.drivers.replay import images_of
+from mapweave.evaluation.verdict import Verdict
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, View
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.registration.evidence import cells
+from mapweave.registration.matching import match
+from mapweave.storage.image_file import read_grey
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+
+
+@dataclass(frozen=True)
+class PhotographSettings:
+    """How questions are asked.
+
+    Attributes:
+        candidates: places that are compared with a question.
+        apart: places further from each other than so many images are not neighbours,
+        comparable: and with this share of the best one's inliers the other one makes it ambiguous.
+    """
+
+    candidates: int = 8
+    apart: int = 2
+    comparable: float = 0.6
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Which places show what a question shows, by the numbers of their images: from `low` to `high`."""
+
+    best: int
+    low: int
+    high: int
+
+
+class Photographs:
+    """The images of a folder, cut into two passes by its lap_truth.csv.
+
+    Attributes:
+        places: images of the first pass, by number.
+        questions: images of the others.
+        references: what is right for each question; None where no image of the first pass shows the place.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Read the table.
+
+        Raises:
+            DeviceError: a file is missing or wrong.
+        """
+        path = folder / "lap_truth.csv"
+        self.references = _read_references(path)
+        numbered = {_number(image): image for image in images_of(folder)}
+        missing = sorted(set(self.references) - set(numbered))
+        if missing:
+            raise DeviceError(f"{path}: there is no image {missing[0]}")
+        self.questions = {number: numbered[number] for number in self.references}
+        self.places = {n: image for n, image in numbered.items() if n not in self.references}
+        if not self.places:
+            raise DeviceError(f"{path}: every image is a question, so there is no first pass")
+
+
+GATE_PX = 2.0
+"""Largest distance from an epipolar line."""
+LEAST_INLIERS, LEAST_SHARE, LEAST_CELLS = 12, 0.5, 4
+"""Matches that agree, as a number and as a share of all; cells of the grid with one, in either image."""
+LEAST_EVIDENCE = 20.0
+"""How much likelier than chance, nats."""
+
+
+def agreeing(node: Node, view: View) -> NDArray[np.int64] | None:
+    """Landmarks of a node and features of a view that agree on one fundamental matrix (RANSAC).
+
+    Returns:
+        (K, 2) pairs, or None if the view does not show the place.
+    """
+    pairs = match(node.landmarks.codes, view.codes)
+    if len(pairs) < LEAST_INLIERS:
+        return None
+    here, there = node.landmarks.pixels[pairs[:, 0]], view.pixels[pairs[:, 1]]
+    _, mask = cv2.findFundamentalMat(here, there, cv2.FM_RANSAC, GATE_PX, 0.999, 2000)
+    inside = np.zeros(len(pairs), bool) if mask is None else mask[:, 0].astype(bool)
+    count = int(inside.sum())
+    if count < max(LEAST_INLIERS, LEAST_SHARE * len(pairs)):
+        return None
+    if evidence(count, len(pairs), GATE_PX, view.camera.height) < LEAST_EVIDENCE:
+        return None
+    if min(cells(here[inside], node.camera), cells(there[inside], view.camera)) < LEAST_CELLS:
+        return None
+    found: NDArray[np.int64] = pairs[inside]
+    return found
+
+
+def evidence(
+    inliers: int, matches: int, gate_px: float, height_px: int, used: int = 7, tries: int = 2000
+) -> float:
+    """Nats: Chernoff's bound on so many wrong matches near their lines, without those that made the lines."""
+    inliers, matches = inliers - used, matches - used
+    chance = 2.0 * gate_px / height_px
+    if matches <= 0 or inliers <= chance * matches:
+        return 0.0
+    share = inliers / matches
+    rest = (1.0 - share) * math.log((1.0 - share) / (1.0 - chance)) if share < 1.0 else 0.0
+    return matches * (share * math.log(share / chance) + rest) - math.log(tries)
+
+
+def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], comparable: float) -> list[int]:
+    """The place with most inliers, and one node each of others that come into question as well."""
+    order = sorted(inliers, key=lambda name: -inliers[name])
+    found = order[:1]
+    for name in order[1:]:
+        enough = inliers[name] >= comparable * inliers[order[0]]
+        if enough and not any(together(name, other) for other in found):
+            found.append(name)
+    return found
+
+
+class AppearanceMap:
+    """Places by their looks alone."""
+
+    def __init__(
+        self, camera: Camera, distortion: tuple[float, ...], settings: PhotographSettings | None = None
+    ):
+        """Begin with none, for a camera and its lens."""
+        self._camera = camera
+        self._sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
+        self._settings = settings or PhotographSettings()
+        self._index = PlaceIndex()
+        self._nodes: dict[int, Node] = {}
+
+    def add(self, number: int, image: Path) -> None:
+        """One more place."""
+        view = self._view(image)
+        unknown = np.full(len(view), np.nan, np.float32)
+        landmarks = Landmarks(view.pixels, view.codes, unknown, unknown)
+        nowhere = PoseGaussian(Pose2(), np.zeros((3, 3)))
+        self._nodes[number] = Node(NodeId("photo", 1, number), 0, nowhere, self._camera, landmarks)
+        self._index.add(self._nodes[number])
+
+    def ask(self, number: int, image: Path, reference: Reference | None) -> Verdict:
+        """Where an image was taken."""
+        began = time.perf_counter()
+        view = self._view(image)
+        extracted = time.perf_counter()
+        ranked = [node_id.number for node_id, _ in self._index.query(view, self._settings.candidates)]
+        certainty, place = self._judge(ranked, view)
+        return Verdict(
+            query=str(number),
+            expected=reference is not None,
+            certainty=certainty,
+            place="" if place is None else str(place),
+            right=None if place is None else _is_right(place, reference),
+            first=_is_right(ranked[0], reference) if ranked else False,
+            error_frames=math.nan if place is None or reference is None else abs(place - reference.best),
+            extract_ms=1e3 * (extracted - began),
+            answer_ms=1e3 * (time.perf_counter() - extracted),
+        )
+
+    def _judge(self, ranked: list[int], view: View) -> tuple[Certainty, int | None]:
+        s = self._settings
+        pairs = {number: agreeing(self._nodes[number], view) for number in ranked}
+        seen = {number: len(found) for number, found in pairs.items() if found is not None}
+        if not seen:
+            return Certainty.UNKNOWN, None
+        best, *others = rivals(seen, lambda one, other: abs(one - other) <= s.apart, s.comparable)
+        return (Certainty.AMBIGUOUS if others else Certainty.FOUND), best
+
+    def _view(self, path: Path) -> View:
+        return self._sift.extract(read_grey(path, self._camera)).view(self._camera)
+
+
+def _is_right(place: int, reference: Reference | None) -> bool:
+    return reference is not None and reference.low <= place <= reference.high
+
+
+def _number(image: Path) -> int:
+    digits = re.findall(r"\d+", image.stem)
+    if not digits:
+        raise DeviceError(f"{image}: no number in its name")
+    return int(digits[-1])
+
+
+def _read_references(path: Path) -> dict[int, Reference | None]:
+    references: dict[int, Reference | None] = {}
+    try:
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                best, low, high = (row[name] for name in ("ref_best", "ref_lo", "ref_hi"))
+                known = Reference(int(best), int(low), int(high)) if best else None
+                references[int(row["query"])] = known
+    except KeyError as missing:
+        raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    if not references:
+        raise DeviceError(f"{path}: no questions in it")
+    return references

@@ -1,0 +1,85 @@
+"""Cutting a recording into robots: as its splits.toml says, or into so many pieces that overlap."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from mapweave.agent.drivers.replay import Replay, images_of
+from mapweave.evaluation.splits import robots_of
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.hybridmap.node import check_name
+
+OVERLAP = 0.3
+"""Of a piece, what the next one shares with it."""
+LEAST_IMAGES = 20
+"""A piece with fewer maps nothing."""
+MOST_ROBOTS = 26
+
+
+def pieces(folder: Path, robots: int | None) -> dict[str, Replay]:
+    """The robots of a recording, by names as the fleet knows them.
+
+    Args:
+        folder: the recording.
+        robots: cut it into so many consecutive pieces; None cuts it as its splits.toml says. Neighbouring
+            pieces share 30 % of their way, where the one takes the even images and the other the odd ones, so
+            that no image is in two of them.
+
+    Raises:
+        DeviceError: the recording lacks something, or cannot be cut like this.
+    """
+    if not folder.is_dir():
+        raise DeviceError(f"{folder}: no such folder; give one with images/, camera.toml, odometry.csv")
+    if robots is None:
+        file = folder / "splits.toml"
+        if not file.exists():
+            raise DeviceError(f"{folder}: no splits.toml tells how to cut it; give --robots 2 or 3")
+        given = robots_of(file)
+        if len(given) < 2:
+            raise DeviceError(f"{file}: merging needs two robots or more; there is only {len(given)}")
+        names = _names(given, file)
+        return {name: Replay(folder, robot) for name, robot in zip(names, given, strict=True)}
+    if not 2 <= robots <= MOST_ROBOTS:
+        raise DeviceError(f"--robots {robots}: use 2 to {MOST_ROBOTS}")
+    count = len(images_of(folder))
+    cuts = cut(count, robots)
+    if min(map(len, cuts)) < LEAST_IMAGES:
+        raise DeviceError(
+            f"{folder}: {count} images are too few for {robots} robots; each needs {LEAST_IMAGES} at least"
+        )
+    return {f"r{k}": Replay(folder, frames=frames) for k, frames in enumerate(cuts)}
+
+
+def cut(count: int, robots: int) -> list[range]:
+    """Consecutive ranges of images that overlap; of neighbours, one takes the even images, one the odd.
+
+    Args:
+        count: images.
+        robots: pieces.
+    """
+    length = count / (robots - (robots - 1) * OVERLAP)
+    ranges = []
+    for k in range(robots):
+        first = round(k * (1.0 - OVERLAP) * length)
+        first += (first + k) % 2
+        last = count if k == robots - 1 else min(count, round(k * (1.0 - OVERLAP) * length + length))
+        ranges.append(range(first, last, 2))
+    return ranges
+
+
+def _names(given: Iterable[str], file: Path) -> list[str]:
+    """Names that agents may have.
+
+    Raises:
+        DeviceError: two robots would have the same.
+    """
+    names = [re.sub("[^a-z0-9_-]", "-", robot.lower()) for robot in given]
+    try:
+        names = [check_name(name) for name in names]
+    except InvalidValue as error:
+        raise DeviceError(f"{file}: {error}") from None
+    if len(set(names)) < len(names):
+        raise DeviceError(f"{file}: two robots are called alike: {', '.join(given)}")
+    return names

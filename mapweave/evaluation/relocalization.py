@@ -1,0 +1,136 @@
+"""Examine a recording by what it holds: two robots with odometry, or photographs and what each shows."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import track
+
+from mapweave.agent.drivers.replay import Replay, images_of, read_camera
+from mapweave.agent.pipeline import PipelineSettings
+from mapweave.evaluation.drive import DriveMap, Truth
+from mapweave.evaluation.photographs import AppearanceMap, Photographs
+from mapweave.evaluation.splits import robots_of
+from mapweave.evaluation.verdict import Verdict, figures
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.storage.image_file import read_grey
+
+STAND_IN_HEIGHT = 0.8
+"""Of a camera of which only the focal length is known, m: bearings do not depend on it."""
+
+
+@dataclass(frozen=True)
+class RelocalizationEvaluation:
+    """What came of it.
+
+    Attributes:
+        about: the recording, in figures.
+        verdicts: of each question, by how places were verified.
+    """
+
+    about: dict[str, Any]
+    verdicts: dict[str, list[Verdict]]
+
+    def report(self) -> dict[str, Any]:
+        """For `json.dumps`: figures of the first way at the top, those of the others under their names."""
+        names = list(self.verdicts)
+        others = {name: figures(self.verdicts[name]) for name in names[1:]}
+        return {**self.about, "verified": names[0], **figures(self.verdicts[names[0]]), **others}
+
+    def write(self, folder: Path) -> list[Path]:
+        """One table of verdicts for each way."""
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = []
+        for name, verdicts in self.verdicts.items():
+            paths.append(folder / f"answers-{name}.csv")
+            with paths[-1].open("w", newline="", encoding="utf-8") as file:
+                rows = [asdict(verdict) for verdict in verdicts]
+                table = csv.DictWriter(file, list(rows[0]) if rows else ["query"])
+                table.writeheader()
+                table.writerows(rows)
+        return paths
+
+
+def evaluate_relocalization(
+    folder: Path,
+    camera_file: Path | None,
+    focal_px: float | None,
+    settings: PipelineSettings,
+    console: Console,
+) -> RelocalizationEvaluation:
+    """Map from one pass, ask from the others.
+
+    Args:
+        folder: the recording.
+        camera_file: another than its camera.toml, for photographs.
+        focal_px: instead of either, for photographs.
+        settings: of the pipeline that maps a drive.
+        console: shows progress.
+
+    Raises:
+        DeviceError: the folder lacks what is needed, or a file is wrong.
+    """
+    if not folder.is_dir():
+        raise DeviceError(f"{folder}: no such folder; give a recording with images/")
+    if (folder / "odometry.csv").exists() and (folder / "splits.toml").exists():
+        if camera_file is not None or focal_px is not None:
+            raise DeviceError(f"{folder}: a drive has its camera.toml; leave --camera and --focal out")
+        return _examine_drive(folder, settings, console)
+    if (folder / "lap_truth.csv").exists():
+        return _examine_photographs(folder, camera_file, focal_px, console)
+    raise DeviceError(
+        f"{folder}: two passes cannot be told apart; it needs odometry.csv and splits.toml with two robots, "
+        "or lap_truth.csv"
+    )
+
+
+def _examine_drive(folder: Path, settings: PipelineSettings, console: Console) -> RelocalizationEvaluation:
+    names = robots_of(folder / "splits.toml")
+    if len(names) < 2:
+        raise DeviceError(
+            f"{folder / 'splits.toml'}: one robot maps, another asks; there is only {len(names)}"
+        )
+    truth = Truth.read(folder / "truth.csv")
+    mapping, asking = Replay(folder, names[0]), [Replay(folder, name) for name in names[1:]]
+    ticks = track(range(len(mapping)), f"{names[0]} maps", console=console)
+    drive = DriveMap(mapping, truth, settings, ticks)
+    total = sum(map(len, asking))
+    questions = (verdict for robot in asking for verdict in drive.questions(robot))
+    verdicts = list(track(questions, f"{', '.join(names[1:])} ask", total=total, console=console))
+    about = {"folder": folder.name, "nodes": drive.nodes, "truth": bool(truth.poses)}
+    return RelocalizationEvaluation(about, {"depths": verdicts})
+
+
+def _examine_photographs(
+    folder: Path, camera_file: Path | None, focal_px: float | None, console: Console
+) -> RelocalizationEvaluation:
+    photographs = Photographs(folder)
+    camera, distortion = _camera_of(folder, camera_file, focal_px)
+    places = AppearanceMap(camera, distortion)
+    for number, image in track(list(photographs.places.items()), "first pass", console=console):
+        places.add(number, image)
+    verdicts = [
+        places.ask(number, image, photographs.references[number])
+        for number, image in track(list(photographs.questions.items()), "questions", console=console)
+    ]
+    about = {"folder": folder.name, "nodes": len(photographs.places), "focal_px": camera.fx}
+    return RelocalizationEvaluation(about, {"looks": verdicts})
+
+
+def _camera_of(
+    folder: Path, camera_file: Path | None, focal_px: float | None
+) -> tuple[Camera, tuple[float, ...]]:
+    if camera_file is not None and focal_px is not None:
+        raise DeviceError("give --camera or --focal, not both")
+    if focal_px is None:
+        return read_camera(camera_file or folder / "camera.toml")
+    first: Sequence[Path] = images_of(folder)[:1]
+    height, width = read_grey(first[0]).shape
+    middle = 0.5 * (width - 1), 0.5 * (height - 1)
+    return Camera(width, height, focal_px, focal_px, *middle, STAND_IN_HEIGHT), (0.0,) * 5

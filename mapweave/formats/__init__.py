@@ -1,0 +1,1 @@
+"""Maps for the tools of others: g2o, TUM, GraphML, GeoJSON."""

@@ -1,0 +1,120 @@
+"""Merging map files without a server: the same merge on the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.map_event import MapEvent
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.map_files import maps_of
+from mapweave.mapserver.merging.merger import Merger, MergerSettings
+from mapweave.merge.merging import MergeSettings
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.storage.map_file import MapFile
+from mapweave.wire.codec import encode_body
+
+Progress = Callable[[int, int], None]
+"""Told how many of how many nodes and edges are taken in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What there is to merge.
+
+    Attributes:
+        maps: the robots' own, by id.
+        rulings: all that people have ruled in any of the files.
+        notes: what was left aside, one sentence each.
+        history: what any of the files tells that has become of the maps, in order.
+    """
+
+    maps: dict[MapId, HybridMap]
+    rulings: ManualConstraints
+    notes: tuple[str, ...] = ()
+    history: tuple[MapEvent, ...] = ()
+
+
+def parts_of(files: Mapping[Path, MapFile]) -> Parts:
+    """The robots' own maps in some files, and all that people have ruled in any of them.
+
+    The same map twice is taken once. Of an older and a newer state of it the newer one counts: numbers are
+    never reused, so it is the one that has come further.
+
+    Raises:
+        InvalidFile: two files hold maps of one name that are different maps, or of which nobody can tell
+            which is newer.
+    """
+    maps: dict[MapId, HybridMap] = {}
+    origin: dict[MapId, Path] = {}
+    rulings = ManualConstraints()
+    notes: list[str] = []
+    for path, content in sorted(files.items()):
+        if not content.changes:
+            notes.append(f"there is nothing in {path}")
+        for map_id, one in sorted(maps_of(content).items()):
+            if map_id in maps:
+                known, there = maps[map_id], origin[map_id]
+                if _length(known) > _length(one):
+                    (known, there), (one, path) = (one, path), (known, there)
+                if objection := _objection(known, one):
+                    raise InvalidFile(f"map {map_id} is in {there} and in {path}: {objection}")
+                if _length(known) < _length(one):
+                    notes.append(f"map {map_id} is taken from {path}, since that in {there} is older")
+            maps[map_id], origin[map_id] = one, path
+        rulings += ManualConstraints(content.rulings)
+    told = {one for content in files.values() for one in content.history}
+    history = sorted(told, key=lambda one: (one.stamp_ns, one.kind, one.words))
+    return Parts(maps, rulings, tuple(notes), tuple(history))
+
+
+def _length(one: HybridMap) -> int:
+    """How far a map has come: its greatest number."""
+    return max((own.number for own in (*one.nodes, *one.edges)), default=0)
+
+
+def _objection(older: HybridMap, newer: HybridMap) -> str:
+    """Why one map is not a later state of another; empty if it is."""
+    both = older.nodes.keys() & newer.nodes.keys()
+    if (older.nodes and not both) or any(older.nodes[n].stamp_ns != newer.nodes[n].stamp_ns for n in both):
+        return "these are two maps of one name, made at different times: leave one of them out"
+    if _length(older) == _length(newer) and _bytes(older) != _bytes(newer):
+        return "nobody can tell which is newer: leave one of them out"
+    return ""
+
+
+def _bytes(one: HybridMap) -> list[bytes]:
+    return sorted(encode_body(body) for body in one.contents())
+
+
+def merge_parts(
+    maps: Mapping[MapId, HybridMap],
+    rulings: ManualConstraints,
+    progress: Progress = lambda done, of: None,
+    settings: MergeSettings | None = None,
+) -> MergedMap:
+    """Merge robots' maps as the map server does.
+
+    Args:
+        maps: by id; they are not changed.
+        rulings: of people.
+        progress: told how far it is.
+        settings: how they are merged.
+
+    Raises:
+        InvalidValue: a map cannot be merged; nobody must lose it by writing the others.
+    """
+    merger = Merger(settings=MergerSettings(merging=settings or MergeSettings()))
+    merger.rule(rulings)
+    bodies = [(map_id, body) for map_id, one in sorted(maps.items()) for body in one.contents()]
+    for k, (map_id, body) in enumerate(bodies):
+        merger.apply(map_id, body)
+        progress(k + 1, len(bodies))
+    merged = merger.merged()
+    for map_id, reason in merged.set_apart.items():
+        raise InvalidValue(f"map {map_id} cannot be merged: {reason}; leave its file out, or retire it")
+    return merged

@@ -1,0 +1,1 @@
+"""One process each: a robot's agent, the simulator; ended with their parent."""

@@ -1,0 +1,347 @@
+"""One robot as a process: body, mind, disk and link put together."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
+
+from mapweave.agent.drivers.robot import Robot
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission import Idle, Mission
+from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.agent.replication.epochs import newest_on_server, next_epoch
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.merged_poses import MergedPoses
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.agent.replication.retained_map import RetainedMap
+from mapweave.agent.runner import Runner
+from mapweave.agent.synchronization import FreeRunning, Synchronization
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.node import NUMBER, MapId
+from mapweave.storage.map_file import MapFile, write_map_file
+from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
+from mapweave.wire.traffic_meter import TrafficMeter
+from mapweave.wire.zenoh_bus import ZenohBus
+
+FIRST_PATIENCE = 3.0
+"""How long a robot that remembers no map asks the server for the number of its next one, s."""
+
+SILENCE = 2.0
+"""s; who waits longer for its body says so."""
+
+
+@dataclass(frozen=True)
+class AgentOptions:
+    """How an agent runs.
+
+    Attributes:
+        name: in the fleet.
+        data: folder for its journal and its map file.
+        epoch: least number of the map if one is begun; None asks the server which one is next.
+        fresh: begin a new map even if the journal holds one.
+        resume: the map of the journal that goes on; None takes the newest.
+        mission: at the start.
+        seed: of the random choices in exploration.
+        synchronization: what the loop waits for between ticks.
+        server: whose acknowledgement lets changes be forgotten.
+        total: observations that will come, if that is known.
+        patience: how long to wait at the end until the server has everything, s.
+    """
+
+    name: str
+    data: Path
+    epoch: int | None = None
+    fresh: bool = False
+    resume: MapId | None = None
+    mission: Mission = field(default_factory=Idle)
+    seed: int = 0
+    synchronization: Synchronization = field(default_factory=FreeRunning)
+    server: str = "s0"
+    total: int | None = None
+    patience: float = 5.0
+
+
+class Agent:
+    """Mind, disk and link of one robot; whoever has its body calls `tick` and `exchange`.
+
+    It takes up the newest map of its journal. When the pipeline cannot find itself on that map, a fresh map
+    begins in a new epoch; the old one stays. Each map has a file of its own, written when another map begins
+    and at the end.
+    """
+
+    def __init__(
+        self,
+        describe: Callable[[], RobotDescription],
+        bus: Bus,
+        keys: Keys,
+        settings: PipelineSettings,
+        options: AgentOptions,
+        on_step: Callable[[Step], None] = lambda step: None,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """Open the journal and join the fleet.
+
+        Args:
+            describe: asks the body what it is, once the disk has turned out to be good.
+            bus: to the fleet; stays the caller's.
+            keys: of the fleet.
+            settings: of the pipeline.
+            options: how.
+            on_step: called after each tick.
+            say: takes lines for people.
+
+        Raises:
+            MapweaveError: the journal cannot be used; one line says why.
+        """
+        self._bus = TrafficMeter(bus)
+        self._keys = keys
+        self._settings = replace(settings, seed=options.seed)
+        self._options = options
+        self._on_step = on_step
+        self._say = say
+        options.data.mkdir(parents=True, exist_ok=True)
+        self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
+        try:
+            self._description = describe()
+            maps = self.journal.maps()
+            if options.resume is not None or (maps and not options.fresh):
+                self._resume(self._chosen(maps))
+            else:
+                for left in maps[-1:]:
+                    # An agent that was killed has written no file.
+                    self._write(left, RetainedMap.of(self.journal, left))
+                self._begin()
+        except BaseException:
+            self.journal.close()
+            raise
+
+    def _begin(self) -> None:
+        """A fresh map, whose number no map of this robot has had."""
+        options = self._options
+        taken = [one.epoch for one in self.journal.maps()]
+        taken += epochs_of_files(options.data, options.name)
+        if options.epoch is not None:
+            epoch = max([options.epoch, *(used + 1 for used in taken)])
+        else:
+            # A session may take a moment to find its router; a disk that remembers maps needs no server.
+            patience = 0.0 if taken else FIRST_PATIENCE
+            stored = None
+            if options.patience > 0.0:
+                stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
+            epoch = next_epoch(taken, stored)
+        map_id = self.journal.open_map(epoch)
+        self._start(map_id, Pipeline(map_id, self._description, self._settings))
+
+    def _resume(self, map_id: MapId) -> None:
+        kept = RetainedMap.of(self.journal, map_id)
+        pipeline = Pipeline(map_id, self._description, self._settings, kept.contents, kept.next_number)
+        self.journal.open_map(map_id.epoch)
+        nodes = len(pipeline.map.nodes)
+        self._say(f"{self._options.name}: takes up map {map_id} with {nodes} nodes")
+        if kept.complaint:
+            self._say(f"{self._options.name}: {kept.complaint}")
+            self._set_aside(map_id)
+        self._start(map_id, pipeline)
+
+    def _chosen(self, maps: list[MapId]) -> MapId:
+        """The map that goes on."""
+        chosen = self._options.resume
+        if chosen is None:
+            return maps[-1]
+        if chosen not in maps:
+            held = ", ".join(map(str, maps)) or "none"
+            raise InvalidValue(f"the journal of {self._options.name} has no map {chosen}; it has {held}")
+        return chosen
+
+    def _start(self, map_id: MapId, pipeline: Pipeline, mission: Mission | None = None) -> None:
+        options = self._options
+        pipeline.set_mission(options.mission if mission is None else mission)
+        self.pipeline = pipeline
+        self.replicator = Replicator(self._bus, self._keys, self.journal, map_id, servers=(options.server,))
+        self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
+        self._fleet = FleetClient(
+            self._bus, self._keys, map_id, options.synchronization.answer_timeout, options.server,
+            self.replicator.unacknowledged, self._placed,
+        )  # fmt: skip
+        self.runner = Runner(pipeline, self._fleet, self.replicator, options.synchronization, self._on_step)
+
+    @property
+    def map_id(self) -> MapId:
+        """The map that it makes."""
+        return self.replicator.map_id
+
+    def begin_anew(self) -> None:
+        """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
+        mission, old = self.pipeline.mission, self.map_id
+        self._leave()
+        try:
+            self.write_map()
+        except InvalidFile as error:
+            # The journal has it all.
+            self._say(f"{self._options.name}: {error}")
+        self._begin()
+        self.pipeline.set_mission(mission)
+        self._say(
+            f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
+            "and the old one stays"
+        )
+
+    def tick(self, observation: Observation) -> Step:
+        """One tick; see Runner.tick. Begins a fresh map where that is needed."""
+        step = self.runner.tick(observation)
+        if self.pipeline.lost:
+            self.begin_anew()
+        return step
+
+    def run(self, robot: Robot, stop: threading.Event) -> None:
+        """Loop until the body has no more observations or `stop` is set."""
+        while True:
+            self.runner.run(robot, stop)
+            if stop.is_set() or not self.pipeline.lost:
+                return
+            self.begin_anew()
+
+    def write_map(self) -> Path:
+        """Write the map that it makes to its map file; returns where."""
+        path = map_path(self._options.data, self.map_id)
+        write_map_file(path, MapFile("agent", str(self.map_id), tuple(self.pipeline.map.contents())))
+        return path
+
+    def _write(self, left: MapId, kept: RetainedMap) -> None:
+        """Write a map that is left to its map file, as the journal has it."""
+        if kept.complaint:
+            self._set_aside(left)
+        if kept.contents:
+            write_map_file(map_path(self._options.data, left), MapFile("agent", str(left), kept.contents))
+
+    def _set_aside(self, map_id: MapId) -> None:
+        """The journal has lost something of a map: its file, which may hold that, is not written over."""
+        path = map_path(self._options.data, map_id)
+        aside = path.with_name(f"{map_id}.before-damage{path.suffix}")
+        if path.exists() and not aside.exists():
+            path.rename(aside)
+            self._say(f"{self._options.name}: the map file written before is kept as {aside}")
+
+    def _placed(self) -> int:
+        return self.merged_poses.count(self.map_id)
+
+    def _leave(self) -> None:
+        self._fleet.close()
+        self.merged_poses.close()
+        self.replicator.flush(10.0)
+        self.replicator.close()
+
+    def close(self) -> None:
+        """Commit what was mapped and leave the fleet. The bus stays open."""
+        self._leave()
+        self.journal.close()
+
+
+def map_path(folder: Path, map_id: MapId) -> Path:
+    """Where an agent writes a map: one file a map, for example `r0.3.mapweave`."""
+    return folder / f"{map_id}.mapweave"
+
+
+def epochs_of_files(folder: Path, agent: str) -> list[int]:
+    """Numbers of the maps of an agent that have a file in a folder."""
+    numbers = (path.name.split(".")[1] for path in folder.glob(f"{agent}.*.mapweave"))
+    return [int(number) for number in numbers if NUMBER.fullmatch(number)]
+
+
+def run_agent(
+    robot: Robot,
+    bus: ZenohBus,
+    keys: Keys,
+    settings: PipelineSettings,
+    options: AgentOptions,
+    stop: threading.Event,
+) -> None:
+    """Run a robot until its body ends or `stop` is set, then write its map file.
+
+    Raises:
+        MapweaveError: the body cannot be read, or the disk cannot be written; one line says which.
+    """
+    # One core a robot: OpenCV's own threads would only fight over it.
+    cv2.setNumThreads(1)
+    console = Console(stderr=True)
+    show = _progress(console, options)
+    describe = partial(_describe, robot, console.print, options.name)
+    agent = Agent(describe, bus, keys, settings, options, show, console.print)
+    with show:
+        try:
+            agent.run(robot, stop)
+        finally:
+            robot.close()
+            path = agent.write_map()
+            nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
+            console.print(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
+            agent.replicator.flush(10.0)
+            _hand_over(console, agent.replicator, bus, options)
+            agent.close()
+
+
+def _describe(robot: Robot, say: Callable[[str], None], name: str) -> RobotDescription:
+    """What the body says of itself; whoever has to wait for that is told what for."""
+    patience = threading.Timer(SILENCE, say, [f"{name}: waits for its body"])
+    patience.daemon = True
+    patience.start()
+    try:
+        return robot.describe()
+    finally:
+        patience.cancel()
+
+
+def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options: AgentOptions) -> None:
+    if options.patience <= 0:
+        console.print("offline: the map stays in the journal and is sent when a server can be reached")
+    elif not bus.wait_connected(min(2.0, options.patience)):
+        console.print("no server in reach: the map stays in the journal and is sent when one can be reached")
+    elif replicator.wait_acknowledged(options.patience):
+        console.print(f"server {options.server} has it all")
+    else:
+        console.print(
+            f"server {options.server} has not said that it has it all: the rest stays in the journal"
+        )
+
+
+class _progress:
+    """Progress of a run: with a bar where the end is known, else a line when something changes."""
+
+    def __init__(self, console: Console, options: AgentOptions) -> None:
+        self._console = console
+        self._options = options
+        self._bar: Progress | None = None
+        self._said = ""
+
+    def __enter__(self) -> _progress:
+        if self._options.total is not None:
+            self._bar = Progress(
+                SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+                TextColumn("{task.fields[detail]}"), console=self._console,
+            )  # fmt: skip
+            self._task = self._bar.add_task(self._options.name, total=self._options.total, detail="")
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, step: Step) -> None:
+        status = step.status
+        if self._bar is not None:
+            self._bar.update(self._task, advance=1, detail=f"{status.nodes} nodes, {status.detail}")
+        elif status.doing != self._said:
+            self._said = status.doing
+            self._console.print(
+                f"{self._options.name}: {status.doing} ({status.nodes} nodes) {status.detail}"
+            )

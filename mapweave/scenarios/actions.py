@@ -1,0 +1,209 @@
+"""What a scenario does to a fleet beside what it does to the world; see `mapweave.sim.events` for the
+rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.node import NodeId, check_name
+from mapweave.sim import events
+from mapweave.sim.robots import camera_from_table
+from mapweave.storage.settings_file import build
+
+EVERYBODY = "all"
+GOALS = ("foreign", "own", "photographed")
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Nothing; only its time, or what it waits for, counts."""
+
+
+@dataclass(frozen=True)
+class SetMission:
+    """An operator's command.
+
+    Attributes:
+        mission: idle, explore or carried.
+        robot: name, or all.
+    """
+
+    mission: str
+    robot: str = EVERYBODY
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown mission (InvalidValue)."""
+        if self.mission not in ("idle", "explore", "carried"):
+            raise InvalidValue(f"mission: no mission {self.mission!r}; known are idle, explore, carried")
+
+
+@dataclass(frozen=True)
+class Abduct:
+    """A robot is put into a room that only one other robot has mapped (truth chooses; it does not help).
+
+    Attributes:
+        robot: name; chosen from the seed if not given.
+    """
+
+    robot: str = ""
+
+
+@dataclass(frozen=True)
+class Send:
+    """A robot shall go to a node.
+
+    Attributes:
+        robot: name; the robot that was lost last if not given.
+        goal: the node; `foreign`: another robot's, in another room; `own`: one of its own, in view of which
+            it is not now; `photographed`: the last photograph.
+    """
+
+    robot: str = ""
+    goal: str = "foreign"
+
+    def __post_init__(self) -> None:
+        """Refuse what is no node (InvalidValue)."""
+        if self.goal not in GOALS:
+            NodeId.parse(self.goal)
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A free way, chosen from the seed, is mapped by photographs; a robot is put down where it begins.
+
+    Attributes:
+        robot: name.
+        count: of photographs.
+        spacing: m between two of them, about.
+        said_spacing: what the photographer says of it, m; the truth by default.
+        camera: that is carried, by its name.
+        name: of the map.
+    """
+
+    robot: str
+    count: int = 9
+    spacing: float = 0.5
+    said_spacing: float = 0.0
+    camera: str = "phone"
+    name: str = "photos"
+
+    def __post_init__(self) -> None:
+        """Refuse what is no walk (InvalidValue)."""
+        if not (3 <= self.count <= 100 and 0.1 <= self.spacing <= 2.0 and 0.0 <= self.said_spacing <= 4.0):
+            raise InvalidValue("photograph: count must be 3 to 100, spacing 0.1 to 2 m")
+        check_name(self.name)
+        camera_from_table(self.camera, "photograph: camera")
+
+
+@dataclass(frozen=True)
+class KillAgent:
+    """An agent's process dies at once, without a word."""
+
+    robot: str
+
+
+@dataclass(frozen=True)
+class StartAgent:
+    """An agent's process is started again, with the same disk."""
+
+    robot: str
+
+
+@dataclass(frozen=True)
+class KillServer:
+    """The map server's process dies at once, without a word; the router is in it."""
+
+
+@dataclass(frozen=True)
+class StartServer:
+    """The map server is started again, with the same disk."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A robot's network is gone; its body is not concerned."""
+
+    robot: str
+
+
+@dataclass(frozen=True)
+class Worsen:
+    """A robot's network becomes bad.
+
+    Attributes:
+        robot: name.
+        loss: share of what it sends that is lost (in one process), or has to be sent again (TCP), 0 to 1.
+        delay: of what is not lost, s.
+    """
+
+    robot: str
+    loss: float = 0.2
+    delay: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Refuse what is no share or no time (InvalidValue)."""
+        if not 0.0 <= self.loss < 1.0:
+            raise InvalidValue(f"worsen: loss must be 0 to 1 (not included), not {self.loss}")
+        if not 0.0 <= self.delay <= 5.0:
+            raise InvalidValue(f"worsen: delay must be 0 to 5 s, not {self.delay}")
+
+
+@dataclass(frozen=True)
+class Restore:
+    """A robot's network is as good as new."""
+
+    robot: str
+
+
+Action = (
+    Wait
+    | SetMission
+    | Abduct
+    | Send
+    | Photograph
+    | KillAgent
+    | StartAgent
+    | KillServer
+    | StartServer
+    | Cut
+    | Worsen
+    | Restore
+    | events.SimEvent
+)
+
+KINDS: dict[str, type[Any]] = {
+    "wait": Wait,
+    "mission": SetMission,
+    "abduct": Abduct,
+    "goto": Send,
+    "photograph": Photograph,
+    "kill_agent": KillAgent,
+    "start_agent": StartAgent,
+    "kill_server": KillServer,
+    "start_server": StartServer,
+    "cut": Cut,
+    "worsen": Worsen,
+    "restore": Restore,
+}
+"""By the `do` of an event's table."""
+
+
+def parse_action(do: str, table: Mapping[str, Any], where: str) -> Action:
+    """Make an action of what a scenario's table says beside its time.
+
+    Raises:
+        SettingsError: an unknown kind or field, or a value that cannot work.
+    """
+    try:
+        if do in events.KINDS:
+            return events.parse_event({"do": do, **table}, where)
+        if do not in KINDS:
+            raise SettingsError(f"{where}: do = {do!r}; known are {', '.join((*KINDS, *events.KINDS))}")
+        action: Action = build(KINDS[do], table, f"{where}: {do}")
+    except InvalidValue as error:
+        raise SettingsError(f"{where}: {error}") from None
+    return action

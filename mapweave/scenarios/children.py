@@ -1,0 +1,95 @@
+"""Child processes: started, watched, ended in order."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+from mapweave.hybridmap.errors import MapweaveError
+from mapweave.processes import parent_watchdog
+
+
+class ChildFailed(MapweaveError):
+    """A child process ended although it should not have."""
+
+
+def free_port() -> int:
+    """A TCP port on loopback that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Children:
+    """Runs `mapweave` commands as processes. Their output goes to files; leaving ends them all.
+
+    Should this process be killed, they end by themselves.
+    """
+
+    def __init__(self, logs: Path) -> None:
+        """Choose the folder for their output."""
+        logs.mkdir(parents=True, exist_ok=True)
+        self._logs = logs
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Children:
+        """Nothing runs yet."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End whatever still runs, last started first."""
+        for name in list(self._running)[::-1]:
+            self.end(name)
+
+    def start(self, name: str, arguments: Sequence[str]) -> None:
+        """Run `mapweave` with arguments."""
+        with self._log(name).open("ab") as output:
+            self._running[name] = subprocess.Popen(
+                [sys.executable, "-m", "mapweave", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=parent_watchdog.environment(),
+            )
+
+    def pid(self, name: str) -> int:
+        """The process's number."""
+        return self._running[name].pid
+
+    def check(self) -> None:
+        """Raise ChildFailed if one has ended, with the last line that it said."""
+        for name, process in self._running.items():
+            if process.poll() is not None:
+                said = self._log(name).read_text(errors="replace").strip().splitlines()
+                last = said[-1] if said else "it said nothing"
+                raise ChildFailed(
+                    f"{name} ended with status {process.returncode}: {last} ({self._log(name)})"
+                )
+
+    def end(self, name: str, patience: float = 20.0) -> None:
+        """Ask one to end, wait, and kill it if it does not."""
+        process = self._running.pop(name, None)
+        if process is None:
+            return
+        with process:
+            process.terminate()
+            try:
+                process.wait(patience)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+    def kill(self, name: str) -> None:
+        """End one at once, without a word (SIGKILL)."""
+        process = self._running.pop(name, None)
+        if process is not None:
+            with process:
+                process.kill()
+
+    def _log(self, name: str) -> Path:
+        return self._logs / f"{name}.log"

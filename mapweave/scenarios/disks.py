@@ -1,0 +1,74 @@
+"""What is on the disks after a trial: robots' journals and the server's store, compared byte by byte."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapweave.agent.replication.journal import Journal
+from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.codec import encode_body
+
+
+@dataclass(frozen=True)
+class DiskRecord:
+    """One robot's maps on the disks.
+
+    Attributes:
+        map_bytes: of all its changes as they go over the wire.
+        unsaved: nodes and edges of its journal that the server's store lacks or has differently.
+        map_hash: SHA-256 over its maps: epoch and every node and edge as it would be sent.
+    """
+
+    map_bytes: int
+    unsaved: int
+    map_hash: str
+
+
+def read_disks(agents: Path, store: Path, robots: Iterable[str]) -> dict[str, DiskRecord]:
+    """Read journals and store; nobody may have them open.
+
+    Args:
+        agents: folder of the journals.
+        store: of the server.
+        robots: names.
+
+    Raises:
+        InvalidFile: one is damaged.
+    """
+    kept = Store(store)
+    try:
+        return {robot: _compare(Journal(agents / f"{robot}.sqlite", robot), kept) for robot in robots}
+    finally:
+        kept.close()
+
+
+def map_hash(contents: Iterable[tuple[MapId, Iterable[ChangeBody]]]) -> str:
+    """SHA-256 over maps, whatever the order in which their parts were put."""
+    digest = hashlib.sha256()
+    for map_id, bodies in sorted(contents, key=lambda one: str(one[0])):
+        digest.update(str(map_id).encode())
+        for encoded in sorted(map(encode_body, bodies)):
+            digest.update(len(encoded).to_bytes(4, "little") + encoded)
+    return digest.hexdigest()
+
+
+def _compare(journal: Journal, store: Store) -> DiskRecord:
+    size, unsaved, maps = 0, 0, []
+    try:
+        stored = set(store.maps())
+        for one in journal.maps():
+            mine = list(HybridMap(journal.replay(one)).contents())
+            bodies = (change.body for change in store.replay(one)) if one in stored else ()
+            theirs = set(map(encode_body, HybridMap(bodies).contents()))
+            unsaved += sum(encode_body(body) not in theirs for body in mine)
+            size += sum(len(change) for _, change in journal.rows(one, 1, journal.head(one)))
+            maps.append((one, mine))
+        return DiskRecord(size, unsaved, map_hash(maps))
+    finally:
+        journal.close()

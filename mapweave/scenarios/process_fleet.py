@@ -1,0 +1,155 @@
+"""A fleet of processes over Zenoh, as on real robots: each may be killed, each network may be cut."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from mapweave.hybridmap.errors import MapweaveError, NotConnected
+from mapweave.scenarios.children import Children, free_port
+from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
+from mapweave.scenarios.network_emulator import NetworkEmulator
+from mapweave.sim.ground_truth_client import SimControl
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
+
+PATIENCE = 60.0
+"""How long a process may take to come up, s."""
+LOOK_EVERY = 2.0
+"""How often it is looked whether everybody is alive while time passes, s."""
+
+
+class ProcessFleet:
+    """Server, simulator and agents as processes on this machine.
+
+    Robots reach their bodies over the simulator's own endpoint and the fleet over the server's, as a robot's
+    wheels do not hang on its Wi-Fi. Robots whose network the scenario touches reach the server over a cable.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        """Nothing runs yet."""
+        self._stage = stage
+        self.keys = Keys(FLEET)
+        self._fleet_port, self._body_port = free_port(), free_port()
+        self._children = Children(stage.out / "logs")
+        self._cables: dict[str, NetworkEmulator] = {}
+        self._started = False
+        self.bus = _client(self._fleet_port)
+        self._sim_bus = _client(self._body_port)
+        self.control = SimControl(self._sim_bus, FLEET, timeout=60.0)
+
+    def start(self) -> None:
+        """Server, simulator, agents; returns when every robot has asked for its first step."""
+        stage, scenario = self._stage, self._stage.scenario
+        touched = {e.table["robot"] for e in scenario.events if e.table["do"] in ("cut", "worsen", "restore")}
+        self._cables = {robot: NetworkEmulator(self._fleet_port, stage.seed) for robot in sorted(touched)}
+        overrides = [part for one in scenario.overrides for part in ("--set", one)]
+        self.start_server()
+        self._children.start(
+            "sim",
+            ["sim", "serve", str(scenario.path), "--seed", str(stage.seed), *overrides, "--held",
+             "--listen", _endpoint(self._body_port), "--fleet", FLEET],
+        )  # fmt: skip
+        self._until(self._simulating, "the simulator does not come up")
+        for robot in stage.robots:
+            self._start_agent(robot)
+        self._until(lambda: self._active() == set(stage.robots), "an agent does not come up")
+
+    def advance(self, tick: int) -> None:
+        """Let the simulator go on, and look now and then whether everybody is alive."""
+        while not self.control.advance(tick, LOOK_EVERY):
+            self._children.check()
+
+    def kill_agent(self, robot: str) -> None:
+        """SIGKILL."""
+        self._children.kill(robot)
+        self._until(
+            lambda: robot not in self._active(), f"the simulator does not notice that {robot} is gone"
+        )
+
+    def start_agent(self, robot: str) -> None:
+        """Start it anew; returns when it has asked for a step."""
+        self._start_agent(robot)
+        self._until(lambda: robot in self._active(), f"agent {robot} does not come up")
+
+    def _start_agent(self, robot: str) -> None:
+        stage = self._stage
+        port = self._cables[robot].port if robot in self._cables else self._fleet_port
+        arguments = [
+            "agent", robot, "--data", str(stage.agents), "--epoch", str(FIRST_EPOCH),
+            "--seed", str(stage.agent_seed(robot)), "--lockstep", "--fleet", FLEET,
+            "--mission", stage.scenario.missions[robot],
+            "--connect", _endpoint(port), "--body", _endpoint(self._body_port),
+        ]  # fmt: skip
+        self._children.start(robot, [*arguments, *self._settings()])
+
+    def _settings(self) -> list[str]:
+        file = self._stage.settings_file
+        return [] if file is None else ["--settings", str(file)]
+
+    def kill_server(self) -> None:
+        """SIGKILL; the router goes with it."""
+        self._children.kill("server")
+        self._until(lambda: not self.bus.connected(), "the network does not notice that the server is gone")
+
+    def start_server(self) -> None:
+        """Start it; returns when this process is connected."""
+        self._children.start(
+            "server",
+            ["server", "--listen", _endpoint(self._fleet_port), "--name", SERVER, "--fleet", FLEET,
+             "--data", str(self._stage.store.parent), "--lockstep", *self._settings()],
+        )  # fmt: skip
+        self._until(self.bus.connected, "the map server does not come up")
+
+    def cut(self, robot: str) -> None:
+        """Cut the robot's cable."""
+        self._cables[robot].cut()
+
+    def worsen(self, robot: str, loss: float, delay: float) -> None:
+        """Make the robot's cable bad."""
+        self._cables[robot].worsen(loss, delay)
+
+    def restore(self, robot: str) -> None:
+        """Mend the robot's cable."""
+        self._cables[robot].restore()
+
+    def end(self) -> None:
+        """Agents first: they hand over what they have; the server last."""
+        for name in (*self._stage.robots, "sim", "server"):
+            self._children.end(name)
+        for cable in self._cables.values():
+            cable.close()
+        self._cables.clear()
+        self.bus.close()
+        self._sim_bus.close()
+
+    def wall(self) -> dict[str, float]:
+        """What the simulator has measured."""
+        return dict(self.control.status().wall)
+
+    def _simulating(self) -> bool:
+        try:
+            return self._sim_bus.connected() and self.control.status().tick == 0
+        except NotConnected:
+            return False  # its world is not built yet
+
+    def _active(self) -> set[str]:
+        return {name for name, robot in self.control.status().robots.items() if robot.active}
+
+    def _until(self, condition: Callable[[], bool], complaint: str) -> None:
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            self._children.check()
+            if time.monotonic() > end:
+                logs = self._stage.out / "logs"
+                raise MapweaveError(f"{complaint} (waited {PATIENCE:.0f} s; see {logs})")
+            time.sleep(0.02)
+
+
+def _endpoint(port: int) -> str:
+    return f"tcp/127.0.0.1:{port}"
+
+
+def _client(port: int) -> ZenohBus:
+    return ZenohBus(BusSettings(mode="client", endpoints=(_endpoint(port),)))

@@ -1,0 +1,179 @@
+"""A trial's folder: figures, page, pictures, trajectories, the merged map."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from mapweave.drawing.map_picture import Drive, MapPicture, draw_map, outline_of
+from mapweave.evaluation.map_score import MapScore, is_false, score_map, write_tum
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.error_plot import draw_errors
+from mapweave.scenarios.expectations import Verdict
+from mapweave.scenarios.figures import Figures
+from mapweave.scenarios.recording import Lost, Recording, Trajectory
+from mapweave.scenarios.report_page import report_page
+from mapweave.scenarios.score import node_truth
+from mapweave.scenarios.trajectories import score_trajectory
+from mapweave.storage.map_file import write_map_file
+
+FIGURES = "figures.json"
+"""Written last: where it is, the folder is whole."""
+OWN = ("*.tum", "merged.mapweave", "map.png", "errors.png", "report.md", "scenario.toml", FIGURES)
+"""What is written here; of these, an earlier trial's are removed first."""
+
+
+def write_folder(
+    out: Path, recording: Recording, figures: Figures, verdicts: Sequence[Verdict], scenario_text: str
+) -> None:
+    """Write everything that a trial measured; a crash leaves whole files only, and no `figures.json`.
+
+    | file | what |
+    |---|---|
+    | `figures.json` | `scenario`, `seed`, `passed`, `figures`, `verdicts` |
+    | `report.md` | the same to be read, with pictures and what happened |
+    | `map.png` | the merged map over the floor plan |
+    | `errors.png` | position error over time |
+    | `scenario.toml` | the scenario, to run it again |
+    | `merged.mapweave` | the merged map |
+    | `r0.truth.tum` | the robot's true trajectory, in world |
+    | `r0.map-1.tum` | what it believed in its map of epoch 1, in that map's frame |
+    | `r0.nodes.tum` | its places in the merged map, each component aligned with the world |
+
+    Args:
+        out: the folder; it is made. A `film.webm` in it is mentioned and left alone.
+        recording: what was left behind.
+        figures: of it.
+        verdicts: what came of the scenario's expectations.
+        scenario_text: the scenario's file.
+
+    Raises:
+        InvalidFile: the disk does not take it.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for old in (path for pattern in reversed(OWN) for path in out.glob(pattern)):
+            old.unlink()
+        _write_all(out, recording, figures, verdicts, scenario_text)
+    except OSError as error:
+        raise InvalidFile(f"{out}: the report cannot be written ({error.strerror})") from None
+
+
+def _write_all(
+    out: Path, recording: Recording, figures: Figures, verdicts: Sequence[Verdict], scenario_text: str
+) -> None:
+    whole, truth = HybridMap(recording.merged.changes), node_truth(recording)
+    poses = {n: (c, p.mean) for n, (c, p) in recording.merged.poses.items()}
+    links = [e for e in whole.edges.values() if e.kind is EdgeKind.MERGED]
+    merged = score_map(poses, links, truth)
+    places = {n: merged.world_from_component[c] @ p for n, (c, p) in poses.items() if n in truth}
+    scores = {}
+    for robot, record in recording.robots.items():
+        _write_tum(out / f"{robot}.truth.tum", record.truth)
+        _write_tum(out / f"{robot}.nodes.tum", _node_trajectory(whole, places, robot))
+        for map_id, estimate in record.estimates.items():
+            if len(estimate.stamps_ns):
+                _write_tum(out / _estimate_name(map_id), estimate)
+                scores[map_id] = score_trajectory(record.truth, estimate)
+    write_map_file(out / "merged.mapweave", recording.merged)
+    _write(out / "scenario.toml", scenario_text)
+    with _beside(out / "map.png") as part:
+        draw_map(_map_picture(recording, figures, whole, places, truth, merged), part)
+    with _beside(out / "errors.png") as part:
+        draw_errors(scores, recording.moments, recording.lost, part)
+    files = {m: (f"{m.agent}.truth.tum", _estimate_name(m)) for m in scores}
+    page = report_page(recording, figures, verdicts, files, (out / "film.webm").exists())
+    _write(out / "report.md", page)
+    content = {
+        "scenario": recording.scenario,
+        "seed": recording.seed,
+        "passed": all(v.good for v in verdicts),
+        "figures": figures.as_dict(),
+        "verdicts": [asdict(verdict) for verdict in verdicts],
+    }
+    _write(out / FIGURES, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def _map_picture(
+    recording: Recording,
+    figures: Figures,
+    whole: HybridMap,
+    places: dict[NodeId, Pose2],
+    truth: dict[NodeId, Pose2],
+    merged: MapScore,
+) -> MapPicture:
+    ate = "-" if figures.merged_ate_m is None else f"{figures.merged_ate_m:.3f} m"
+    recall = "-" if figures.link_recall is None else f"{figures.link_recall:.0%}"
+    parts = "1 component" if merged.components == 1 else f"{merged.components} components"
+    title = (
+        f"{recording.scenario}, seed {recording.seed}: {figures.nodes} nodes, {parts}, {merged.links} links "
+        f"({merged.false_links} false, recall {recall}), ATE {ate}"
+    )
+    starts = {
+        name: Pose2.from_vector(r.truth.poses[0])
+        for name, r in recording.robots.items()
+        if len(r.truth.poses)
+    }
+    known = [e for e in whole.edges.values() if e.a in truth and e.b in truth]
+    return MapPicture(
+        title=title,
+        poses=places,
+        edges=list(whole.edges.values()),
+        outline=outline_of(recording.plan),
+        drives=[_drive(lost, recording.robots[lost.robot].truth, truth) for lost in recording.lost],
+        starts=starts,
+        false=frozenset(e.id for e in known if is_false(e, truth)),
+    )
+
+
+def _drive(lost: Lost, truth: Trajectory, nodes: dict[NodeId, Pose2]) -> Drive:
+    """Where a robot went from where it was put down, until it arrived or was given up."""
+    ends = [t for t in (lost.arrived_ns, lost.gave_up_ns) if t is not None]
+    last = min(ends) if ends else int(truth.stamps_ns[-1])
+    # At the stamp itself it may still have been where it came from.
+    during = (truth.stamps_ns > lost.stamp_ns) & (truth.stamps_ns <= last)
+    goal = nodes.get(lost.goal) if lost.goal is not None else None
+    return Drive(truth.poses[during, :2], lost.world_from_robot, goal, f"drive of {lost.robot}", lost.robot)
+
+
+def _node_trajectory(whole: HybridMap, places: dict[NodeId, Pose2], robot: str) -> Trajectory:
+    """A robot's places in the order in which it saw them."""
+    own = sorted((node for node in places if node.agent == robot), key=lambda n: (whole.nodes[n].stamp_ns, n))
+    stamps = np.array([whole.nodes[node].stamp_ns for node in own], np.int64)
+    return Trajectory(stamps, np.array([places[node].vector for node in own]).reshape(-1, 3))
+
+
+def _estimate_name(map_id: MapId) -> str:
+    return f"{map_id.agent}.map-{map_id.epoch}.tum"
+
+
+def _write_tum(path: Path, trajectory: Trajectory) -> None:
+    """No file for an empty one: others' tools do not take it."""
+    if len(trajectory.stamps_ns):
+        with _beside(path) as part:
+            write_tum(part, trajectory.stamps_ns, trajectory.poses)
+
+
+def _write(path: Path, text: str) -> None:
+    with _beside(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A file to write that takes its place only once it is whole."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,128 @@
+"""What agents and server say of themselves during a trial: asked between ticks, and heard meanwhile."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapweave.agent.status_message import AgentStatus, decode_agent_status
+from mapweave.hybridmap.errors import InvalidMessage, NotConnected
+from mapweave.hybridmap.node import MapId
+from mapweave.scenarios.recording import Trajectory
+from mapweave.wire.bus import Bus, Sample
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
+
+PATIENCE = 120.0
+"""How long the server may take to merge what it has, s."""
+
+
+@dataclass(frozen=True)
+class ServerReport:
+    """The server's state after it has merged everything that it has.
+
+    Attributes:
+        nodes: in the merged map.
+        maps: that have come.
+        components: of the merged map.
+        links: between maps.
+        summary: in words.
+    """
+
+    nodes: int = 0
+    maps: int = 0
+    components: int = 0
+    links: int = 0
+    summary: str = "nothing yet"
+
+    @staticmethod
+    def decode(payload: bytes) -> ServerReport:
+        """Read a server's status; raises InvalidMessage."""
+        values = decode_record(payload)
+        try:
+            return ServerReport(
+                nodes=int(values["nodes"]),
+                maps=int(values["maps"]),
+                components=int(values["components"]),
+                links=int(values["links"]),
+                summary=str(values["summary"]),
+            )
+        except (KeyError, ValueError) as error:
+            raise InvalidMessage(f"server status: {error}") from None
+
+
+class Reports:
+    """Asks for the present, and keeps what each robot believed of its pose while it mapped."""
+
+    def __init__(self, bus: Bus, keys: Keys) -> None:
+        """Begin to listen."""
+        self._bus = bus
+        self._keys = keys
+        self._lock = threading.Lock()
+        self._poses: dict[MapId, dict[int, tuple[float, float, float]]] = {}
+        self._traffic: dict[str, list[int]] = {}
+        self._closing = bus.subscribe(keys.agent_statuses(), self._hear)
+
+    def agent(self, robot: str) -> AgentStatus | None:
+        """What an agent says of its last tick; None if it cannot be reached."""
+        for reply in self._bus.ask(self._keys.agent_status(robot), b"", 5.0):
+            if not reply.error:
+                report = decode_agent_status(reply.payload)
+                self._note(robot, report)
+                return report
+        return None
+
+    def agents(self, robots: Iterable[str]) -> dict[str, AgentStatus]:
+        """Of those that can be reached."""
+        found = ((robot, self.agent(robot)) for robot in robots)
+        return {robot: report for robot, report in found if report is not None}
+
+    def server(self, name: str) -> ServerReport:
+        """What the server says when it has merged all that has come.
+
+        Raises:
+            NotConnected: it does not answer, or cannot.
+        """
+        replies = self._bus.ask(self._keys.server_status(name), b"", PATIENCE)
+        for reply in replies:
+            if not reply.error:
+                return ServerReport.decode(reply.payload)
+        raise NotConnected(f"map server {name}: {replies[0].error if replies else 'no answer'}")
+
+    def estimates(self, robot: str) -> dict[MapId, Trajectory]:
+        """`map_from_robot` over time, of each map that the robot made."""
+        with self._lock:
+            mine = {one: dict(sorted(p.items())) for one, p in self._poses.items() if one.agent == robot}
+        return {
+            one: Trajectory(np.array(list(p), dtype=np.int64), np.array(list(p.values())).reshape(-1, 3))
+            for one, p in mine.items()
+        }
+
+    def traffic(self, robot: str) -> int:
+        """Bytes over the fleet's network, over all lives of the agent, as far as it could say."""
+        with self._lock:
+            return sum(self._traffic.get(robot, []))
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._closing.close()
+
+    def _hear(self, sample: Sample) -> None:
+        self._note(self._keys.parse_agent_status(sample.key), decode_agent_status(sample.payload))
+
+    def _note(self, robot: str, report: AgentStatus) -> None:
+        status = report.status
+        with self._lock:
+            lives = self._traffic.setdefault(robot, [0])
+            # A counter that has fallen belongs to an agent that was started anew.
+            if report.traffic < lives[-1]:
+                lives.append(0)
+            lives[-1] = report.traffic
+            # A robot that says that it does not know where it is claims no pose.
+            if status.mission in ("explore", "carried") and status.nodes and not status.astray:
+                pose = status.map_from_robot
+                by_stamp = self._poses.setdefault(MapId(robot, report.epoch), {})
+                by_stamp[report.stamp_ns] = (pose.x, pose.y, pose.heading)

@@ -1,0 +1,185 @@
+"""One trial from beginning to end: fleet, conductor, recording, figures, folder."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mapweave.agent.pipeline import PipelineSettings
+from mapweave.hybridmap.errors import SettingsError
+from mapweave.scenarios.disks import read_disks
+from mapweave.scenarios.expectations import Verdict, check
+from mapweave.scenarios.figures import Figures
+from mapweave.scenarios.filming import FilmingOptions, filming
+from mapweave.scenarios.fleet import Fleet, Stage
+from mapweave.scenarios.recording import Recording, RobotRecord, Trajectory
+from mapweave.scenarios.scenario import Scenario
+from mapweave.scenarios.scenario_runner import ScenarioRunner
+from mapweave.scenarios.score import score
+from mapweave.scenarios.terminal_progress import TerminalProgress
+from mapweave.sim.placement import starting_places
+
+OWN = ".mapweave-trial"
+"""A file of this name marks a folder as a trial's: only there folders are taken away."""
+FOLDERS = ("agents", "server", "logs", "photographs")
+FILES = (
+    "*.tum", "*.mapweave", "figures.json", "report.*", "map.png", "errors.png", "film.webm", "scenario.toml",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrialOptions:
+    """How a trial is run.
+
+    Attributes:
+        seed: of everything.
+        out: folder for the report; an earlier trial's in it is replaced.
+        processes: a process for each agent, the server and the simulator; else all in one.
+        settings: of every robot's pipeline.
+        settings_file: where they came from, if from a file.
+        film_every: simulated seconds between two frames of the film; 0 makes none.
+        view: port of the live view, None for none.
+        quiet: no progress on the terminal.
+    """
+
+    seed: int
+    out: Path
+    processes: bool = True
+    settings: PipelineSettings = field(default_factory=PipelineSettings)
+    settings_file: Path | None = None
+    film_every: float = 1.0
+    view: int | None = None
+    quiet: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What came of it."""
+
+    recording: Recording
+    figures: Figures
+    verdicts: tuple[Verdict, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "scenario": self.recording.scenario,
+            "seed": self.recording.seed,
+            "passed": self.passed,
+            "figures": self.figures.as_dict(),
+            "verdicts": [asdict(verdict) for verdict in self.verdicts],
+        }
+
+    @property
+    def passed(self) -> bool:
+        """Whether every expectation was met."""
+        return all(verdict.good for verdict in self.verdicts)
+
+
+def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
+    """Run a scenario and leave its report in a folder.
+
+    Raises:
+        MapweaveError: something could not be started, or ended; one line says what.
+    """
+    from mapweave.scenarios.report_folder import write_folder
+
+    # A world that cannot be built shall be one line, before anything has been started.
+    starting_places(scenario.world(options.seed), scenario.robots, options.seed)
+    _make_room(options.out)
+    stage = Stage(scenario, options.seed, options.out, options.settings, options.settings_file)
+    with TerminalProgress(scenario.name, stage.robots, len(scenario.events), options.quiet) as show:
+        recording = _record(stage, options, show)
+        show.stage("scoring")
+        figures = score(recording)
+        verdicts = tuple(check(figures, scenario.expectations))
+        write_folder(options.out, recording, figures, verdicts, scenario.text)
+    return Trial(recording, figures, verdicts)
+
+
+def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Recording:
+    began = time.monotonic()
+    with ExitStack() as stack:
+        fleet = _fleet(stage, options.processes)
+        stack.callback(fleet.end)
+        show.stage("starting server, simulator and agents")
+        fleet.start()
+        started = time.monotonic()
+        wanted = FilmingOptions(options.film_every or 1.0, bool(options.film_every), options.view, show.say)
+        camera = stack.enter_context(filming(stage, wanted, fleet, options.out))
+
+        def look(conductor: ScenarioRunner) -> None:
+            show.look(conductor)
+            camera(conductor)
+
+        conductor = ScenarioRunner(stage, fleet, look, options.film_every or 1.0)
+        stack.callback(conductor.reports.close)
+        conductor.run()
+        ran = time.monotonic() - started
+        show.stage("asking for the merged map and the truth")
+        merged = conductor.merged()
+        status, control = fleet.control.status(), fleet.control
+        truth = {robot: Trajectory(*control.trajectory(robot)) for robot in stage.robots}
+        conductor.agents = conductor.reports.agents(stage.robots)
+        plan, wall = control.plan(), fleet.wall()
+        reports = conductor.reports
+        fleet.end()
+    disks = read_disks(stage.agents, stage.store, stage.robots)
+    robots = {
+        robot: RobotRecord(
+            truth=truth[robot],
+            estimates=reports.estimates(robot),
+            collisions=status.robots[robot].collisions,
+            map_bytes=disks[robot].map_bytes,
+            wire_bytes=reports.traffic(robot),
+            unsaved=disks[robot].unsaved,
+            map_hash=disks[robot].map_hash,
+        )
+        for robot in stage.robots
+    }
+    return Recording(
+        scenario=stage.scenario.name,
+        seed=stage.seed,
+        robots=robots,
+        plan=plan,
+        merged=merged,
+        lost=tuple(conductor.lost),
+        photographed=conductor.photographed,
+        moments=tuple(conductor.moments),
+        recoveries_s=tuple(conductor.recoveries_s),
+        sim_s=status.stamp_ns / 1e9,
+        wall_s=ran,
+        wall={**wall, "starting": started - began, "whole": time.monotonic() - began},
+    )
+
+
+def _fleet(stage: Stage, processes: bool) -> Fleet:
+    if processes:
+        from mapweave.scenarios.process_fleet import ProcessFleet
+
+        return ProcessFleet(stage)
+    from mapweave.scenarios.local_fleet import LocalFleet
+
+    return LocalFleet(stage)
+
+
+def _make_room(out: Path) -> None:
+    """Take away what an earlier trial left in the folder, and nothing else.
+
+    Raises:
+        SettingsError: folders stand there that no trial has made.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    taken = [name for name in FOLDERS if (out / name).exists()]
+    if taken and not (out / OWN).is_file():
+        raise SettingsError(f"{out / taken[0]}: was made by no earlier trial; choose another --out")
+    for name in taken:
+        shutil.rmtree(out / name)
+    for pattern in FILES:
+        for old in out.glob(pattern):
+            old.unlink()
+    (out / OWN).write_text("A trial made the files beside this one; the next trial takes them away.\n")

@@ -1,0 +1,36 @@
+"""What came of a trial, for people."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from mapweave.scenarios.figures import as_text
+from mapweave.scenarios.run import Trial
+from mapweave.scenarios.scenario import Scenario
+
+SHOWN = (
+    "components", "maps", "nodes", "links", "false_links", "false_edges", "merged_ate_m", "trajectory_ate_m",
+    "rpe_m", "found", "found_error_m", "reached", "goal_error_m", "goal_error_deg", "collisions",
+    "unsaved_changes", "troubles", "explored_share",
+    "longest_loop_m", "recovery_s", "bytes_per_node", "wire_bytes_per_robot_minute", "sim_s", "wall_s",
+    "real_time_factor",
+)  # fmt: skip
+"""Of the figures; all of them are in figures.json."""
+
+
+def summary_table(scenario: Scenario, seed: int, trial: Trial) -> Table:
+    """Verdicts first, then the figures that were measured."""
+    verdict = "[green]passed[/]" if trial.passed else "[red]failed[/]"
+    table = Table(title=f"{scenario.name}, seed {seed}: {verdict}", show_header=False)
+    table.add_column(justify="right", style="bold")
+    table.add_column()
+    judged = {one.name: one for one in trial.verdicts}
+    for one in trial.verdicts:
+        colour = "green" if one.good else "red"
+        table.add_row(one.name, f"[{colour}]{'as wanted' if one.good else 'NOT as wanted'}[/]: {one}")
+    for name in SHOWN:
+        value = getattr(trial.figures, name)
+        if name not in judged and value is not None:
+            table.add_row(name, as_text(value))
+    table.add_row("map hash", trial.figures.map_hash[:16])
+    return table

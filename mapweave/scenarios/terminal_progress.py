@@ -1,0 +1,62 @@
+"""Progress of a trial on the terminal."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from mapweave.scenarios.scenario_runner import ScenarioRunner
+
+
+class TerminalProgress:
+    """A line for the trial and one for each robot; what happened stays above."""
+
+    def __init__(self, name: str, robots: tuple[str, ...], events: int, quiet: bool) -> None:
+        """Prepare; with `quiet` nothing is shown."""
+        self._console = Console(stderr=True, quiet=quiet)
+        self._progress = Progress(
+            TextColumn("{task.description:>8}"), BarColumn(bar_width=24), TimeElapsedColumn(),
+            TextColumn("{task.fields[doing]}"), console=self._console, transient=False,
+        )  # fmt: skip
+        self._whole = self._progress.add_task(name[:16], total=float(events), doing="starting")
+        self._robots: dict[str, TaskID] = {
+            robot: self._progress.add_task(robot, total=None, doing="starting") for robot in robots
+        }
+        self._said = 0
+
+    def __enter__(self) -> TerminalProgress:
+        """Begin to show."""
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the last state on the terminal."""
+        self._progress.stop()
+
+    def say(self, text: str) -> None:
+        """One line that stays."""
+        self._console.print(text)
+
+    def stage(self, text: str) -> None:
+        """What is being done beside the scenario."""
+        self._progress.update(self._whole, doing=text)
+
+    def look(self, conductor: ScenarioRunner) -> None:
+        """How far the trial is, and what everybody is doing."""
+        for moment in conductor.moments[self._said :]:
+            self._console.print(f"{moment.stamp_ns / 1e9:7.1f} s  {moment.text}", highlight=False)
+        self._said = len(conductor.moments)
+        doing = f"{conductor.now:6.1f} s  {conductor.doing}"
+        self._progress.update(self._whole, completed=float(conductor.done), doing=doing[:110])
+        for robot, task in self._robots.items():
+            report = conductor.agents.get(robot)
+            if report is None:
+                self._progress.update(task, doing="not in reach")
+                continue
+            status = report.status
+            detail = f", {status.detail}" if status.detail else ""
+            self._progress.update(task, doing=f"{status.nodes:3d} nodes  {status.doing}{detail}"[:110])

@@ -1,0 +1,130 @@
+"""Partings: what has become one map, or is no longer one, from one merge to the next."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable
+
+import networkx as nx
+
+from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.node import MapId
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
+
+MOST_NAMED = 4
+"""Maps that are named one by one."""
+
+
+def joined_maps(merged: MergedMap) -> list[frozenset[MapId]]:
+    """Sets of maps that are one, of single ones too, by their smallest; maps without nodes are in none."""
+    graph: nx.Graph = nx.Graph()
+    for component in merged.components:
+        inside = sorted({node.map for node in component})
+        graph.add_nodes_from(inside)
+        graph.add_edges_from((inside[0], other) for other in inside[1:])
+    return sorted((frozenset(part) for part in nx.connected_components(graph)), key=min)
+
+
+def partings(
+    before: Iterable[frozenset[MapId]], links: Collection[Link] | None, after: MergedMap
+) -> tuple[str, ...]:
+    """What is no longer one map, with the reason.
+
+    Args:
+        before: sets of maps that were one.
+        links: that joined them; None if these are not known any more.
+        after: the merge now.
+
+    Returns:
+        For example `r1.1 and r3.1 are no longer one map: 8 links refused (r1 would have seen ...)`.
+    """
+    part_of = {one: part for part in joined_maps(after) for one in part}
+    out: list[str] = []
+    for whole in before:
+        met = {part_of[one] for one in whole if one in part_of}
+        parts = sorted({part & whole for part in met}, key=lambda p: (-len(p), min(p)))
+        for part in parts[1:]:
+            lost = _refused_now(part, whole, after) if links is None else _lost(part, links, after)
+            out.append(f"{_briefly(parts[0])} and {_briefly(part)} are no longer one map: {lost}")
+    return tuple(out)
+
+
+def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str, ...]:
+    """What has become one map.
+
+    Args:
+        before: sets of maps that were one.
+        after: the merge now.
+
+    Returns:
+        For example `r1.1 and r3.1 are one map now, by 8 links`.
+    """
+    part_of = {one: part for part in before for one in part}
+    wholes = []
+    for whole in joined_maps(after):
+        known = {part & whole for part in {part_of[one] for one in whole if one in part_of}}
+        news = [frozenset([one]) for one in sorted(whole) if one not in part_of]
+        wholes.append([*sorted(known, key=lambda p: (-len(p), min(p))), *news])
+    seat = {one: (k, n) for k, parts in enumerate(wholes) for n, part in enumerate(parts) for one in part}
+    ties: dict[tuple[int, int], Counter[int]] = {}
+    for link in after.links:
+        a, b = seat[link.a.map], seat[link.b.map]
+        if a != b:
+            ties.setdefault(a, Counter())[b[1]] += 1
+            ties.setdefault(b, Counter())[a[1]] += 1
+    out = []
+    for k, parts in enumerate(wholes):
+        # Those first that a link joins to what is one already; so each link is counted once.
+        joined, counts, left = parts[0], Counter(ties.get((k, 0))), list(range(1, len(parts)))
+        while left:
+            n = next((n for n in left if counts[n]), left[0])
+            left.remove(n)
+            by = _links(counts[n]) if counts[n] else "way of others"
+            out.append(f"{_briefly(joined)} and {_briefly(parts[n])} are one map now, by {by}")
+            joined, counts = joined | parts[n], counts + ties.get((k, n), Counter())
+    return tuple(out)
+
+
+def _briefly(maps: frozenset[MapId]) -> str:
+    """For example `r0.1+r2.1`: with `and` nobody would know which are on which side."""
+    named = "+".join(str(one) for one in sorted(maps))
+    return named if len(maps) <= MOST_NAMED else f"{len(maps)} maps with {min(maps)}"
+
+
+def _refused_now(part: frozenset[MapId], whole: frozenset[MapId], after: MergedMap) -> str:
+    """What stands between a part and the rest, where nobody knows any more which links held it."""
+    reasons: Counter[str] = Counter()
+    for r in after.refused:
+        ends = {r.a.map in part, r.b.map in part}
+        if r.link is not None and r.edge is None and len(ends) == 2 and {r.a.map, r.b.map} <= whole:
+            reasons[r.reason] += 1
+    told = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    return "; ".join(told) or "no link joins them any more"
+
+
+def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> str:
+    """What has become of the links that held a part."""
+    held = [link for link in links if (link.a.map in part) != (link.b.map in part)]
+    pairs = {link.pair for link in held}
+    reasons = Counter(r.reason for r in after.refused if r.pair in pairs and r.edge is None)
+    retired = after.rulings.retired
+    away = [next((end.map for end in pair if end.map in retired), None) for pair in pairs]
+    gone = [
+        pair
+        for pair, which in zip(pairs, away, strict=True)
+        if which is None and (pair[0] not in after.poses or pair[1] not in after.poses)
+    ]
+    told = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    for which, count in sorted(Counter(one for one in away if one is not None).items()):
+        told.append(f"{_links(count)} gone, since {reason_of(retired[which])}")
+    if gone:
+        told.append(f"{_links(len(gone))} gone with a node")
+    left = len(pairs) - sum(reasons.values()) - len(gone) - sum(one is not None for one in away)
+    if left > 0:
+        told.append(f"{_links(left)} no longer among the pairs that look most alike")
+    return "; ".join(told) or "a map has fallen into pieces"
+
+
+def _links(count: int) -> str:
+    return "1 link" if count == 1 else f"{count} links"

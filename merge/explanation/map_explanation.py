@@ -1,0 +1,236 @@
+"""Explanations of two maps: why they are one, or are not, and which nodes came nearest to joining them."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import networkx as nx
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.explanation import MapsExplanation, NearMiss
+from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.reachability import reachability_of
+from mapweave.merge.explanation.component_changes import joined_maps
+from mapweave.merge.explanation.node_explanation import node_of
+from mapweave.merge.explanation.own_edges import reach_words
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verification import VerificationSettings, examine
+from mapweave.registration.matching import match
+
+Pair = tuple[MapId, MapId]
+MOST_NEAR = 5
+"""Pairs that are told of each two maps."""
+CLOSELY = 16
+"""So many two maps of a fleet are looked at closely: comparing alike pairs once more takes 50 ms each."""
+
+
+def explain_maps(
+    merged: MergedMap, first: MapId, second: MapId, verification: VerificationSettings | None = None
+) -> MapsExplanation:
+    """Explain two maps.
+
+    Args:
+        merged: the merged map.
+        first: a map.
+        second: another one.
+        verification: as in the merge.
+
+    Raises:
+        InvalidValue: the same map twice, or one that is not there.
+    """
+    for one in (first, second):
+        merged.check(one)
+    if first == second:
+        raise InvalidValue(f"{first} twice: give two maps")
+    pair = min(first, second), max(first, second)
+    return _explained(merged, pair, _between(merged, [pair])[pair], merged.joined(*pair), verification, True)
+
+
+def explain_fleet(
+    merged: MergedMap, most: int, verification: VerificationSettings | None = None
+) -> tuple[MapsExplanation, ...]:
+    """Explain each two maps: those first that are not one, of these those with the most refused links.
+
+    Args:
+        merged: the merged map.
+        most: pairs at most.
+        verification: as in the merge.
+    """
+    part_of = {one: number for number, part in enumerate(joined_maps(merged)) for one in part}
+    refused: Counter[Pair] = Counter()
+    alike: Counter[Pair] = Counter()
+    for r in merged.refused:
+        if r.a.map != r.b.map:
+            (alike if r.link is None else refused)[min(r.a.map, r.b.map), max(r.a.map, r.b.map)] += 1
+
+    def interest(pair: Pair) -> tuple[bool, int, int, Pair]:
+        first, second = (part_of.get(one) for one in pair)
+        return first is not None and first == second, -refused[pair], -alike[pair], pair
+
+    pairs = heapq.nsmallest(most, combinations(sorted(merged.maps), 2), key=interest)
+    found = _between(merged, pairs)
+    components = [{node.map for node in component} for component in merged.components]
+    return tuple(
+        _explained(
+            merged,
+            pair,
+            found[pair],
+            any(one.issuperset(pair) for one in components),
+            verification,
+            k < CLOSELY,
+        )
+        for k, pair in enumerate(pairs)
+    )
+
+
+@dataclass(frozen=True)
+class _Between:
+    """What was found between two maps."""
+
+    links: list[Link] = field(default_factory=list)
+    refused: list[RefusedLink] = field(default_factory=list)
+    unverified: list[RefusedLink] = field(default_factory=list)
+
+
+def _between(merged: MergedMap, pairs: Collection[Pair]) -> dict[Pair, _Between]:
+    """Of all pairs at once: a large fleet has many refusals."""
+    out = {pair: _Between() for pair in pairs}
+    for link in merged.links:
+        if found := out.get((min(link.a.map, link.b.map), max(link.a.map, link.b.map))):
+            found.links.append(link)
+    for r in merged.refused:
+        if r.edge is None and (found := out.get((min(r.a.map, r.b.map), max(r.a.map, r.b.map)))):
+            (found.unverified if r.link is None else found.refused).append(r)
+    return out
+
+
+def _explained(
+    merged: MergedMap,
+    pair: Pair,
+    found: _Between,
+    joined: bool,
+    verification: VerificationSettings | None,
+    closely: bool,
+) -> MapsExplanation:
+    """Of two maps; only looked at closely are alike pairs compared once more."""
+    links, refused = found.links, found.refused
+    if joined:
+        nearest = _weakest(merged, links)
+    else:
+        nearest = _strongest(refused)
+        if closely and len(nearest) < MOST_NEAR:
+            nearest = (*nearest, *_most_alike(merged, found.unverified, verification))[:MOST_NEAR]
+    reason = (
+        _why_joined(merged, *pair, links)
+        if joined
+        else _why_apart(merged, *pair, refused, found.unverified, nearest)
+    )
+    return MapsExplanation(
+        *pair,
+        joined,
+        reason,
+        len(links),
+        sum(link.weight for link in links),
+        len(refused),
+        len(found.unverified),
+        nearest,
+        merged.rulings.about(*pair),
+    )
+
+
+def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[Link]) -> str:
+    if links:
+        landmarks = sum(link.weight for link in links)
+        many = "1 link joins" if len(links) == 1 else f"{len(links)} links join"
+        driven = sum(_drivable(merged, link) for link in links)
+        ways = f"{driven} of them can be driven" if driven else "they tie poses, none can be driven"
+        return f"{first} and {second} are one map: {many} them, with {landmarks} landmarks behind; {ways}"
+    graph: nx.Graph = nx.Graph((link.a.map, link.b.map) for link in merged.links)
+    # A map may be in several pieces, so a way over maps is no more than a hint where to look.
+    way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
+    over = ", ".join(map(str, way[1:-1])) or "each other's pieces"
+    apart = any(set(r.ends) == {first, second} for r in merged.rulings.in_force)
+    more = ", as was ruled; to part them undo the links of that way too" if apart else ""
+    return f"{first} and {second} are one map by way of {over}; no link joins the two directly{more}"
+
+
+def _drivable(merged: MergedMap, link: Link) -> bool:
+    edge = link.edge()
+    return reachability_of(edge, node_of(merged, edge.a), node_of(merged, edge.b)).drivable
+
+
+def _why_apart(
+    merged: MergedMap,
+    first: MapId,
+    second: MapId,
+    refused: Sequence[RefusedLink],
+    unverified: Sequence[RefusedLink],
+    nearest: Sequence[NearMiss],
+) -> str:
+    head = f"{first} and {second} are not one map"
+    ends = ((first, second), (first, first), (second, second))
+    ruling = next((r for r in merged.rulings.in_force if r.ends in ends), None)
+    if ruling is not None:
+        return f"{head}: {reason_of(ruling)}"
+    if refused:
+        reasons = Counter(r.reason for r in refused)
+        told = [
+            reason if count == len(refused) else f"{reason} ({count} of them)"
+            for reason, count in reasons.most_common(2)
+        ]
+        many = (
+            "1 link was found and does not stand"
+            if len(refused) == 1
+            else (f"{len(refused)} links were found and none stands")
+        )
+        return f"{head}: {many}: {'; '.join(told)}"
+    if unverified:
+        best = f"; nearest are {nearest[0].a} and {nearest[0].b}: {nearest[0].lacks}" if nearest else ""
+        many = "1 pair of nodes looks" if len(unverified) == 1 else f"{len(unverified)} pairs of nodes look"
+        return f"{head}: {many} alike and no two show a common pose{best}"
+    return f"{head}: no node of one shares enough alike features with any of the other to be compared"
+
+
+def _strongest(refused: Sequence[RefusedLink]) -> tuple[NearMiss, ...]:
+    """Refused links with the most landmarks behind them that are found nowhere else."""
+    links = [(refusal.link, refusal.reason) for refusal in refused if refusal.link is not None]
+    links.sort(key=lambda item: (-item[0].weight, item[0].pair))
+    return tuple(_near(link, reason) for link, reason in links[:MOST_NEAR])
+
+
+def _weakest(merged: MergedMap, links: Sequence[Link]) -> tuple[NearMiss, ...]:
+    """Links that stand with the fewest landmarks behind them: whoever doubts a merge looks at these first."""
+    few = sorted(links, key=lambda link: (link.weight, link.pair))[:MOST_NEAR]
+    return tuple(_near(link, reach_words(merged, link.edge())) for link in few)
+
+
+def _near(link: Link, words: str) -> NearMiss:
+    inliers = int(link.evidence.get("inliers", link.weight))
+    if link.doubles:
+        words = f"{link.doubles} of these are found at other places too; {words}"
+    return NearMiss(*link.pair, int(link.evidence.get("matches", inliers)), inliers, words)
+
+
+def _most_alike(
+    merged: MergedMap, unverified: Sequence[RefusedLink], verification: VerificationSettings | None
+) -> tuple[NearMiss, ...]:
+    """Pairs without a common pose that share the most alike landmarks, compared once more."""
+    s = verification or VerificationSettings()
+    alike: list[tuple[int, NodeId, NodeId, str]] = []
+    for refusal in unverified:
+        a, b = node_of(merged, refusal.a), node_of(merged, refusal.b)
+        matches = match(a.landmarks.codes, b.landmarks.codes, s.recognition.matching)
+        alike.append((len(matches), a.id, b.id, refusal.reason))
+    alike.sort(key=lambda item: (-item[0], item[1:]))
+    out = []
+    for count, a_id, b_id, reason in alike[:MOST_NEAR]:
+        verdict = examine(node_of(merged, a_id), node_of(merged, b_id), s)
+        inliers = verdict.inliers
+        out.append(NearMiss(a_id, b_id, count, inliers, reason))
+    return tuple(sorted(out, key=lambda near: (-near.inliers, -near.matches, near.a, near.b)))

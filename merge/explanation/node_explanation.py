@@ -1,0 +1,226 @@
+"""Explanations of two nodes: why they are linked, or are not, with every number behind it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.explanation import Misfit, PairExplanation, Standing, Witness
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.merge.explanation.own_edges import claims, consequences, own_edge, said
+from mapweave.merge.manual_constraints import apply_constraints
+from mapweave.merge.outlier_rejection.link_probability import prior_odds, probability, standpoints
+from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
+from mapweave.merge.outlier_rejection.pairwise_consistency import (
+    ConsistencySettings,
+    group_links,
+    loop_distances2,
+)
+from mapweave.merge.outlier_rejection.segmentation import fragments_of
+from mapweave.merge.pose_graph.fragments import fragment_by_node
+from mapweave.merge.pose_graph.links import Link, RefusedLink, link_of
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verification import VerificationSettings, examine, verify
+from mapweave.registration.matching import match
+
+
+def explain_nodes(
+    merged: MergedMap,
+    a: NodeId,
+    b: NodeId,
+    verification: VerificationSettings | None = None,
+    consistency: ConsistencySettings | None = None,
+) -> PairExplanation:
+    """Explain two nodes.
+
+    Args:
+        merged: the merged map.
+        a: a node.
+        b: another one.
+        verification: as in the merge.
+        consistency: as in the merge.
+
+    Raises:
+        InvalidValue: the same node twice, or one that is not there.
+    """
+    if a == b:
+        raise InvalidValue(f"{a} twice: give two nodes")
+    one, two = (node_of(merged, node) for node in sorted((a, b)))
+    link, own = _link(merged, one.id, two.id), own_edge(merged, one.id, two.id)
+    refusal = _refusal(merged, one.id, two.id, own is not None)
+    geometry = link or (refusal.link if refusal else None)
+    if geometry is not None:
+        own = None
+    elif own is not None:
+        geometry = link_of(own)
+    found = replace(
+        _looked_at(one, two, geometry, verification),
+        claims=(*claims(merged, one.id, two.id, own), *consequences(merged, link, one.id, two.id)),
+        rulings=merged.rulings.about(one.id, two.id),
+    )
+    retired = next((r for m, r in merged.rulings.retired.items() if m in (one.id.map, two.id.map)), None)
+    if retired is not None:
+        return replace(found, standing=Standing.UNDONE, reason=reason_of(retired))
+    witnesses: tuple[Witness, ...] = ()
+    verified = geometry is not None and (own is None or own.kind in CLAIMS)
+    if geometry is None and found.a_from_b is not None:
+        geometry = Link(one.id, two.id, found.a_from_b, found.shared, found.evidence)
+    if geometry is not None and (own is None or own.kind in CLAIMS):
+        witnesses = _witnesses(merged, geometry, consistency)
+    standing, reason = _verdict(merged, (one, two), link, own, refusal, witnesses, verification)
+    found = replace(found, standing=standing, reason=reason, witnesses=witnesses)
+    if geometry is None:
+        return found
+    misfit, credence = _judged(merged, geometry, kept=link is not None or own is not None)
+    return replace(found, misfit=misfit, probability=credence if verified else None)
+
+
+def _verdict(
+    merged: MergedMap,
+    ends: tuple[Node, Node],
+    link: Link | None,
+    own: Edge | None,
+    refusal: RefusedLink | None,
+    witnesses: tuple[Witness, ...],
+    verification: VerificationSettings | None,
+) -> tuple[Standing, str]:
+    """What has become of two nodes, and why, in words."""
+    one, two = ends
+    if link is not None:
+        count = sum(w.agrees and w.kept for w in witnesses)
+        return Standing.LINKED, f"{_landmarks(link)}, {_others(count)}"
+    ruling = merged.rulings.against(one.id, two.id)
+    if ruling is not None and refusal is not None and refusal.link is not None:
+        return Standing.UNDONE, reason_of(ruling)
+    if own is not None:
+        more = f"; the merge has compared them too: {refusal.reason}" if refusal else ""
+        return Standing.OWN, f"{said(own)}{more}"
+    if refusal is not None:
+        return Standing.REFUSED, refusal.reason
+    fresh = verify(one, two, verification)
+    words = fresh.reason if isinstance(fresh, RefusedLink) else _landmarks(fresh)
+    return Standing.UNCOMPARED, f"they share too little, or others share more; compared now: {words}"
+
+
+def node_of(merged: MergedMap, node: NodeId) -> Node:
+    """A node of a merged map.
+
+    Raises:
+        InvalidValue: it is not there; the words say what is.
+    """
+    merged.check(node)
+    return merged.maps[node.map].nodes[node]
+
+
+def residuals_px(a: Node, b: Node, a_from_b: Pose2, shared: NDArray[np.int64]) -> Array:
+    """(K,) px, how far shared landmarks are from where a pose predicts them.
+
+    A landmark of a that has a depth is projected into b's image, one that only b knows the depth of into a's.
+
+    Args:
+        a: one node.
+        b: another one.
+        a_from_b: pose of b in a.
+        shared: (K, 2) indices of landmarks in a and in b.
+    """
+    in_a, in_b = a.landmarks.take(shared[:, 0]), b.landmarks.take(shared[:, 1])
+    to_b = b.camera.project(a_from_b.inverse().apply(in_a.points_in_robot(a.camera)))
+    to_a = a.camera.project(a_from_b.apply(in_b.points_in_robot(b.camera)))
+    off = np.where(in_a.has_depth[:, None], to_b - in_b.pixels, to_a - in_a.pixels)
+    out: Array = np.linalg.norm(off.reshape(-1, 2), axis=1)
+    return out
+
+
+def _looked_at(
+    a: Node, b: Node, link: Link | None, verification: VerificationSettings | None
+) -> PairExplanation:
+    """What the landmarks say. A link brings its pose; else the nodes are compared again.
+
+    So what the merge refused because too little agrees is told with the little that does.
+    """
+    s = verification or VerificationSettings()
+    matches = match(a.landmarks.codes, b.landmarks.codes, s.recognition.matching)
+    nothing = np.zeros((0, 2), np.int64)
+    out = PairExplanation(a, b, Standing.UNCOMPARED, "", matches, nothing, np.zeros(0))
+    if link is not None:
+        pose, shared, evidence = link.a_from_b, link.shared, link.evidence
+    else:
+        verdict = examine(a, b, s)
+        if verdict.node_from_robot is None:
+            return out
+        pose, shared, evidence = verdict.node_from_robot, verdict.pairs, verdict.evidence
+    off = residuals_px(a, b, pose.mean, shared)
+    return replace(out, a_from_b=pose, shared=shared, evidence=dict(evidence), residuals_px=off)
+
+
+def _link(merged: MergedMap, a: NodeId, b: NodeId) -> Link | None:
+    return next((link for link in merged.links if link.pair == (a, b)), None)
+
+
+def _refusal(merged: MergedMap, a: NodeId, b: NodeId, joined: bool) -> RefusedLink | None:
+    """What became of a comparison of the two; else of what the robot claimed."""
+    found = [r for r in merged.refused if r.pair == (a, b) and (r.edge is None or not joined)]
+    return max(found, key=lambda r: (r.edge is None, r.link is not None, r.edge or a), default=None)
+
+
+def _landmarks(link: Link) -> str:
+    if not link.doubles:
+        return f"{link.weight} landmarks agree on one pose"
+    inliers = link.weight + link.doubles
+    return f"{inliers} landmarks agree on one pose, {link.doubles} of them found at other places too"
+
+
+def _others(count: int) -> str:
+    more = "1 more link" if count == 1 else f"{count} more links"
+    return f"and {more} between the same pieces of map agree{'s' if count == 1 else ''}"
+
+
+def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, float | None]:
+    component = merged.component_of(link.a)
+    if component is None or component != merged.component_of(link.b):
+        # How many links of all stand tells nothing of these: maps that show alike things bring many.
+        return None, None
+    (found,) = standpoints([link], merged.graphs[component], kept=kept)
+    misfit = Misfit(found.merged_a_from_b, found.off, found.strain2, found.alone)
+    return misfit, probability(found.log_factor, prior_odds(merged))
+
+
+def _witnesses(merged: MergedMap, link: Link, consistency: ConsistencySettings | None) -> tuple[Witness, ...]:
+    """All other links that were found between the two pieces of map, as the merge compares them."""
+    s = consistency or ConsistencySettings()
+    maps = {one: merged.maps[one] for one in {link.a.map, link.b.map}}
+    pieces = fragment_by_node(fragments_of(_without_undone(merged, maps), s))
+    ends = {pieces[link.a].name, pieces[link.b].name}
+    kept = {other.pair for other in merged.links}
+    found = [*merged.links, *(r.link for r in merged.refused if r.link is not None and r.edge is None)]
+    near = [
+        other
+        for other in found
+        if other.pair != link.pair
+        and other.a in pieces
+        and other.b in pieces
+        and {pieces[other.a].name, pieces[other.b].name} == ends
+    ]
+    ((names, group),) = group_links([link, *near], pieces).items()
+    distances2 = loop_distances2(group, pieces[names[0]], pieces[names[1]], s)
+    own = next(k for k, other in enumerate(group) if other.key == link.key)
+    return tuple(
+        Witness(
+            *other.pair,
+            float(distances2[own, k]),
+            bool(distances2[own, k] < s.gate),
+            other.key in kept,
+        )
+        for k, other in enumerate(group)
+        if k != own
+    )
+
+
+def _without_undone(merged: MergedMap, maps: dict[MapId, HybridMap]) -> dict[MapId, HybridMap]:
+    return dict(apply_constraints(maps, (), merged.rulings).maps)

@@ -1,0 +1,52 @@
+"""The links of a merged map by their nodes, kept from merged map to merged map: most stay what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.merge.pose_graph.links import Link
+
+
+class Adjacency:
+    """Which links there are at a node. Only what has come or gone costs more than a glance.
+
+    Attributes:
+        touched: nodes at which links have come or gone with the last merged map.
+    """
+
+    def __init__(self) -> None:
+        """No links yet."""
+        self.touched: set[NodeId] = set()
+        self._links: dict[int, Link] = {}
+        self._at: dict[NodeId, dict[NodeId, Link]] = {}
+
+    def follow(self, links: Iterable[Link]) -> list[Link]:
+        """Take those of the next merged map, and no others.
+
+        Returns:
+            Those of pairs that were not linked before.
+        """
+        now = {id(link): link for link in links}
+        gone = [link for key, link in self._links.items() if key not in now]
+        come = [link for key, link in now.items() if key not in self._links]
+        fresh = [link for link in come if self.between(link.a, link.b) is None]
+        self.touched = {node for link in (*gone, *come) for node in link.pair}
+        for link in gone:
+            for one, other in (link.pair, link.pair[::-1]):
+                del self._at[one][other]
+                if not self._at[one]:
+                    del self._at[one]
+        for link in come:
+            for one, other in (link.pair, link.pair[::-1]):
+                self._at.setdefault(one, {})[other] = link
+        self._links = now
+        return fresh
+
+    def at(self, node: NodeId) -> Collection[Link]:
+        """Links with an end at a node."""
+        return self._at.get(node, {}).values()
+
+    def between(self, a: NodeId, b: NodeId) -> Link | None:
+        """The link of two nodes, in whichever order they are given."""
+        return self._at.get(a, {}).get(b)

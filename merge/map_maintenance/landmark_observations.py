@@ -1,0 +1,115 @@
+"""Looks: what one view of a place tells of the landmarks that a node has of it.
+
+A view should show a landmark if it projects well into the image, from a distance and direction from which it
+looks alike, and nothing that the view knows the depth of stands before it. It shows it if the two were
+matched when view and node were linked, or if it has a landmark near where this one projects that looks
+like it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.descriptor import decode, rounding_noise
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.projected_view import ProjectedView
+from mapweave.registration.matching import squared_distances
+
+
+@dataclass(frozen=True)
+class LandmarkObservationSettings:
+    """When a landmark should be seen, and when it is.
+
+    Attributes:
+        margin_px: it should be seen if it projects this far inside the image.
+        scale: and if its distance has changed by at most this factor.
+        aside: and if it is seen from a direction that differs by at most this, rad.
+        before_px: something hides it that is seen this near to it in the image,
+        before: at less than this share of its distance.
+        near_px: it is found again this near to where it projects,
+        alike: by a descriptor that is at most this far from its own; of two that have nothing to do with each
+            other one in a hundred is, in a whole image.
+    """
+
+    margin_px: float = 12.0
+    scale: float = 1.6
+    aside: float = math.radians(25.0)
+    before_px: float = 12.0
+    before: float = 0.8
+    near_px: float = 25.0
+    alike: float = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkObservations:
+    """What one later view tells of a node's landmarks.
+
+    Attributes:
+        node: that has the landmarks.
+        view: of its place.
+        link: between the two, if there is one.
+        between: node_from_view by which it was worked out.
+        expected: (N,) which landmarks the view should show.
+        found: (N,) which it shows.
+        sure: whether the view stands where it is thought to.
+    """
+
+    node: Node
+    view: Node
+    link: Link | None
+    between: Pose2
+    expected: NDArray[np.bool_]
+    found: NDArray[np.bool_]
+    sure: bool = True
+
+    @staticmethod
+    def of(
+        node: Node, view: Node, link: Link | None, node_from_view: Pose2, s: LandmarkObservationSettings
+    ) -> LandmarkObservations:
+        """Look for a node's landmarks in a view.
+
+        Args:
+            node: that has the landmarks.
+            view: of its place.
+            link: between the two, if there is one.
+            node_from_view: how they stand.
+            s: when a landmark should be seen, and when it is.
+        """
+        shown = expected(node, view, node_from_view, s)
+        found = np.zeros(len(node.landmarks), np.bool_)
+        if link is not None:
+            found[link.shared[:, 0 if link.a == node.id else 1]] = True
+        sought = np.flatnonzero(shown & ~found)
+        if len(sought) and len(view.landmarks):
+            points = node_from_view.inverse().apply(node.points_in_robot[sought])
+            pixels = view.camera.project(points)
+            apart = np.linalg.norm(pixels[:, None] - view.landmarks.pixels[None], axis=2)
+            codes = node.landmarks.codes[sought], view.landmarks.codes
+            unlike = squared_distances(decode(codes[0]), decode(codes[1])) - rounding_noise()
+            found[sought] = ((apart < s.near_px) & (unlike < s.alike**2)).any(axis=1)
+        return LandmarkObservations(node, view, link, node_from_view, shown, found)
+
+
+def expected(old: Node, new: Node, old_from_new: Pose2, s: LandmarkObservationSettings) -> NDArray[np.bool_]:
+    """(N,) which landmarks of a node another view should show.
+
+    Args:
+        old: the node.
+        new: the view.
+        old_from_new: how they stand.
+        s: when a landmark should be seen.
+    """
+    there = ProjectedView.of(old, new, old_from_new, s.margin_px, s.scale, s.aside)
+    shown, candidates = there.fits, np.flatnonzero(there.fits)
+    if len(candidates):
+        known = new.landmarks.take(new.landmarks.has_depth)
+        apart = np.linalg.norm(there.pixels[candidates, None] - known.pixels[None], axis=2)
+        before = (apart < s.before_px) & (known.depths[None] < s.before * there.depths[candidates, None])
+        shown[candidates[before.any(axis=1)]] = False
+    return shown

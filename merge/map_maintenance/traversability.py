@@ -1,0 +1,178 @@
+"""Passages: what can be driven between the nodes of a merged map, and whether a node can be spared."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.reachability import RECOGNISED
+from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.merge.map_maintenance.adjacency import Adjacency
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.registration.pose_arrays import compose_poses, inverse_poses
+
+
+class Traversability:
+    """Edges that can be driven, and nodes that stand in one place, among the nodes that are left.
+
+    Nothing is worked out but around the nodes that are asked about.
+    """
+
+    def __init__(
+        self,
+        merged: MergedMap,
+        links: Adjacency,
+        reaches: ReachabilityCache,
+        near: float,
+        foreign: Iterable[Edge] = (),
+        without: Iterable[NodeId] = (),
+    ) -> None:
+        """Take a merged map.
+
+        Args:
+            merged: the map.
+            links: of it.
+            reaches: what is known of edges; it is written to.
+            near: m, nodes nearer than this to each other stand in one place.
+            foreign: edges that lead out of the maps that tell them, see `ForeignEdges`.
+            without: nodes that are left out from the start.
+        """
+        self._merged, self._book, self._near = merged, reaches, near
+        self._gone = set(without)
+        self._trees: dict[NodeId, cKDTree] = {}
+        self._ways: dict[NodeId, dict[NodeId, float]] = {}
+        self._foreign: dict[NodeId, list[Edge]] = {}
+        for edge in foreign:
+            for end in (edge.a, edge.b):
+                self._foreign.setdefault(end, []).append(edge)
+        self._links = links
+        self._false = {refusal.edge for refusal in merged.refused if refusal.edge is not None}
+
+    def has(self, node: NodeId) -> bool:
+        """Whether a node is left."""
+        return node not in self._gone
+
+    def remove(self, node: NodeId) -> None:
+        """Leave a node out from now on."""
+        self._gone.add(node)
+
+    def add(self, node: NodeId) -> None:
+        """Take a node in again."""
+        self._gone.discard(node)
+
+    def around(self, node: NodeId, reach: float, also_gone: bool = False) -> list[NodeId]:
+        """Other nodes that are left, of the same component, within a distance, m; in the order of ids.
+
+        Args:
+            node: in the middle.
+            reach: m.
+            also_gone: those that were left out too.
+        """
+        graph = self._graph(node)
+        if graph.anchor not in self._trees:
+            self._trees[graph.anchor] = cKDTree(graph.means[:, :2])
+        found = self._trees[graph.anchor].query_ball_point(graph.means[graph.rows[node], :2], reach)
+        near = (graph.nodes[k] for k in found)
+        return sorted(other for other in near if other != node and (also_gone or other not in self._gone))
+
+    def stances(self, node: NodeId, others: Sequence[NodeId]) -> Array:
+        """(K, 3) m, m, rad, how other nodes of the same component stand to a node."""
+        graph = self._graph(node)
+        here, there = (graph.means[graph.index(some)] for some in ([node], others))
+        return compose_poses(inverse_poses(here), there)
+
+    def spare(self, node: NodeId, successor: NodeId, detour: float) -> bool:
+        """Whether every neighbour of a node is reached from its successor without the node.
+
+        Args:
+            node: that may be left out.
+            successor: that stands for it.
+            detour: m, by which such a way may be longer than over the node.
+        """
+        own = self._ways_of(node)
+        there = self._distance(node, successor)
+        limits = {
+            other: length + there + detour
+            for other, length in own.items()
+            if other != successor and other not in self._gone
+        }
+        return not limits or self._reaches(successor, node, limits)
+
+    def _reaches(self, start: NodeId, without: NodeId, limits: dict[NodeId, float]) -> bool:
+        """Whether all nodes are reached within their limits, m; by Dijkstra's algorithm."""
+        left, farthest = dict(limits), max(limits.values())
+        settled: set[NodeId] = set()
+        heap = [(0.0, start)]
+        while heap and left:
+            length, node = heapq.heappop(heap)
+            if node in settled:
+                continue
+            settled.add(node)
+            if left.pop(node, length) < length:
+                return False
+            for other, step in self._ways_of(node).items():
+                barred = other == without or other in self._gone or other in settled
+                if not barred and length + step <= farthest:
+                    heapq.heappush(heap, (length + step, other))
+        return not left
+
+    def _ways_of(self, node: NodeId) -> dict[NodeId, float]:
+        """Neighbours, also those that were left out, with the distance, m."""
+        if node not in self._ways:
+            others = {other for edge in self._edges(node) for other in (edge.a, edge.b)}
+            graph = self._graph(node)
+            others |= set(self.around(node, self._near))
+            others = {other for other in others if other in graph.rows}
+            self._ways[node] = {other: self._distance(node, other) for other in others - {node}}
+        return self._ways[node]
+
+    def _edges(self, node: NodeId) -> Iterator[Edge]:
+        one = self._merged.maps[node.map]
+        own = (one.edges[edge_id] for _, _, edge_id in one.graph.edges(node, keys=True))
+        links = (link.edge() for link in self._links.at(node))
+        for edge in (*own, *links, *self._foreign.get(node, ())):
+            if edge.id not in self._false and self._drivable(edge):
+                yield edge
+
+    def _drivable(self, edge: Edge) -> bool:
+        if edge.kind not in RECOGNISED:
+            return True
+        maps = self._merged.maps
+        a, b = (maps[end.map].nodes.get(end) if end.map in maps else None for end in (edge.a, edge.b))
+        return a is not None and b is not None and self._book.reach(edge, a, b, (None, None)).drivable
+
+    def _graph(self, node: NodeId) -> PoseGraph:
+        component = self._merged.component_of(node)
+        assert component is not None, "a node of the merged map"
+        return self._merged.graphs[component]
+
+    def _distance(self, a: NodeId, b: NodeId) -> float:
+        graph = self._graph(a)
+        off = graph.means[graph.rows[a], :2] - graph.means[graph.rows[b], :2]
+        return float(np.hypot(off[0], off[1]))
+
+
+class ForeignEdges:
+    """Edges that lead out of the maps that tell them: drives among others' nodes. A map is read once."""
+
+    def __init__(self) -> None:
+        """Start with no maps."""
+        self._known: dict[MapId, tuple[HybridMap, tuple[Edge, ...]]] = {}
+
+    def of(self, maps: Mapping[MapId, HybridMap]) -> list[Edge]:
+        """Those of all maps, in the order of the maps."""
+        before, self._known = self._known, {}
+        for map_id, one in maps.items():
+            known = before.get(map_id)
+            if known is None or known[0] is not one:
+                out = (edge for edge in one.edges.values() if {edge.a.map, edge.b.map} != {map_id})
+                known = one, tuple(out)
+            self._known[map_id] = known
+        return [edge for map_id in sorted(self._known) for edge in self._known[map_id][1]]

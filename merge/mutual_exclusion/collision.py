@@ -1,0 +1,55 @@
+"""Clashes: two robots that cannot both have been where a merge puts them, and why in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Collision:
+    """Two robots that would have been at the same place at the same time, or would have seen each other.
+
+    Attributes:
+        first: agent; the one that would have seen the other.
+        second: another one.
+        clock: that says so.
+        moments: how many moments they would have been too near, or seen each other; 0 if what their views
+            should show of each other's maps was enough, after another story was refuted.
+        nearest: how near they would have been, m.
+        time: when that was, s.
+        evidence: natural logarithm of the odds against the merge.
+        where: the first would have seen the second, in words; empty if they would have been in one place.
+        blank: views that show nothing of what the other one has mapped there, if that was decisive.
+    """
+
+    first: str
+    second: str
+    clock: str
+    moments: int
+    nearest: float
+    time: float
+    evidence: float
+    where: str = ""
+    blank: int = 0
+
+    @property
+    def reason(self) -> str:
+        """In words."""
+        if not self.moments:
+            return (
+                f"other links between their maps were refuted, and {self.blank} views of {self.first} and "
+                f"{self.second} show nothing of what the other one mapped there"
+            )
+        views = f"; {self.blank} views of theirs show nothing of what the other one mapped there"
+        views = views if self.blank else ""
+        if self.where:
+            return (
+                f"{self.first} would have seen {self.second} {self.nearest:.1f} m {self.where} "
+                f"at {self.time:.1f} s of clock {self.clock}; its sensors saw nothing there, "
+                f"{self.moments} such moments{views}"
+            )
+        return (
+            f"{self.first} and {self.second} would have been at the same place at the same time: "
+            f"{self.nearest:.2f} m apart at {self.time:.1f} s of clock {self.clock}, "
+            f"{self.moments} such moments{views}"
+        )

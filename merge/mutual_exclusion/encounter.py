@@ -1,0 +1,117 @@
+"""Meetings: the moments of two robots, and what each says about a merge."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.pose import Array
+from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
+from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
+
+
+@dataclass(frozen=True, eq=False)
+class Encounter:
+    """Moments of two robots.
+
+    Attributes:
+        times: (T,) s.
+        known: (T,) whether both are known to be somewhere.
+        distances: (T,) m, between them.
+        close: (K,) indices of moments when they are too near.
+        seen: M looks at where the other one would have been.
+        least_apart: what is too near, m.
+    """
+
+    times: Array
+    known: NDArray[np.bool_]
+    distances: Array
+    close: NDArray[np.int64]
+    seen: VisibilityInterval
+    least_apart: float
+
+    def _windows(self, s: ExclusionSettings) -> NDArray[np.int64]:
+        """(T,) number of the window of time in which a moment is; -1 where it is not known of both."""
+        windows = np.floor(self.times / s.window).astype(np.int64)
+        _, seats = np.unique(windows[self.known], return_inverse=True)
+        out = np.full(len(windows), -1, np.int64)
+        out[self.known] = seats
+        return out
+
+    def by_bodies(self, clear: Array, s: ExclusionSettings) -> Array:
+        """(W,) logarithms of the odds against the merge that each window of time gives.
+
+        Args:
+            clear: (K,) chances that they were clear of each other after all in the moments that are close.
+            s: how long a window is.
+        """
+        # A body takes this share of the neighbourhood; without it many moments would prove anything.
+        free = 1.0 - s.neighbourhood**-2
+        odds = np.where(self.distances < s.neighbourhood * self.least_apart, free, 1.0)
+        odds[self.close] = free / clear
+        seats = self._windows(s)[self.known]
+        # Moments of one window hang together: the mean of their odds is fair all the same, a product is not.
+        out: Array = np.log(np.bincount(seats, odds[self.known]) / np.bincount(seats))
+        return out
+
+    def by_sight(self, odds: Array, s: ExclusionSettings) -> Array:
+        """(S, W) the same of what they should have seen.
+
+        Args:
+            odds: (S, M) against the merge, of each look.
+            s: how long a window is.
+        """
+        seats = self._windows(s)
+        looks, count = seats[self.seen.moments], int(seats.max()) + 1
+        counts = np.bincount(looks, minlength=count)
+        sums = np.array([np.bincount(looks, row, minlength=count) for row in odds])
+        out: Array = np.log(np.where(counts > 0, sums / np.maximum(counts, 1), 1.0))
+        return out
+
+    def refuses(
+        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings, besides: float = 0.0
+    ) -> bool:
+        """Whether that is enough to refuse a merge.
+
+        Args:
+            clear: as in `by_bodies`.
+            odds: as in `by_sight`.
+            weights: (S,) how probable each way is in which poses may be wrong.
+            s: what is enough.
+            besides: natural logarithm of the odds against the merge that other evidence gives.
+        """
+        by_window, total = self.added(clear, odds, weights, s)
+        # What was enough at any time is enough: later meetings do not make it possible.
+        witnesses = np.cumsum(by_window > math.log(2.0))
+        return bool(((witnesses >= s.least_witnesses) & (total + besides >= -math.log(s.doubt))).any())
+
+    def added(self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings) -> tuple[Array, Array]:
+        """(W,) logarithms of the odds against the merge that each window adds to those before, and (W,) sums.
+
+        Over all ways in which poses may be wrong, each as probable as it is: the later windows meet those
+        that the earlier ones have left.
+        """
+        by_way = np.cumsum(self.by_bodies(clear, s) + self.by_sight(odds, s), axis=1)
+        total: Array = -scipy.special.logsumexp(-by_way, axis=0, b=weights[:, None])
+        added: Array = np.diff(total, prepend=0.0)
+        return added, total
+
+    def evidence(
+        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings
+    ) -> tuple[float, float]:
+        """By bodies and by sight, when it was most."""
+        by_bodies = np.cumsum(self.by_bodies(clear, s))
+        _, total = self.added(clear, odds, weights, s)
+        most = int(np.argmax(total))
+        return float(by_bodies[most]), float(total[most] - by_bodies[most])
+
+    def ample(self, clear: Array, odds: Array, s: ExclusionSettings) -> int:
+        """Number of moments after which there is twice as much evidence as is asked for; all, if never."""
+        evidence = np.cumsum(self.by_bodies(clear, s) + self.by_sight(odds, s)[0])
+        enough = np.flatnonzero(evidence >= -2.0 * math.log(s.doubt))
+        seats = self._windows(s)
+        return int(np.flatnonzero(seats == enough[0])[-1]) + 1 if len(enough) else len(seats)

@@ -1,0 +1,214 @@
+"""Absence: views that show nothing of what another robot has mapped there.
+
+Two rooms that look alike are alike inside; what lies before their doors is not. Under a merge that takes the
+one for the other, a robot that looks out of the one door should see what was mapped from the other. A view
+should show a landmark if it projects well into the image, from about the distance and direction from which it
+was mapped, and if the view itself knows something about there that is no nearer: then nothing stands before
+it, and the robot looked that far. A view that should show many landmarks and shows as good as none speaks
+against the merge; one that shows some speaks for it.
+
+**Why a true merge is safe.** Things are moved, people stand before them, descriptors fail. Under a true merge
+a view that should show many landmarks shows none with a chance of at most ε (`missed`). Against this stands a
+merge of places that look alike in a share q of what they show (`alike`). The odds against the merge are then
+(1 - q) / ε where nothing is shown and q / (1 - ε) where something is; their expectation under a true merge is
+at most 1, as in `mapweave.merge.mutual_exclusion.mutual_visibility`, and so is that of the mean over all
+views that look at one place, which are one witness. Views of places that are apart multiply. Whether a whole
+building was redecorated between two views no share tells: so only views within an hour by one clock are
+compared, the odds are never more than `most`, and by themselves they refute nothing: they are heard where
+robots' bodies speak against a merge.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory
+from mapweave.merge.pose_graph.projected_view import ProjectedView
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.registration.matching import match
+
+
+@dataclass(frozen=True)
+class NegativeEvidenceSettings:
+    """What a view should show of what another robot has mapped.
+
+    Attributes:
+        near: a view is held against nodes at most so far away, m,
+        turn: that look at most so much another way, rad,
+        lasting: and were made at most so much earlier or later, s;
+        most_nodes: against the nearest ones if there are more.
+        most_views: of each robot are looked at, evenly chosen.
+        sigma_xy: how the two stand is known as well as this at least, m,
+        sigma_heading: and this, rad.
+        margin: a landmark should be seen if it projects this far inside the image, rad.
+        scale: and if its distance has changed by at most this factor.
+        aside: and if it is seen from a direction that differs by at most this, rad.
+        around: and if the view knows a depth this near to it in the image, rad,
+        before: and none there of less than this share of the landmark's distance.
+        within: it is found if what matches it is this near to where it should be, rad.
+        least: landmarks that a view should show before it says anything.
+        nothing: a view shows nothing if it shows at most this share of them.
+        missed: share of such views, at most, that show nothing though the merge is true.
+        alike: how often places that are taken for each other show the same.
+        apart: views that look at what is nearer than this are one witness, m.
+        most: odds against a merge are never more: that all things changed is as probable as this.
+    """
+
+    near: float = 1.5
+    turn: float = math.radians(50.0)
+    lasting: float = 3600.0
+    most_nodes: int = 4
+    most_views: int = 80
+    sigma_xy: float = 0.15
+    sigma_heading: float = math.radians(3.0)
+    margin: float = 0.04
+    scale: float = 1.4
+    aside: float = math.radians(15.0)
+    around: float = 0.1
+    before: float = 0.8
+    within: float = 0.15
+    least: int = 20
+    nothing: float = 0.03
+    missed: float = 0.02
+    alike: float = 0.85
+    apart: float = 1.5
+    most: float = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """N views that should show something.
+
+    Attributes:
+        places: (N, 2) m, in merged: the middle of what they should show.
+        expected: (N,) how many landmarks they should show.
+        found: (N,) how many of these they show.
+    """
+
+    places: Array
+    expected: NDArray[np.int64]
+    found: NDArray[np.int64]
+
+    def show_nothing(self, s: NegativeEvidenceSettings) -> NDArray[np.bool_]:
+        """(N,) which show nothing of what they should."""
+        out: NDArray[np.bool_] = self.found <= s.nothing * self.expected
+        return out
+
+    def odds_against(self, s: NegativeEvidenceSettings) -> Array:
+        """(N,) odds against the merge that each gives."""
+        out: Array = np.where(self.show_nothing(s), (1.0 - s.alike) / s.missed, s.alike / (1.0 - s.missed))
+        return out
+
+    def witnesses(self, s: NegativeEvidenceSettings) -> NDArray[np.int64]:
+        """(N,) number of the place that each looks at."""
+        seats = np.full(len(self.places), -1, np.int64)
+        for k in range(len(seats)):
+            if seats[k] < 0:
+                ways = self.places - self.places[k]
+                seats[(seats < 0) & (np.hypot(ways[:, 0], ways[:, 1]) < s.apart)] = seats.max(initial=-1) + 1
+        return seats
+
+    def evidence(self, s: NegativeEvidenceSettings) -> float:
+        """Natural logarithm of the odds against the merge."""
+        if not len(self.places):
+            return 0.0
+        seats = self.witnesses(s)
+        means = np.bincount(seats, self.odds_against(s)) / np.bincount(seats)
+        return min(float(np.log(means).sum()), math.log(s.most))
+
+
+def negative_evidence(
+    graph: PoseGraph,
+    first: BodyTrajectory,
+    second: BodyTrajectory,
+    settings: NegativeEvidenceSettings | None = None,
+) -> Views:
+    """What the views of two robots should show of what the other one has mapped, and what they do show.
+
+    Args:
+        graph: the merged component that holds the nodes of both.
+        first: of one robot.
+        second: of another one, by the same clock.
+        settings: when a view should show something.
+    """
+    s = settings or NegativeEvidenceSettings()
+    rows: list[tuple[Array, int, int]] = []
+    for looking, mapped in ((first, second), (second, first)):
+        chosen = np.unique(np.linspace(0, len(looking.views) - 1, s.most_views).round().astype(np.int64))
+        pairs = _near(graph, looking, mapped, chosen, s)
+        for k in np.unique(pairs[:, 0]):
+            one = [_look(graph, mapped.views[j], looking.views[k], s) for j in pairs[pairs[:, 0] == k, 1]]
+            points = np.concatenate([points for points, _ in one])
+            if len(points) >= s.least:
+                rows.append((points.mean(axis=0), len(points), sum(found for _, found in one)))
+    return Views(
+        np.array([place for place, _, _ in rows]).reshape(-1, 2),
+        np.array([expected for _, expected, _ in rows], np.int64),
+        np.array([found for _, _, found in rows], np.int64),
+    )
+
+
+def _near(
+    graph: PoseGraph,
+    looking: BodyTrajectory,
+    mapped: BodyTrajectory,
+    chosen: NDArray[np.int64],
+    s: NegativeEvidenceSettings,
+) -> NDArray[np.int64]:
+    """(P, 2) views, and nodes of the other robot that might show the same, the nearest ones of each view."""
+    lookers, mappers = ([view.id for view in trail.views] for trail in (looking, mapped))
+    here, there = graph.means[graph.index([lookers[k] for k in chosen])], graph.means[graph.index(mappers)]
+    ways = np.hypot(*(here[:, None, :2] - there[None, :, :2]).transpose(2, 0, 1))
+    turns = np.abs(np.angle(np.exp(1j * (here[:, None, 2] - there[None, :, 2]))))
+    gaps = np.abs(looking.view_times[chosen][:, None] - mapped.view_times[None])
+    ways[(turns > s.turn) | (gaps > s.lasting)] = np.inf
+    nearest = np.argsort(ways, axis=1, kind="stable")[:, : s.most_nodes]
+    i, j = np.nonzero(np.take_along_axis(ways, nearest, axis=1) < s.near)
+    pairs = np.stack([chosen[i], nearest[i, j]], axis=1)
+    if not len(pairs):
+        return pairs
+    between = graph.relative([lookers[k] for k in pairs[:, 0]], [mappers[k] for k in pairs[:, 1]]).covariances
+    known = np.linalg.eigvalsh(between[:, :2, :2])[:, -1] < s.sigma_xy**2
+    out: NDArray[np.int64] = pairs[known & (between[:, 2, 2] < s.sigma_heading**2)]
+    return out
+
+
+def _look(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings) -> tuple[Array, int]:
+    """(K, 2) m, in merged, a node's landmarks that a view should show, and how many of them it shows."""
+    merged_from_node = graph.pose(node.id)
+    node_from_view = merged_from_node.inverse() @ graph.pose(view.id)
+    shown, pixels = should_show(node, view, node_from_view, s)
+    if not len(shown):
+        return np.zeros((0, 2)), 0
+    seats = np.full(len(node.landmarks), -1)
+    seats[shown] = np.arange(len(shown))
+    one, other = match(node.landmarks.codes, view.landmarks.codes).T
+    one, other = seats[one[seats[one] >= 0]], other[seats[one] >= 0]
+    off = np.linalg.norm(pixels[one] - view.landmarks.pixels[other], axis=1) / view.camera.fx
+    return merged_from_node.apply(node.points_in_robot[shown][:, :2]), int((off < s.within).sum())
+
+
+def should_show(
+    node: Node, view: Node, node_from_view: Pose2, s: NegativeEvidenceSettings
+) -> tuple[NDArray[np.int64], Array]:
+    """Which of a node's landmarks a view should show, and (K, 2) px where.
+
+    Args:
+        node: that has mapped them.
+        view: another node.
+        node_from_view: how they stand.
+        s: when a landmark should be seen.
+    """
+    there = ProjectedView.of(node, view, node_from_view, s.margin * view.camera.fx, s.scale, s.aside)
+    shown = np.flatnonzero(there.fits)
+    known = view.landmarks.take(view.landmarks.has_depth)
+    off = np.linalg.norm(there.pixels[shown, None] - known.pixels[None], axis=2) / view.camera.fx
+    about, before = off < s.around, known.depths[None] < s.before * there.depths[shown, None]
+    clear = (about & ~before).any(axis=1) & ~(about & before).any(axis=1)
+    return shown[clear], there.pixels[shown[clear]]

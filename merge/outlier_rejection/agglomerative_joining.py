@@ -1,0 +1,270 @@
+"""Maps are joined step by step, best supported first, and each step is evidence for the next.
+
+Two maps that few links join may be joined by many once one of them is part of something larger; of two
+stories that are supported alike one may then prevail; and a link that was too little alone may be borne out
+by what others have joined. So in each round only pieces are joined of which each is the other's best
+supported one. Then the links between the larger pieces are sorted anew, all together, and those within one
+piece are tested against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence, Set
+
+import networkx as nx
+
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.merge.outlier_rejection.closing_links import misfits
+from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
+from mapweave.merge.outlier_rejection.link_groups import LinkGroup
+from mapweave.merge.outlier_rejection.link_probability import standpoints
+from mapweave.merge.outlier_rejection.pairwise_consistency import (
+    ConsistencySettings,
+    Sorted,
+    group_links,
+    sort_links,
+)
+from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
+from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+Key = tuple[NodeId, NodeId]
+"""Names of two pieces of map, smaller first."""
+
+MOST_POOLED = 200
+"""Links between two components that are sorted together, the best supported ones; the others are tested
+against what these join. All pairs of them are compared."""
+CONTRADICTION = "contradicts better supported links by way of other maps"
+
+
+def agglomerate(
+    solver: ComponentSolver,
+    groups: Mapping[Key, LinkGroup],
+    s: ConsistencySettings,
+    standing: Sequence[Link] = (),
+    closed: Set[Key] = frozenset(),
+) -> tuple[list[Link], list[RefusedLink]]:
+    """Join fragments by their groups of links.
+
+    Args:
+        solver: of the fragments.
+        groups: by the names of the fragments.
+        s: when links are believed.
+        standing: links that are believed already; the others are tested against what they join.
+        closed: pairs of links that are not asked: they were refused, and nothing near them has changed.
+
+    Returns:
+        The links that join, and those that do not; what a group has refuted or what is closed is in neither.
+    """
+    kept = list(standing)
+    told = {link.key for link in kept} | closed
+    asked = {key: [k for k in group.links if k.key not in told] for key, group in groups.items()}
+    asked = {key: links for key, links in asked.items() if links}
+    for key in asked:
+        if groups[key].first is groups[key].second:
+            kept += [link for link in groups[key].sorted.kept if link.key not in told]
+    refused = {r.pair: r for key in asked for r in groups[key].sorted.refused if r.pair not in told}
+    waiting = [link for key, links in asked.items() if key[0] != key[1] for link in links]
+    between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
+    heard = _heard(groups)
+    agreed = {
+        link.key
+        for key in asked
+        if key in between
+        for link in _beyond_chance(between[key], [between[key]], heard[key[0].map], s).kept
+    }
+    sorted_before: dict[Key, tuple[PoseGraph, PoseGraph, int, Sorted]] = {}
+    while True:
+        by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
+        inside = [link for link in waiting if by_node[link.a] is by_node[link.b]]
+        waiting = [link for link in waiting if by_node[link.a] is not by_node[link.b]]
+        borne_out = _borne_out(inside, by_node, agreed, heard, s)
+        kept += borne_out
+        fits = {link.pair for link in borne_out}
+        for link in inside:
+            if link.pair not in fits:
+                refused.setdefault(link.key, refuse(link, CONTRADICTION))
+        pools = group_links(waiting, by_node)
+        if not pools:
+            break
+        own: dict[Key, list[Sorted]] = {}
+        for (a, b), found in between.items():
+            first, second = sorted((by_node[a].name, by_node[b].name))
+            own.setdefault((first, second), []).append(found)
+        pooled = {}
+        for key, links in pools.items():
+            first_graph, second_graph = (by_node[name].graph for name in key)
+            known = sorted_before.get(key)
+            if known is None or known[:3] != (first_graph, second_graph, len(links)):
+                found = _sorted(links, key, groups, by_node, s)
+                known = sorted_before[key] = first_graph, second_graph, len(links), found
+            pooled[key] = _beyond_chance(known[3], own[key], heard[key[0].map], s)
+        chosen = joined({key: found.weight for key, found in pooled.items() if found.kept}, pooled)
+        if not chosen:
+            for key, found in pooled.items():
+                refused = {**{r.pair: r for r in found.refused}, **refused}
+                for link in pools[key]:
+                    refused.setdefault(link.key, refuse(link, found.refused[0].reason))
+            break
+        kept += [link for key in chosen for link in pooled[key].kept]
+        through = {link.key for key in chosen for link in pooled[key].kept}
+        waiting = [link for link in waiting if link.key not in through]
+    told = {link.key for link in kept}
+    left = [link for links in asked.values() for link in links if link.key not in told]
+    kept = _heard_again(solver, kept, left, agreed, heard, s)
+    told = {link.key for link in kept}
+    return kept, [r for pair, r in refused.items() if pair not in told]
+
+
+def _heard_again(
+    solver: ComponentSolver,
+    kept: Sequence[Link],
+    refused: Sequence[Link],
+    agreed: set[tuple[NodeId, NodeId]],
+    heard: Mapping[MapId, ChanceSupport],
+    s: ConsistencySettings,
+) -> list[Link]:
+    """Refused links that the joined map bears out after all, until there is none.
+
+    Of hundreds of links that are right some two will miss each other's gate by chance, and a clique keeps but
+    one of them. What all others make of the map is a better judge than any one of them.
+    """
+    kept, refused = list(kept), list(refused)
+    while refused:
+        by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
+        inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
+        back = _borne_out(inside, by_node, agreed, heard, s)
+        if not back:
+            return kept
+        kept += back
+        pairs = {link.key for link in back}
+        refused = [link for link in refused if link.key not in pairs]
+    return kept
+
+
+def _sorted(
+    links: Sequence[Link],
+    key: Key,
+    groups: Mapping[Key, LinkGroup],
+    by_node: Mapping[NodeId, Fragment],
+    s: ConsistencySettings,
+) -> Sorted:
+    """Sort the links between two pieces; what a group is by itself has been found out already."""
+    group = groups.get(key)
+    first, second = by_node[key[0]], by_node[key[1]]
+    if group is not None and len(group.first) == len(first) and len(group.second) == len(second):
+        return group.sorted
+    best = sorted(links, key=lambda link: (-link.weight, link.pair))[:MOST_POOLED]
+    return sort_links(best, first, second, s)
+
+
+def _heard(groups: Mapping[Key, LinkGroup]) -> dict[MapId, ChanceSupport]:
+    """What false witnesses are like, by map: read off all maps that links tie to it, directly or not."""
+    ties: nx.Graph = nx.Graph()
+    ties.add_edges_from((group.first.name.map, group.second.name.map) for group in groups.values())
+    out: dict[MapId, ChanceSupport] = {}
+    for island in nx.connected_components(ties):
+        supports = [
+            group.sorted.supports[0]
+            for group in groups.values()
+            if group.first is not group.second and group.first.name.map in island
+        ]
+        out |= dict.fromkeys(island, ChanceSupport.of(supports))
+    return out
+
+
+def _beyond_chance(
+    found: Sorted, own: Sequence[Sorted], heard: ChanceSupport, s: ConsistencySettings
+) -> Sorted:
+    """What chance does is read off all pieces but the two that are judged."""
+    return found.beyond_chance(heard.without(ChanceSupport.of(one.supports[0] for one in own)), s)
+
+
+def best_supported(weights: Mapping[Key, float]) -> dict[NodeId, Key]:
+    """Of each piece the two that are joined by the greatest weight: it and another one."""
+    best: dict[NodeId, Key] = {}
+    for key in _ranked(weights):
+        for piece in key:
+            best.setdefault(piece, key)
+    return best
+
+
+def joined(weights: Mapping[Key, float], tied: Container[Key]) -> list[Key]:
+    """Which pieces are joined in this round: those of which each is the other's best supported one.
+
+    A piece of which the other one has a better supported one is joined to it too, if no links at all tie it
+    to any of those: then they have nothing to say to each other, and whichever comes first is the same.
+
+    Args:
+        weights: behind the links that would join two pieces, the smaller first.
+        tied: pieces between which there are links at all.
+
+    Returns:
+        Best supported first.
+    """
+    best = best_supported(weights)
+    better: dict[NodeId, list[NodeId]] = {}
+    out = []
+    for key in _ranked(weights):
+        for one, other in (key, key[::-1]):
+            if best[one] == key and not any(
+                (min(one, rival), max(one, rival)) in tied for rival in better.get(other, ())
+            ):
+                out.append(key)
+                break
+        for one, other in (key, key[::-1]):
+            better.setdefault(one, []).append(other)
+    return out
+
+
+def _ranked(weights: Mapping[Key, float]) -> list[Key]:
+    return sorted(weights, key=lambda key: (-weights[key], key))
+
+
+def _borne_out(
+    links: Sequence[Link],
+    by_node: Mapping[NodeId, Fragment],
+    agreed: set[tuple[NodeId, NodeId]],
+    heard: Mapping[MapId, ChanceSupport],
+    s: ConsistencySettings,
+) -> list[Link]:
+    """The links within pieces that these bear out: others of their group agree with them and they fit, or how
+    well they fit makes it likely enough that they are true.
+    """
+    inside: dict[NodeId, tuple[PoseGraph, list[Link]]] = {}
+    for link in links:
+        piece = by_node[link.a]
+        inside.setdefault(piece.name, (piece.graph, []))[1].append(link)
+    out: list[Link] = []
+    for graph, here in inside.values():
+        least = max(0.0, s.least_evidence - heard[here[0].a.map].log_odds)
+        good = borne_out(here, graph, agreed, least, s)
+        out += [link for link, yes in zip(here, good, strict=True) if yes]
+    return out
+
+
+def borne_out(
+    links: Sequence[Link],
+    graph: PoseGraph,
+    agreed: Container[tuple[NodeId, NodeId]],
+    least: float,
+    s: ConsistencySettings,
+) -> list[bool]:
+    """Of links within one piece, which it bears out.
+
+    Args:
+        links: with both ends in the piece.
+        graph: the piece.
+        agreed: links that others of their group agree with.
+        least: natural logarithm of Bayes' factor from which any other one is likely enough.
+        s: when links are believed.
+    """
+    if not links:
+        return []
+    fits = misfits(links, graph, s) < s.gate
+    out = [bool(good) and link.key in agreed for link, good in zip(links, fits, strict=True)]
+    asked = [k for k, good in enumerate(out) if not good]
+    for k, found in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
+        out[k] = bool(found.log_factor > least)
+    return out

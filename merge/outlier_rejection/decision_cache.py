@@ -1,0 +1,118 @@
+"""What a merge has found out that the next one need not find out again.
+
+Everything kept here depends on nothing but what it is kept with, compared by identity: maps, fragments and
+links are never changed, only replaced. So a merge with a memory is the merge without one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, trajectories_of
+from mapweave.merge.outlier_rejection.link_groups import LinkGroup, Verdict
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, group_links
+from mapweave.merge.outlier_rejection.segmentation import fragments_of
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link
+
+T = TypeVar("T")
+Key = tuple[NodeId, NodeId]
+"""Names of two fragments, or two nodes, smaller first."""
+
+
+class DecisionCache:
+    """Fragments by map, and sorted groups of links by fragments. For merges with the same settings."""
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self._maps: dict[MapId, tuple[HybridMap, list[Fragment]]] = {}
+        self._groups: dict[Key, LinkGroup] = {}
+        self._weighed: dict[Key, tuple[Link, Link]] = {}
+        self._trails: dict[NodeId, tuple[Fragment, tuple[BodyTrajectory, ...]]] = {}
+
+    def fragments(
+        self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings, strain: float
+    ) -> list[Fragment]:
+        """See `mapweave.merge.outlier_rejection.segmentation.fragments_of`; only maps that have changed are
+        cut.
+        """
+        found: list[Fragment] = []
+        for map_id, one in maps.items():
+            known = self._maps.get(map_id)
+            if known is None or known[0] is not one:
+                known = self._maps[map_id] = one, fragments_of({map_id: one}, s, strain)
+            found += known[1]
+        return sorted(found, key=lambda fragment: fragment.name)
+
+    def weighed(self, links: Sequence[Link], weighed: Sequence[Link]) -> list[Link]:
+        """Links as they were weighed now; one that has the weight it had before is the same object as before.
+
+        Args:
+            links: as they were verified.
+            weighed: the same by `mapweave.merge.outlier_rejection.distinctness.weigh`, in the same order.
+        """
+        found = []
+        for link, now in zip(links, weighed, strict=True):
+            if now is not link:
+                before = self._weighed.get(link.pair)
+                if before is None or before[0] is not link or before[1].doubles != now.doubles:
+                    before = self._weighed[link.pair] = link, now
+                now = before[1]
+            found.append(now)
+        return found
+
+    def groups(
+        self,
+        links: Sequence[Link],
+        by_node: Mapping[NodeId, Fragment],
+        s: ConsistencySettings,
+        verdict: Verdict,
+        exact: bool = True,
+    ) -> dict[Key, LinkGroup]:
+        """See `LinkGroup.of`; links between two fragments are sorted anew only if any of them is new.
+
+        Args:
+            links: each once.
+            by_node: the fragment of each node.
+            s: when links are believed.
+            verdict: on sets that are supported alike; it depends on the two fragments alone.
+            exact: also if either fragment has changed elsewhere.
+
+        Returns:
+            By the names of the fragments.
+        """
+        out = {}
+        for (a, b), some in group_links(links, by_node).items():
+            first, second = by_node[a], by_node[b]
+            known = self._groups.get((a, b))
+            same = known is not None and known.first is first and known.second is second
+            if known is None or not (same or not exact) or not _same(known.given, some):
+                known = self._groups[a, b] = LinkGroup.of(some, first, second, s, verdict)
+            out[a, b] = known
+        return out
+
+    def trails(self, fragment: Fragment, one: HybridMap) -> tuple[BodyTrajectory, ...]:
+        """See `trails_of`; those of a fragment are read once."""
+        known = self._trails.get(fragment.name)
+        if known is None or known[0] is not fragment:
+            found = trajectories_of([one.nodes[node] for node in fragment.nodes])
+            known = self._trails[fragment.name] = fragment, found
+        return known[1]
+
+    def forget(self, maps: set[MapId]) -> None:
+        """Drop what is known of maps that are gone."""
+        self._maps = {k: v for k, v in self._maps.items() if k not in maps}
+        self._groups = _among(self._groups, maps)
+        self._weighed = _among(self._weighed, maps)
+
+
+def _among(known: dict[Key, T], gone: set[MapId]) -> dict[Key, T]:
+    """What is known between two nodes of maps that are not gone."""
+    return {k: v for k, v in known.items() if k[0].map not in gone and k[1].map not in gone}
+
+
+def _same(one: Sequence[Link], other: Sequence[Link]) -> bool:
+    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))

@@ -1,0 +1,257 @@
+"""Distinctness: which landmarks tell a place at all.
+
+In a warehouse the same cartons stand in every other bay. What two nodes share there is found again between
+many nodes, and each time the geometry is right: nothing in the two images tells that it is another bay. But
+the fleet's maps do. A node's landmark that was recognised at one place, and at another one which by that
+robot's own way is not the same, is something that there is twice; so is one that a loop recognised against
+its map's own way. Such a landmark says what is seen, not where. It counts for no link of its node, wherever
+that leads to: only the rest of a link's landmarks speak for it. (Text retrieval has long weighed words by how
+few documents they are in, Sparck Jones 1972; here geometry tells which landmarks are in how many places.)
+
+What is left of a true link is what there is nowhere else: a sign, a wall, the one bay with other goods.
+
+Landmarks are followed from node to node, by the images that a robot saw on its way and by loops that agree
+with it: what is found out at one node holds for all that show the same thing.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Array
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import DOUBLES, Link, link_of
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
+
+FOLLOWED = (EdgeKind.MAPPED, EdgeKind.TURNED)
+"""Edges whose two nodes share landmarks that were tracked from image to image."""
+
+Landmark = tuple[NodeId, int]
+"""Which node, and which of its landmarks."""
+
+
+@dataclass(frozen=True)
+class DistinctnessSettings:
+    """When two recognitions mean two places.
+
+    Attributes:
+        apart_xy: they contradict each other by more than this, m, or
+        apart_heading: by more than this, rad. Less is how well places are measured, not another place.
+    """
+
+    apart_xy: float = 0.5
+    apart_heading: float = 0.26
+
+
+def weigh(
+    links: Sequence[Link],
+    by_node: Mapping[NodeId, Fragment],
+    maps: Mapping[MapId, HybridMap],
+    consistency: ConsistencySettings | None = None,
+    settings: DistinctnessSettings | None = None,
+) -> list[Link]:
+    """Count how many landmarks of each link are found at other places too.
+
+    Args:
+        links: verified, both nodes in fragments.
+        by_node: the fragment of each node.
+        maps: with the robots' own edges.
+        consistency: when two measurements contradict each other,
+        settings: and by how much at least.
+
+    Returns:
+        The links in the same order; where there are such landmarks, with their number among the evidence.
+        Links that do not tell their landmarks stay as they are. The order has no say.
+    """
+    c, s = consistency or ConsistencySettings(), settings or DistinctnessSettings()
+    # What a robot says of nodes of others it did not see: they would lose their links by it.
+    own = (e for one in maps.values() for e in one.edges.values() if e.within)
+    claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
+    told = (link for link in (*links, *claims) if len(link.shared))
+    known = [link for link in told if link.a in by_node and link.b in by_node]
+    doubles: set[Landmark] = set()
+    if known:
+        sides = _Sides.of(known, by_node)
+        loops, pairs = sides.loops(), sides.pairs()
+        astray = sides.contradict(loops, None, c, s)
+        for k in loops[astray]:
+            doubles |= _ends(known[k])
+        for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c, s)]:
+            node, one, other = sides.meeting(i, j)
+            doubles |= {(node, int(landmark)) for landmark in np.intersect1d(one, other)}
+        if doubles:
+            doubles = _followed(doubles, [known[k] for k in loops[~astray]], maps)
+    return [_weighed(link, doubles) for link in links]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """N links, each from both of its sides: row k as link k has it, row N + k turned round.
+
+    Attributes:
+        links: N.
+        poses: (2N) of the far end in the near one.
+        near: (2N,) rows in `places`.
+        far: (2N,) likewise.
+        fragments: (P,) which fragment a place is in.
+        places: (P, 3) m, m, rad, all nodes of the fragments, each in its fragment's frame.
+        graphs: of the fragments.
+        starts: (F,) first row of each fragment.
+    """
+
+    links: Sequence[Link]
+    poses: PoseGaussians
+    near: NDArray[np.int64]
+    far: NDArray[np.int64]
+    fragments: NDArray[np.int64]
+    places: Array
+    graphs: tuple[PoseGraph, ...]
+    starts: NDArray[np.int64]
+
+    @staticmethod
+    def of(links: Sequence[Link], by_node: Mapping[NodeId, Fragment]) -> _Sides:
+        """Of links with both nodes in fragments."""
+        graphs = {by_node[node].name: by_node[node].graph for link in links for node in link.pair}
+        sizes = [len(graph.nodes) for graph in graphs.values()]
+        starts = np.cumsum([0, *sizes[:-1]])
+        first = dict(zip(graphs, starts.tolist(), strict=True))
+        a, b = (
+            np.array([first[by_node[node].name] + graphs[by_node[node].name].rows[node] for node in nodes])
+            for nodes in zip(*(link.pair for link in links), strict=True)
+        )
+        there = PoseGaussians(
+            np.array([(m.x, m.y, m.heading) for m in (link.a_from_b.mean for link in links)]),
+            np.array([link.a_from_b.covariance for link in links]),
+        )
+        back = there.inverse()
+        return _Sides(
+            links,
+            PoseGaussians(
+                np.concatenate([there.means, back.means]),
+                np.concatenate([there.covariances, back.covariances]),
+            ),
+            np.concatenate([a, b]),
+            np.concatenate([b, a]),
+            np.repeat(np.arange(len(sizes)), sizes),
+            np.concatenate([graph.means for graph in graphs.values()]),
+            tuple(graphs.values()),
+            starts,
+        )
+
+    def loops(self) -> NDArray[np.int64]:
+        """(L,) links within one fragment."""
+        count = len(self.links)
+        found = self.fragments[self.near[:count]] == self.fragments[self.far[:count]]
+        return np.flatnonzero(found)
+
+    def pairs(self) -> NDArray[np.int64]:
+        """(K, 2) sides that go from one node into one other fragment, two by two."""
+        out = np.flatnonzero(self.fragments[self.near] != self.fragments[self.far])
+        keys = self.near[out] * len(self.graphs) + self.fragments[self.far[out]]
+        order = np.argsort(keys, kind="stable")
+        cuts = np.flatnonzero(np.diff(keys[order])) + 1
+        groups = np.split(out[order], cuts)
+        pairs = [pair for group in groups for pair in combinations(group.tolist(), 2)]
+        return np.array(pairs, np.int64).reshape(-1, 2)
+
+    def meeting(self, i: int, j: int) -> tuple[NodeId, NDArray[np.int64], NDArray[np.int64]]:
+        """The node from which two sides go, and which of its landmarks each of them rests on."""
+        count = len(self.links)
+        links = self.links[i % count], self.links[j % count]
+        columns = int(i >= count), int(j >= count)
+        one, other = (link.shared[:, column] for link, column in zip(links, columns, strict=True))
+        return links[0].pair[columns[0]], one, other
+
+    def contradict(
+        self,
+        sides: NDArray[np.int64],
+        others: NDArray[np.int64] | None,
+        c: ConsistencySettings,
+        s: DistinctnessSettings,
+    ) -> NDArray[np.bool_]:
+        """(K,) whether two sides that go out from one node contradict the way between their far ends.
+
+        Args:
+            sides: (K,) which.
+            others: (K,) which; None: loops, and the way between the two ends of each.
+            c: when they contradict it,
+            s: and by how much at least.
+        """
+        starts = self.far[sides]
+        ends = self.near[sides] if others is None else self.far[others]
+        own = compose_poses(inverse_poses(self.places[ends]), self.places[starts])
+        off = compose_poses(self._between(sides, others).means, own)
+        much = (np.hypot(off[:, 0], off[:, 1]) > s.apart_xy) | (abs(off[:, 2]) > s.apart_heading)
+        out = np.zeros(len(sides), bool)
+        # Covariances cost more than all the rest: only where places seem to be different.
+        for fragment in np.unique(self.fragments[starts[much]]):
+            here = np.flatnonzero(much & (self.fragments[starts] == fragment))
+            nodes, first = self.graphs[fragment].nodes, self.starts[fragment]
+            back = self.graphs[fragment].relative(
+                [nodes[k - first] for k in ends[here]], [nodes[k - first] for k in starts[here]]
+            )
+            loop = self._between(sides[here], None if others is None else others[here]) @ back
+            floor = np.diag([c.floor_xy**2, c.floor_xy**2, c.floor_heading**2])
+            out[here] = PoseGaussians(loop.means, loop.covariances + floor).distances2() > c.gate
+        return out
+
+    def _between(self, sides: NDArray[np.int64], others: NDArray[np.int64] | None) -> PoseGaussians:
+        """How the far ends stand to each other by the links alone; of a loop, its far and its near end."""
+        back = self.poses.take(sides).inverse()
+        return back if others is None else back @ self.poses.take(others)
+
+
+def _ends(link: Link) -> set[Landmark]:
+    """The landmarks that a link rests on, at either end."""
+    return {(node, int(k)) for node, column in zip(link.pair, link.shared.T, strict=True) for k in column}
+
+
+def _followed(
+    doubles: Iterable[Landmark], loops: Sequence[Link], maps: Mapping[MapId, HybridMap]
+) -> set[Landmark]:
+    """All landmarks that show the same things as some."""
+    by_loop: dict[NodeId, list[Link]] = defaultdict(list)
+    for link in loops:
+        by_loop[link.a].append(link)
+        by_loop[link.b].append(link.turned())
+    onward: dict[NodeId, dict[int, list[Landmark]]] = {}
+    found, waiting = set(doubles), list(doubles)
+    while waiting:
+        node, landmark = waiting.pop()
+        if node not in onward:
+            onward[node] = _next_to(node, by_loop.get(node, ()), maps[node.map])
+        fresh = [same for same in onward[node].get(landmark, ()) if same not in found]
+        found.update(fresh)
+        waiting += fresh
+    return found
+
+
+def _next_to(node: NodeId, loops: Iterable[Link], one: HybridMap) -> dict[int, list[Landmark]]:
+    """Which landmarks of other nodes show the same things as a node's own."""
+    edges = (one.edges[key] for _, _, key in one.graph.edges(node, keys=True))
+    ways = [link_of(edge) for edge in edges if edge.kind in FOLLOWED and edge.within]
+    table: dict[int, list[Landmark]] = defaultdict(list)
+    for way in (*(way if way.a == node else way.turned() for way in ways), *loops):
+        for i, j in way.shared.tolist():
+            table[i].append((way.b, j))
+    return table
+
+
+def _weighed(link: Link, doubles: set[Landmark]) -> Link:
+    count = 0
+    if doubles:
+        count = sum((link.a, i) in doubles or (link.b, j) in doubles for i, j in link.shared.tolist())
+    if count == link.doubles:
+        return link
+    evidence = {name: value for name, value in link.evidence.items() if name != DOUBLES}
+    return replace(link, evidence={**evidence, DOUBLES: float(count)} if count else evidence)

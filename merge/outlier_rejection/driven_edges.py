@@ -1,0 +1,60 @@
+"""Drives among the nodes of others: they say that a robot can get through, not where nodes are.
+
+A robot that follows a route through the merged map notes in its own log that it got from node to node. Where
+nodes of different maps stand to each other is settled by what both show, which anybody can verify again. So
+such an edge takes no part in the merge; it is only checked against its outcome.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, MapId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.pose_graph.links import RefusedLink, refuse_edge
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+VAGUE = np.array([0.6, 0.6, 0.2])
+"""m, m, rad: a drive known no better tells not even that the servo got there. Four of these are as far as it
+gets, see `mapweave.hybridmap.reachability.ReachabilitySettings`. Robots tell none above 0.1 m."""
+
+
+def refuse_drives(
+    maps: Mapping[MapId, HybridMap], graphs: Sequence[PoseGraph], s: ConsistencySettings
+) -> list[RefusedLink]:
+    """Find the edges with an end in another map that the merged map does not bear out.
+
+    Args:
+        maps: by id.
+        graphs: of the merged map, one a component.
+        s: when measurements agree.
+
+    Returns:
+        Those that lead to nodes that are not there, that join what is not joined, that measured what the
+        merged map contradicts, or hardly anything.
+    """
+    refusals = []
+    for map_id, one in sorted(maps.items()):
+        for edge in sorted(one.edges.values(), key=lambda edge: edge.id):
+            reason = "" if edge.a.map == edge.b.map == map_id else _objection(edge, graphs, s)
+            if reason:
+                refusals.append(refuse_edge(edge, f"a drive {reason}"))
+    return refusals
+
+
+def _objection(edge: Edge, graphs: Sequence[PoseGraph], s: ConsistencySettings) -> str:
+    graph = next((graph for graph in graphs if edge.a in graph.rows and edge.b in graph.rows), None)
+    if graph is None:
+        placed = {node for graph in graphs for node in (edge.a, edge.b) if node in graph.rows}
+        return "joins maps that nothing else joins" if len(placed) == 2 else "leads to a node that is gone"
+    if (np.diag(edge.a_from_b.covariance) > VAGUE**2).any():
+        return f"measured no better than {VAGUE[0]:g} m and {VAGUE[2]:g} rad"
+    merged = graph.relative([edge.a], [edge.b])
+    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+    spread = edge.a_from_b.covariance + merged.covariances[0] + floor
+    off = PoseGaussian(edge.a_from_b.mean, spread).mahalanobis2(Pose2.from_vector(merged.means[0]))
+    return "" if off < s.gate else "contradicts the merged map"

@@ -1,0 +1,138 @@
+"""Credence: how probable it is that a link is right, by the rest of the map.
+
+What two images show cannot tell one place from another that looks the same. So the odds begin with how many
+of this merge's verified links stand. Everything else that is joined then predicts how the two nodes stand to
+each other: a link that is right is off from that by what the covariances say, one into a place that merely
+looks alike by anything within the floor that is mapped. The ratio of these two densities is Bayes' factor.
+
+A link is taken out of the graph before it is compared with it, without solving anew: with P the covariance of
+the two nodes' relative pose, W the information of the link as the solver weighed it, and e the residual,
+the rest of the graph has the covariance (P^-1 - W)^-1, and the residual against it is (I - P W)^-1 e (the
+leave-one-out residual of least squares; exact where the graph is linear).
+
+The number holds for links that are right or wrong each for itself. Links into a whole room that looks the
+same agree with one another; against these the merge has other means
+(mapweave.merge.mutual_exclusion.refutation and mapweave.merge.outlier_rejection.pairwise_consistency).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.pose_graph.factors import believable
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+AT_ONCE = 64
+"""Links whose covariances are solved for together: all at once would take memory by the square."""
+LEAST_AREA = 4.0
+"""What is mapped is never smaller than this, m^2: a single look around."""
+_S = ConsistencySettings()
+FLOOR = np.diag([_S.floor_xy**2, _S.floor_xy**2, _S.floor_heading**2])
+"""Error that no covariance tells of, as where links are compared with each other."""
+NO_INFORMATION = 1e-6
+"""Share of a link's own information below which the rest of the graph says nothing."""
+
+
+class Standpoint(NamedTuple):
+    """How a link compares with the merged map.
+
+    Attributes:
+        merged_a_from_b: of its two nodes, by everything that is joined, the link included if it is kept.
+        off: (3,) m, m, rad, from the link's b to the merged one, in the link's b.
+        strain2: `off` in the link's own uncertainty, chi-square with 3 degrees of freedom.
+        alone: whether nothing but the link says how the two stand to each other.
+        log_factor: natural logarithm of Bayes' factor for the link, 0 if it is alone.
+    """
+
+    merged_a_from_b: PoseGaussian
+    off: Array
+    strain2: float
+    alone: bool
+    log_factor: float
+
+
+def prior_odds(merged: MergedMap) -> float:
+    """Odds that a verified link is right before its place in the map is looked at: as many as stand.
+
+    Those that people have ruled out count neither way. Half a link is added to either side (Jeffreys' prior).
+    """
+    refused = sum(
+        r.link is not None and r.edge is None and merged.rulings.against(*r.pair) is None
+        for r in merged.refused
+    )
+    return (len(merged.links) + 0.5) / (refused + 0.5)
+
+
+def probability(log_factor: float, odds: float) -> float:
+    """Of Bayes' factor and prior odds, never so near to 0 or 1 that nothing could change it."""
+    log_odds = float(np.clip(log_factor + math.log(odds), -12.0, 12.0))
+    return 1.0 / (1.0 + math.exp(-log_odds))
+
+
+def link_probabilities(merged: MergedMap) -> dict[tuple[NodeId, NodeId], float]:
+    """Probability of each link that stands, by its pair."""
+    odds = prior_odds(merged)
+    out: dict[tuple[NodeId, NodeId], float] = {}
+    for graph in merged.graphs:
+        inside = [link for link in merged.links if link.a in graph.rows]
+        for k in range(0, len(inside), AT_ONCE):
+            some = inside[k : k + AT_ONCE]
+            for link, found in zip(some, standpoints(some, graph, kept=True), strict=True):
+                out[link.pair] = probability(found.log_factor, odds)
+    return out
+
+
+def standpoints(links: Sequence[Link], graph: PoseGraph, *, kept: bool) -> list[Standpoint]:
+    """Compare links with a solved component.
+
+    Args:
+        links: with both ends in the graph.
+        graph: the component.
+        kept: whether they are among its measurements.
+    """
+    if not links:
+        return []
+    merged = graph.relative([link.a for link in links], [link.b for link in links])
+    area = max(float(np.prod(np.ptp(graph.means[:, :2], axis=0))), LEAST_AREA)
+    return [
+        _standpoint(
+            link,
+            PoseGaussian(Pose2.from_vector(mean), nearest_covariance(covariance)),
+            area,
+            graph.huber if kept else None,
+        )
+        for link, mean, covariance in zip(links, merged.means, merged.covariances, strict=True)
+    ]
+
+
+def _standpoint(link: Link, merged: PoseGaussian, area: float, huber: float | None) -> Standpoint:
+    off = (link.a_from_b.mean.inverse() @ merged.mean).vector
+    own = believable(link.a_from_b.covariance)
+    strain2 = float(off @ np.linalg.solve(own, off))
+    rest, moved = merged.covariance, off
+    if huber is not None:
+        # The solver let a robust link pull less where it is far off.
+        weight = np.linalg.inv(own) * min(1.0, huber / max(math.sqrt(strain2), 1e-12))
+        information = np.linalg.inv(merged.covariance) - weight
+        scale = np.linalg.inv(np.linalg.cholesky(weight))
+        if np.linalg.eigvalsh(scale @ information @ scale.T)[0] < NO_INFORMATION:
+            return Standpoint(merged, off, strain2, True, 0.0)
+        rest = np.linalg.inv(information)
+        moved = rest @ np.linalg.solve(merged.covariance, off)
+    spread = own + rest + FLOOR
+    # In the plane anywhere on the floor that is mapped, in heading anyhow.
+    anywhere = -math.log(area * 2.0 * math.pi)
+    there = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
+    if there <= anywhere:
+        return Standpoint(merged, off, strain2, True, 0.0)
+    factor = there - 0.5 * float(moved @ np.linalg.solve(spread, moved)) - anywhere
+    return Standpoint(merged, off, strain2, False, factor)

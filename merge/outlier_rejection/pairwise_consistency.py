@@ -1,0 +1,284 @@
+"""Which links tell the same story: pairwise consistency, and the best supported set of it.
+
+Two links between the same two pieces of map close a loop: along one link, through the one piece, back along
+the other link, through the other piece. If both are right the loop comes back to where it began, within its
+uncertainty (pairwise consistent measurement set maximisation, Mangelson et al., ICRA 2018). A false link, or
+a set of links into a room that merely looks alike, closes no loop with the true ones. The set that is kept is
+the clique with the most landmarks behind it, and it has to be clearly better than any that contradicts it.
+Links between the same two places are no independent witnesses and count for less (see witnesses.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Array
+from mapweave.merge.outlier_rejection.independent_support import (
+    NOTHING,
+    ChanceSupport,
+    Support,
+    chances,
+    crowds,
+    neighbours,
+    support_of,
+)
+from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link, RefusedLink, place_told, refuse
+from mapweave.registration.pose_arrays import PoseGaussians
+
+HUNDREDTHS = 100.0
+"""Cliques are weighed in whole hundredths of a landmark."""
+
+
+@dataclass(frozen=True)
+class ConsistencySettings:
+    """When links are believed.
+
+    Attributes:
+        gate: chi-square with 3 degrees of freedom that a loop may miss by; 16.27 is 99.9 %, since a link must
+            agree with every other one.
+        floor_xy: error of any loop that no covariance tells of, m.
+        floor_heading: the same, rad.
+        least_links: independent links (no node in common) that join two pieces.
+        overwhelming_inliers: a single link with as many landmarks ...
+        overwhelming_share: ... and this share of its matches joins them alone.
+        place: nodes of a map that are nearer to each other see the same landmarks, m.
+        chance: so many false sets at most may be expected between two pieces that are as good as the one
+            that is kept.
+        dominance: how many times the landmarks of a contradicting set the kept set must have, and how many
+            times its witnesses if that set would be believed without it.
+        exact: up to as many links the best clique is searched exhaustively, beyond greedily.
+        least_evidence: natural logarithm of the odds from which a link that is too little alone, or was
+            contradicted, is believed where others join its two ends: how many witnesses are true for one that
+            is false, times Bayes' factor (see mapweave.merge.outlier_rejection.link_probability), which must
+            speak for it.
+    """
+
+    gate: float = 16.27
+    floor_xy: float = 0.02
+    floor_heading: float = 0.01
+    least_links: int = 2
+    overwhelming_inliers: int = 45
+    overwhelming_share: float = 0.7
+    place: float = 2.0
+    chance: float = 0.01
+    dominance: float = 1.5
+    exact: int = 40
+    least_evidence: float = 4.6
+
+
+@dataclass(frozen=True, eq=False)
+class Sorted:
+    """Links between two pieces of map, sorted into believed and not.
+
+    Attributes:
+        kept: mutually consistent and enough, or nothing.
+        refused: the others, with reasons.
+        rivals: two sets that contradict each other and are supported alike, if that is why nothing is kept.
+        weight: landmarks behind the best set; links of one place count by the root of their number.
+        sets: the best set, kept or not, and the best of those that contradict it.
+        supports: behind these two.
+    """
+
+    kept: tuple[Link, ...]
+    refused: tuple[RefusedLink, ...]
+    rivals: tuple[tuple[Link, ...], ...] = ()
+    weight: float = 0.0
+    sets: tuple[tuple[Link, ...], tuple[Link, ...]] = ((), ())
+    supports: tuple[Support, Support] = (NOTHING, NOTHING)
+
+    def beyond_chance(self, false: ChanceSupport, s: ConsistencySettings) -> Sorted:
+        """The same between two pieces that differ, knowing what false links are like.
+
+        What is no more than chance makes is not kept, and contradicts nothing.
+
+        Args:
+            false: what false witnesses are like.
+            s: when links are believed.
+        """
+        real = [k for k in (0, 1) if self.supports[k].by_chance(false) < s.chance]
+        if len(real) == 2 or (self.kept and 0 in real):
+            return self
+        story = self.sets[real[0]] if real and not _too_little(self.sets[real[0]], s) else ()
+        if not self.kept and not story:
+            return self
+        reason = (
+            f"contradicts {len(story)} links, and what agrees with it is no more than chance makes"
+            if story
+            else f"as many agree by chance where {100.0 * false.share:.0f} % of the links are false"
+        )
+        told = {link.key for link in story}
+        every = [*self.kept, *(r.link for r in self.refused if r.link is not None)]
+        refused = [refuse(link, reason) for link in every if link.key not in told]
+        refused.sort(key=lambda refusal: refusal.pair)
+        return replace(self, kept=story, refused=tuple(refused), rivals=())
+
+
+def loop_distances2(
+    links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings
+) -> Array:
+    """(N, N) squared normalised misclosures of the loops through each two links, 3 degrees of freedom.
+
+    Args:
+        links: each from a node of `first` (its a) to a node of `second` (its b).
+        first: piece of map.
+        second: piece of map; may be the same, then the links are loops within it.
+        s: the floor of uncertainty.
+    """
+    return _loops(links, first, second, s)[0]
+
+
+def _loops(
+    links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings
+) -> tuple[Array, Array]:
+    """(N, N) see `loop_distances2`; (N, N) m^2 rad, square roots of the determinants of their covariances."""
+    n = len(links)
+    i, j = np.triu_indices(n, 1)
+    out, spreads = np.zeros((n, n)), np.ones((n, n))
+    if len(i) == 0:
+        return out, spreads
+    across = PoseGaussians(
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance for link in links]),
+    )
+    a, b = [link.a for link in links], [link.b for link in links]
+    through_second = second.graph.relative([b[k] for k in i], [b[k] for k in j])
+    through_first = first.graph.relative([a[k] for k in j], [a[k] for k in i])
+    loop = across.take(i) @ through_second @ across.take(j).inverse() @ through_first
+    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+    loop = PoseGaussians(loop.means, loop.covariances + floor)
+    out[i, j] = out[j, i] = loop.distances2()
+    spreads[i, j] = spreads[j, i] = np.sqrt(np.linalg.det(loop.covariances))
+    return out, spreads
+
+
+def sort_links(
+    links: Sequence[Link], first: Fragment, second: Fragment, settings: ConsistencySettings | None = None
+) -> Sorted:
+    """Keep the best supported consistent set of the links between two pieces of map.
+
+    Args:
+        links: from nodes of `first` to nodes of `second`.
+        first: piece of map.
+        second: piece of map; may be the same.
+        settings: when links are believed.
+
+    Returns:
+        Kept and refused links, in the order of their nodes.
+    """
+    s = settings or ConsistencySettings()
+    links = sorted(links, key=lambda link: link.pair)
+    refused: list[RefusedLink] = []
+    if first is second:
+        links, refused = _against_odometry(links, first, s)
+    if not links:
+        return Sorted((), tuple(refused))
+    distances2, spreads = _loops(links, first, second, s)
+    agree, near = distances2 < s.gate, neighbours(links, first, second, s.place)
+    landmarks = np.array([link.weight for link in links])
+    # Witnesses that depend on each other count by the root of their number.
+    weights = landmarks / np.sqrt(crowds(agree, near))
+    hundredths = np.maximum(np.rint(HUNDREDTHS * weights), 1).astype(np.int64)
+    best = best_clique(agree, hundredths, s.exact)
+    kept = [links[k] for k in best]
+    reason = _too_little(kept, s)
+    rival = _rival(agree, hundredths, best, s)
+    support, against_it = int(landmarks[best].sum()), int(landmarks[rival].sum())
+    weight, against = float(weights[best].sum()), float(weights[rival].sum())
+    sets = tuple(kept), tuple(links[k] for k in rival)
+    chance = chances(distances2, spreads, first, second)
+    telling = np.array([link.telling for link in links])
+    own, others = (support_of(some, telling, agree, near, chance) for some in (best, rival))
+    rivals: tuple[tuple[Link, ...], ...] = ()
+    # In number and in places: a single place may bring many links however false they are.
+    if not reason and (against_it * s.dominance > support or against * s.dominance > weight):
+        reason = f"ambiguous: {support} landmarks support one way of joining, {against_it} another"
+        rivals = sets
+    # One of two stories that would each be believed alone is false: landmarks and links do not tell which.
+    elif not reason and not _too_little(sets[1], s) and own.witnesses < s.dominance * others.witnesses:
+        places = f"{own.witnesses:.1f} and {others.witnesses:.1f} independent places"
+        reason = f"ambiguous: two ways of joining contradict each other, with {places} behind"
+        rivals = sets
+    for k, link in enumerate(links):
+        if k not in best:
+            contradicts = f"contradicts {len(best)} links with {support} landmarks between the same maps"
+            refused.append(refuse(link, reason or contradicts))
+        elif reason:
+            refused.append(refuse(link, reason))
+    return Sorted(
+        () if reason else tuple(kept),
+        tuple(sorted(refused, key=lambda refusal: refusal.pair)),
+        rivals,
+        weight,
+        sets,
+        (own, others),
+    )
+
+
+def _against_odometry(
+    links: Sequence[Link], fragment: Fragment, s: ConsistencySettings
+) -> tuple[list[Link], list[RefusedLink]]:
+    """A loop within a map must also agree with the map's own way from the one node to the other."""
+    if not links:
+        return [], []
+    own = fragment.graph.relative([link.b for link in links], [link.a for link in links])
+    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+    measured = PoseGaussians(
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance + floor for link in links]),
+    )
+    fits = (measured @ own).distances2() < s.gate
+    refusals = [
+        refuse(link, "contradicts the map's own way between its nodes")
+        for link, good in zip(links, fits, strict=True)
+        if not good
+    ]
+    return [link for link, good in zip(links, fits, strict=True) if good], refusals
+
+
+def _rival(
+    agree: NDArray[np.bool_], weights: NDArray[np.int64], best: list[int], s: ConsistencySettings
+) -> list[int]:
+    """The best set among the links that agree with less than half of the kept ones."""
+    others = np.setdiff1d(np.arange(len(weights)), best)
+    others = others[agree[others][:, best].mean(axis=1) < 0.5] if best else others
+    clique = best_clique(agree[np.ix_(others, others)], weights[others], s.exact)
+    return [int(k) for k in others[clique]]
+
+
+def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
+    """Why a consistent set does not suffice; empty if it does."""
+    if not kept:
+        return "no links"
+    telling = [link for link in kept if link.telling]
+    if not telling or not place_told(kept):
+        agree = "the link shows" if len(kept) == 1 else f"the {len(kept)} links that agree show"
+        return f"most of what {agree} is found at other places too"
+    independent = independent_links(telling, s.least_links)
+    if independent >= s.least_links:
+        return ""
+    for link in telling:
+        share = link.evidence.get("share", 0.0)
+        if link.weight >= s.overwhelming_inliers and share >= s.overwhelming_share:
+            return ""
+    return f"no {s.least_links} links that share no node agree with each other, as they must"
+
+
+def group_links(
+    links: Sequence[Link], by_node: Mapping[NodeId, Fragment]
+) -> dict[tuple[NodeId, NodeId], list[Link]]:
+    """Links by the names of the two pieces of map, smaller first; each link turned to that direction."""
+    groups: dict[tuple[NodeId, NodeId], list[Link]] = {}
+    for link in sorted(links, key=lambda link: link.pair):
+        first, second = by_node[link.a].name, by_node[link.b].name
+        if second < first:
+            link = link.turned()
+            first, second = second, first
+        groups.setdefault((first, second), []).append(link)
+    return groups

@@ -1,0 +1,102 @@
+"""Cutting maps into fragments, and testing what each robot says of its own map.
+
+That a robot drove or turned from one node to the next while mapping it has measured all the way. That it
+recognised a place (`loop`) is a claim: in a warehouse the next bay looks like this one. So is what it
+measured between two places that it recognised on a later drive (`driven`). So a robot's own claims join the
+pieces that its way makes just as links join maps: sorted by consistency, then optimised, and one that strains
+is left out. Two things differ. One claim is enough, for the way speaks for it. And a map is never torn apart:
+where a robot resumed its map elsewhere, claims are all that ties the new part to the old one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import networkx as nx
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.merge.outlier_rejection.closing_links import join, optimise
+from mapweave.merge.outlier_rejection.loop_closures import CLAIMS, sort_loop_closures
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, group_links, sort_links
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import RefusedLink, link_of
+
+WORDS = {EdgeKind.LOOP: "loop", EdgeKind.MERGED: "link", EdgeKind.DRIVEN: "drive"}
+
+
+def fragments_of(
+    maps: Mapping[MapId, HybridMap], consistency: ConsistencySettings | None = None, strain: float = 25.0
+) -> list[Fragment]:
+    """Cut maps into connected pieces, each solved by itself, in the order of names.
+
+    Args:
+        maps: by id. Edges whose ends are not both nodes of the same map are not theirs to say and are left
+            out: maps are joined by links alone.
+        consistency: when a robot's own claims are believed.
+        strain: chi-square with 3 degrees of freedom above which one is refused after all.
+    """
+    s = consistency or ConsistencySettings()
+    found = [piece for map_id in sorted(maps) for piece in _pieces(maps[map_id], s, strain)]
+    return sorted(found, key=lambda fragment: fragment.name)
+
+
+def _pieces(one: HybridMap, s: ConsistencySettings, strain: float) -> list[Fragment]:
+    """The fragments of one map."""
+    own = sorted(
+        (
+            edge
+            for edge in one.edges.values()
+            if edge.a in one.nodes and edge.b in one.nodes and edge.a != edge.b
+        ),
+        key=lambda edge: edge.id,
+    )
+    strands = _strands(one, [edge for edge in own if edge.kind not in CLAIMS])
+    claims, refusals = sort_loop_closures(own, s)
+    if not claims:
+        return strands
+    solver = ComponentSolver(strands)
+    loops = sorted((link_of(edges[0]) for edges in claims.values()), key=lambda link: link.pair)
+    within, between = replace(s, least_links=1), replace(s, least_links=1, dominance=0.0)
+    groups = {}
+    refused: list[RefusedLink] = []
+    for (first, second), links in group_links(loops, solver.by_node).items():
+        pair = solver.by_node[first], solver.by_node[second]
+        groups[first, second] = sort_links(links, *pair, within if first == second else between)
+        refused += groups[first, second].refused
+    kept, more = join(solver, groups, s)
+    refused += more
+    graphs, kept, more = optimise(solver, kept, strain)
+    refused += more
+    refusals += [
+        replace(r, reason=f"the robot's own {WORDS[edge.kind]} {r.reason}", edge=edge.id)
+        for r in refused
+        for edge in claims[r.pair]
+    ]
+    pieces = []
+    for graph in graphs:
+        inside = [strand for strand in strands if strand.name in graph.rows]
+        measurements = [m for strand in inside for m in strand.measurements]
+        measurements += [Measurement(*k.pair, k.a_from_b, robust=True) for k in kept if k.a in graph.rows]
+        about = sorted((r for r in refusals if r.a in graph.rows), key=lambda r: (r.pair, str(r.edge)))
+        pieces.append(Fragment(graph.anchor, graph, tuple(measurements), tuple(about)))
+    return pieces
+
+
+def _strands(one: HybridMap, edges: list[Edge]) -> list[Fragment]:
+    """What a map's way alone connects."""
+    graph: nx.Graph = nx.Graph()
+    graph.add_nodes_from(one.nodes)
+    graph.add_edges_from((edge.a, edge.b) for edge in edges)
+    names = {node: min(piece) for piece in nx.connected_components(graph) for node in piece}
+    measurements: dict[NodeId, list[Measurement]] = {name: [] for name in sorted(set(names.values()))}
+    for edge in edges:
+        measurements[names[edge.a]].append(Measurement(edge.a, edge.b, edge.a_from_b))
+    return [
+        Fragment(name, solve_graph(name, one.nodes[name].map_from_robot.mean, inside), tuple(inside))
+        for name, inside in measurements.items()
+    ]

@@ -1,0 +1,362 @@
+"""Maps with wrong geometry: wherever their links put them, other robots look through their walls.
+
+A robot whose wheels slip, or that is carried off unnoticed, makes a map with true views and a wrong way
+between them. Each of its links to a sound map is true, and no rigid placement satisfies them all: they fall
+into sets that agree only within themselves (pairwise consistency, Mangelson et al., ICRA 2018). A room that
+looks like another room gives such sets too. Consistency cannot tell the two cases apart. Lines of sight can:
+
+* If the map is sound, one placement is true. Under it the landmarks of the map are where others have seen
+  them, or where nobody has looked. The links of all other sets are false.
+* If the map bends or jumps, each placement puts a part of it where it never was. Others then look through its
+  walls, and it looks through theirs: they know landmarks behind them in the same direction.
+
+So a map is wrong if lines of sight refute every placement among several maps that agree with each other.
+Clutter and wrong depths are looked through at true places too. How much is measured on the same nodes, each
+put where its own links put it. Where others have not looked nothing is refuted, and the map may be right: it
+may know a room that only looks like theirs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from scipy.special import bdtrc
+
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
+from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
+from mapweave.merge.outlier_rejection.max_clique import independent_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, loop_distances2
+from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import WrongGeometry
+from mapweave.registration.pose_arrays import PoseGaussians
+
+MOST_LINKS = 60
+"""Links between two pieces of map that are looked at, evenly chosen: pairs of links grow by the square."""
+MOST_PARTNERS = 5
+"""Maps against which one is held: those with which it has most links."""
+AGREEING = 0.9
+"""Two maps agree if this share of their links do: a few are false. Sound maps of the benchmark have 0.97 and
+more, those of a robot with wrong geometry up to 0.75."""
+LEAST_SHARE = 0.25
+"""A set of links is a placement if it has this share of the links of the largest set."""
+RARE = 0.05
+"""Share of nodes, where their own links put them, that are looked through more than is usual."""
+REFUTED = 0.001
+"""Chance, at most, that so many nodes are under a true placement (binomial)."""
+LEAST_NODES = 4
+"""Nodes on either side of the comparison, at least."""
+MOST_SIGMA_XY, MOST_SIGMA_HEADING = 0.25, math.radians(5.0)
+"""Nodes whose place is known less well, by the surest link of a placement, are not compared, m and rad."""
+LEAST_LANDMARKS = 50
+"""In all views with which a node is compared."""
+SAME_XY, SAME_HEADING = 0.5, math.radians(20.0)
+"""Links of one node agree where it is if they differ by less, m and rad."""
+REACH, MOST_NEAR = 5.0, 20
+"""A node is compared with the nearest others within reach, m: depths are poor beyond it."""
+SIGMAS, MARGIN = 3.0, 0.2
+"""What lies behind a landmark by more than so many sigmas, and so many m, is behind it."""
+AROUND = 0.03
+"""Two landmarks are in the same direction if they are so near to each other, rad."""
+
+MapPair = tuple[MapId, MapId]
+"""Two maps, the smaller id first."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Tie:
+    """The links between two maps.
+
+    Attributes:
+        links: all between the largest pieces of the two.
+        best: the largest set of them that agrees.
+        share: of the links that were looked at that are in it.
+    """
+
+    links: tuple[Link, ...]
+    best: tuple[Link, ...]
+    share: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the two maps do."""
+        return self.share >= AGREEING
+
+
+class WrongGeometrySearch:
+    """Finds maps with wrong geometry. What was found out of maps and links that did not change is kept."""
+
+    def __init__(self, consistency: ConsistencySettings, strain: float) -> None:
+        """Nothing is known yet.
+
+        Args:
+            consistency: when links agree.
+            strain: see `mapweave.merge.outlier_rejection.segmentation.fragments_of`.
+        """
+        self._s, self._strain = consistency, strain
+        self._memory = DecisionCache()
+        self._ties: dict[MapPair, _Tie] = {}
+        self._checked: dict[tuple[MapId, tuple[MapId, ...]], bool] = {}
+
+    def wrong(
+        self,
+        maps: Mapping[MapId, HybridMap],
+        links: Callable[[MapPair], Sequence[Link]],
+        stale: Collection[MapPair],
+        left_out: Collection[MapId] = (),
+    ) -> dict[MapId, WrongGeometry]:
+        """Find them, those that contradict most others first.
+
+        Args:
+            maps: by id; never changed, only replaced.
+            links: gives those between two of them.
+            stale: pairs of maps whose links have changed, or of which one was replaced, since the last call.
+            left_out: maps that are not heard.
+
+        Returns:
+            The maps that are wrong, by id.
+        """
+        for pair in stale:
+            self._tie(pair, maps, links(pair))
+        changed = [set(pair) for pair in stale]
+        self._checked = {
+            (one, others): found
+            for (one, others), found in self._checked.items()
+            if not any(pair <= {one, *others} for pair in changed)
+        }
+        ties: dict[MapId, dict[MapId, _Tie]] = {}
+        for pair, tie in self._ties.items():
+            if not set(pair) & set(left_out):
+                for one, other in (pair, pair[::-1]):
+                    ties.setdefault(one, {})[other] = tie
+        doubts = {one: sum(not tie.agrees for tie in others.values()) for one, others in ties.items()}
+        out: dict[MapId, WrongGeometry] = {}
+        for one in sorted(doubts, key=lambda one: (-doubts[one], one)):
+            if doubts[one] < 2:
+                break
+            agreeing = self._agreeing({k: v for k, v in ties[one].items() if k not in out}, ties)
+            if len(agreeing) < 2:
+                continue
+            if (one, agreeing) not in self._checked:
+                self._checked[one, agreeing] = self._is_wrong(one, agreeing, maps)
+            if self._checked[one, agreeing]:
+                out[one] = WrongGeometry(one, agreeing)
+        return out
+
+    def _main(self, map_id: MapId, one: HybridMap) -> Fragment | None:
+        """The largest piece of a map."""
+        pieces = self._memory.fragments({map_id: one}, self._s, self._strain)
+        return max(pieces, key=len, default=None)
+
+    def _tie(self, pair: MapPair, maps: Mapping[MapId, HybridMap], links: Sequence[Link]) -> None:
+        """Sort the links between two maps."""
+        self._ties.pop(pair, None)
+        first, second = (self._main(one, maps[one]) if one in maps else None for one in pair)
+        if first is None or second is None or first is second:
+            return
+        inside = [link for link in links if link.a in first.graph.rows and link.b in second.graph.rows]
+        if len(inside) >= self._s.least_links:
+            some = thinned(inside)
+            best = link_sets(some, first, second, self._s)[0]
+            self._ties[pair] = _Tie(tuple(inside), tuple(best), len(best) / len(some))
+
+    @staticmethod
+    def _agreeing(own: Mapping[MapId, _Tie], ties: Mapping[MapId, Mapping[MapId, _Tie]]) -> tuple[MapId, ...]:
+        """Maps that agree with each other, of those tied to one map; empty unless it disagrees with two."""
+        some = sorted(own, key=lambda other: (-len(own[other].links), other))[:MOST_PARTNERS]
+        graph: nx.Graph = nx.Graph()
+        graph.add_edges_from(
+            (a, b) for a in some for b in some if a < b and b in ties[a] and ties[a][b].agrees
+        )
+        parts = [part for part in nx.connected_components(graph) if sum(not own[k].agrees for k in part) >= 2]
+        return tuple(sorted(max(parts, key=len, default=())))
+
+    def _is_wrong(self, one: MapId, agreeing: Sequence[MapId], maps: Mapping[MapId, HybridMap]) -> bool:
+        """Whether every placement of a map among maps that agree is refuted."""
+        placed = self._main(one, maps[one])
+        pieces = [piece for other in agreeing if (piece := self._main(other, maps[other])) is not None]
+        assert placed is not None, "a map with links has nodes"
+        pairs = [(a, b) for a in agreeing for b in agreeing if a < b and (a, b) in self._ties]
+        held = [link for pair in pairs if self._ties[pair].agrees for link in self._ties[pair].best]
+        graph = ComponentSolver(pieces).solve(held, believed=True)[0]
+        across = [
+            link if link.a.map == one else link.turned()
+            for other in agreeing
+            for link in thinned(self._ties[min(one, other), max(one, other)].links)
+        ]
+        across = [link for link in across if link.b in graph.rows]
+        every = {k: node for which in (one, *agreeing) for k, node in maps[which].nodes.items()}
+        return all_refuted(across, placed, Fragment(graph.anchor, graph, ()), every, self._s)
+
+
+def thinned(links: Sequence[Link]) -> list[Link]:
+    """At most `MOST_LINKS` of them."""
+    chosen = np.unique(np.linspace(0, len(links) - 1, MOST_LINKS).round().astype(np.int64))
+    return [links[int(k)] for k in chosen]
+
+
+def link_sets(
+    links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings
+) -> list[list[Link]]:
+    """Sets of links in which each agrees with each, grown greedily; largest first.
+
+    Args:
+        links: from `first` to `second`, at least one.
+        first: piece of map.
+        second: piece of map.
+        s: when links agree.
+    """
+    agree = loop_distances2(links, first, second, s) < s.gate
+    np.fill_diagonal(agree, True)
+    left, sets = np.ones(len(links), np.bool_), list[list[Link]]()
+    while left.any():
+        support = np.where(left, (agree & left).sum(axis=1), 0)
+        free, members = left.copy(), list[int]()
+        for k in np.argsort(-support, kind="stable").tolist():
+            if free[k]:
+                members.append(k)
+                free &= agree[k]
+        sets.append([links[k] for k in sorted(members)])
+        left[members] = False
+    return sorted(sets, key=len, reverse=True)
+
+
+def all_refuted(
+    links: Sequence[Link],
+    placed: Fragment,
+    fixed: Fragment,
+    nodes: Mapping[NodeId, Node],
+    s: ConsistencySettings,
+) -> bool:
+    """Whether the lines of sight refute every placement that links give.
+
+    Args:
+        links: from `placed` to `fixed`.
+        placed: piece of map that may be wrong.
+        fixed: piece of map that several robots agree on.
+        nodes: of both.
+        s: when links agree.
+    """
+    if not _nodes_agree(links, fixed):
+        return False
+    sets = link_sets(links, placed, fixed, s)
+    sets = [one for one in sets if len(one) >= LEAST_SHARE * len(sets[0])]
+    sets = [one for one in sets if independent_links(one, s.least_links) >= s.least_links]
+    if not sets:
+        return False
+    own: dict[NodeId, list[Link]] = {}
+    for link in links:
+        own.setdefault(link.a, []).append(link)
+    # By its own links each node is where it truly is, whatever the map says of the way there.
+    usual = np.concatenate([_looked_through(some, [one], placed, fixed, nodes) for one, some in own.items()])
+    return all(
+        _more(_looked_through(one, sorted(own.keys() - {k.a for k in one}), placed, fixed, nodes), usual)
+        for one in sets
+    )
+
+
+def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
+    """Whether the links of each single node agree where it is.
+
+    They do, whatever the geometry of its map. Otherwise many links are false since places look alike, and a
+    map whose links are all false would be refuted everywhere too.
+    """
+    places: dict[NodeId, list[Pose2]] = {}
+    for link in sorted(links, key=lambda link: -link.weight):
+        places.setdefault(link.a, []).append(fixed.graph.pose(link.b) @ link.a_from_b.mean.inverse())
+    agree = [
+        best.distance(other) < SAME_XY and abs(wrap_angle(best.heading - other.heading)) < SAME_HEADING
+        for best, *others in places.values()
+        for other in others
+    ]
+    return len(agree) >= LEAST_NODES and sum(agree) >= AGREEING * len(agree)
+
+
+def _more(shares: Array, usual: Array) -> bool:
+    """Whether more nodes than chance makes are looked through more than is usual."""
+    if min(len(shares), len(usual)) < LEAST_NODES:
+        return False
+    many = int((shares > np.quantile(usual, 1.0 - RARE)).sum())
+    return bool(bdtrc(many - 1, len(shares), RARE) < REFUTED)
+
+
+def _looked_through(
+    story: Sequence[Link],
+    which: Sequence[NodeId],
+    placed: Fragment,
+    fixed: Fragment,
+    nodes: Mapping[NodeId, Node],
+) -> Array:
+    """Of each node that can be placed: the share of landmarks through which it or others look.
+
+    Args:
+        story: links from `placed` to `fixed` that place it.
+        which: nodes of `placed`.
+        placed: piece of map.
+        fixed: piece of map.
+        nodes: of both.
+    """
+    starts, ends = [link.a for link in story], [link.b for link in story]
+    measured = PoseGaussians(
+        np.stack([link.a_from_b.mean.vector for link in story]),
+        np.stack([link.a_from_b.covariance for link in story]),
+    ).inverse()
+    means, out = fixed.graph.means, []
+    for node_id in which:
+        by_link = measured @ placed.graph.relative(starts, [node_id] * len(starts))
+        surest = int(np.trace(by_link.covariances[:, :2, :2], axis1=1, axis2=2).argmin())
+        covariance = by_link.covariances[surest]
+        sigma_xy = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        sigma_heading = math.sqrt(covariance[2, 2])
+        if sigma_xy > MOST_SIGMA_XY or sigma_heading > MOST_SIGMA_HEADING:
+            continue
+        at = fixed.graph.pose(ends[surest]) @ Pose2.from_vector(by_link.means[surest])
+        away = np.hypot(means[:, 0] - at.x, means[:, 1] - at.y)
+        counts = np.zeros(2, np.int64)
+        for k in np.argsort(away, kind="stable")[:MOST_NEAR]:
+            if away[k] < REACH:
+                one, other = nodes[node_id], nodes[fixed.nodes[k]]
+                other_from_one = Pose2.from_vector(means[k]).inverse() @ at
+                counts += looked_through(one, other, other_from_one, sigma_xy, sigma_heading)
+                counts += looked_through(other, one, other_from_one.inverse(), sigma_xy, sigma_heading)
+        if counts[0] >= LEAST_LANDMARKS:
+            out.append(counts[1] / counts[0])
+    return np.array(out)
+
+
+def looked_through(
+    node: Node, view: Node, view_from_node: Pose2, sigma_xy: float, sigma_heading: float
+) -> tuple[int, int]:
+    """How many of a node's landmarks are in a view, and through how many of these it looks.
+
+    A view looks through a landmark if it knows one behind it in the same direction, and none as far away.
+
+    Args:
+        node: whose landmarks.
+        view: another node.
+        view_from_node: how the two stand,
+        sigma_xy: standard deviation of that, m,
+        sigma_heading: and rad.
+    """
+    marks, known = (n.landmarks.take(n.landmarks.has_depth) for n in (node, view))
+    points = view_from_node.apply(marks.points_in_robot(node.camera))
+    pixels = view.camera.project(points)
+    inside = view.camera.contains(pixels)
+    if not inside.any() or not len(known):
+        return int(inside.sum()), 0
+    depths, pixels = points[inside, 0] - view.camera.mount_forward, pixels[inside]
+    own = marks.depth_sigmas[inside].astype(np.float64) ** 2 + sigma_xy**2 + (sigma_heading * depths) ** 2
+    sigmas = np.sqrt(own[:, None] + known.depth_sigmas.astype(np.float64)[None] ** 2)
+    further = known.depths.astype(np.float64)[None] - depths[:, None]
+    off = np.linalg.norm(pixels[:, None] - known.pixels[None], axis=2) / view.camera.fx
+    same_direction = off < AROUND + 2.0 * sigma_heading
+    behind = same_direction & (further > SIGMAS * sigmas + MARGIN)
+    about = same_direction & (np.abs(further) <= SIGMAS * sigmas + MARGIN)
+    return len(depths), int((behind.any(axis=1) & ~about.any(axis=1)).sum())

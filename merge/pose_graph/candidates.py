@@ -1,0 +1,109 @@
+"""Which pairs of nodes are worth a closer look: those that share many alike descriptors.
+
+The overlap of two nodes depends on these two alone, not on what else is in the fleet, so a table of overlaps
+can grow node by node and the choice made from it is the same whatever came first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.descriptor import decode
+from mapweave.hybridmap.node import Edge, Node, NodeId
+from mapweave.registration.matching import squared_distances
+
+Pair = tuple[NodeId, NodeId]
+
+
+@dataclass(frozen=True)
+class CandidateSettings:
+    """Which pairs are looked at.
+
+    Attributes:
+        alike: distance of two decoded descriptors below which they may be the same landmark.
+        least_overlap: see `overlap`.
+        most_per_map: best pairs of one node with the nodes of any one map.
+        least_hops: nodes of one map that are fewer edges apart are neighbours, not loops.
+    """
+
+    alike: float = 0.5
+    least_overlap: float = 3.0
+    most_per_map: int = 4
+    least_hops: int = 3
+
+
+def overlap(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], squared: NDArray[Any], alike: float
+) -> float:
+    """How many landmarks two nodes seem to share, from all pairs of descriptors that are alike.
+
+    Each descriptor counts once, with its best partner and by how near that is; the smaller of the two sides'
+    sums makes it symmetric.
+
+    Args:
+        rows: (K,) descriptor of the one node.
+        columns: (K,) descriptor of the other.
+        squared: (K,) squared distances, all below alike^2.
+        alike: distance at which a pair counts nothing.
+    """
+    weights = 1.0 - np.asarray(squared, dtype=np.float64) / alike**2
+    sums = []
+    for side in (rows, columns):
+        best = np.zeros(int(side.max(initial=-1)) + 1)
+        np.maximum.at(best, side, weights)
+        sums.append(float(best.sum()))
+    return min(sums)
+
+
+def overlaps(nodes: Collection[Node], settings: CandidateSettings | None = None) -> dict[Pair, float]:
+    """The table for nodes that are all there, by comparing every pair: exact, for some hundred nodes.
+
+    Returns:
+        Overlaps of at least `least_overlap` by (smaller id, greater id).
+    """
+    s = settings or CandidateSettings()
+    ordered = sorted(nodes, key=lambda node: node.id)
+    vectors = [decode(node.landmarks.codes) for node in ordered]
+    table: dict[Pair, float] = {}
+    for i, a in enumerate(ordered):
+        for j in range(i):
+            squared = squared_distances(vectors[j], vectors[i])
+            rows, columns = np.nonzero(squared < s.alike**2)
+            value = overlap(rows, columns, squared[rows, columns], s.alike)
+            if value >= s.least_overlap:
+                table[ordered[j].id, a.id] = value
+    return table
+
+
+def choose_pairs(
+    table: Mapping[Pair, float], edges: Iterable[Edge], settings: CandidateSettings | None = None
+) -> list[Pair]:
+    """Choose the pairs to verify.
+
+    Args:
+        table: overlaps by (smaller id, greater id).
+        edges: of all maps; nodes that are few edges apart are left out.
+        settings: which pairs are looked at.
+
+    Returns:
+        Pairs that are among the best of either of their nodes, in the order of ids.
+    """
+    s = settings or CandidateSettings()
+    graph: nx.Graph = nx.Graph()
+    graph.add_edges_from((edge.a, edge.b) for edge in edges)
+    near = {node: set(nx.single_source_shortest_path_length(graph, node, s.least_hops - 1)) for node in graph}
+    ranked: dict[tuple[NodeId, Any], list[tuple[float, Pair]]] = {}
+    for pair, value in table.items():
+        a, b = pair
+        if value < s.least_overlap or b in near.get(a, ()):
+            continue
+        for one, other in ((a, b), (b, a)):
+            ranked.setdefault((one, other.map), []).append((-value, pair))
+    chosen = {pair for best in ranked.values() for _, pair in sorted(best)[: s.most_per_map]}
+    return sorted(chosen)

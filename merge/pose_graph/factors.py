@@ -1,0 +1,167 @@
+"""Measurements of a pose graph in columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.registration.pose_arrays import adjoints, compose_poses, inverse_poses
+
+Rows = NDArray[np.int64]
+LEAST_SIGMAS = np.array([1e-3, 1e-3, 2e-4])
+"""No measurement is better than this, m, m, rad: it keeps the graph well conditioned."""
+LEAST_SHARE = 2e-6
+"""Nor is any direction better known than by this share of the covariance's trace: what is told of it may be
+off by half as much (`mapweave.hybridmap.pose`), and nothing smaller comes through the solver."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A relative pose.
+
+    Attributes:
+        a: one node.
+        b: another one.
+        a_from_b: pose of b in a.
+        robust: whether it may be wrong: then its pull is limited (Huber).
+    """
+
+    a: NodeId
+    b: NodeId
+    a_from_b: PoseGaussian
+    robust: bool = False
+
+    @property
+    def covariance(self) -> Array:
+        """(3, 3), not better than is believable."""
+        return believable(self.a_from_b.covariance)
+
+
+def believable(covariances: Array) -> Array:
+    """(..., 3, 3) covariances of measurements, each made as large as is believable."""
+    share = LEAST_SHARE * np.trace(covariances, axis1=-2, axis2=-1)
+    least = np.maximum(LEAST_SIGMAS**2, share[..., None])
+    out: Array = covariances + least[..., None] * np.eye(3)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """M relative poses between the rows of N nodes.
+
+    Attributes:
+        a: (M,) row of the one node.
+        b: (M,) row of the other.
+        means: (M, 3) m, m, rad, `a_from_b`.
+        weights: (M, 3, 3) information.
+        robust: (M,) whether a measurement may be wrong: then its pull is limited (Huber).
+    """
+
+    a: Rows
+    b: Rows
+    means: Array
+    weights: Array
+    robust: NDArray[np.bool_]
+
+    @staticmethod
+    def of(measurements: Sequence[Measurement], a: Sequence[int], b: Sequence[int]) -> Factors:
+        """Of measurements between rows."""
+        covariances = np.array([m.a_from_b.covariance for m in measurements]).reshape(-1, 3, 3)
+        means = [(m.x, m.y, m.heading) for m in (one.a_from_b.mean for one in measurements)]
+        return Factors(
+            np.array(a, np.int64),
+            np.array(b, np.int64),
+            np.array(means).reshape(-1, 3),
+            np.asarray(np.linalg.inv(believable(covariances)), np.float64),
+            np.array([m.robust for m in measurements], np.bool_),
+        )
+
+    @staticmethod
+    def together(parts: Sequence[Factors]) -> Factors:
+        """Of all parts, which have the same rows."""
+        columns = ("a", "b", "means", "weights", "robust")
+        return Factors(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+
+    def __len__(self) -> int:
+        """How many measurements."""
+        return len(self.a)
+
+    def take(self, index: NDArray[np.bool_] | Rows, row_of: Rows | None = None) -> Factors:
+        """Some of the measurements, between rows that have moved to `row_of`."""
+        a, b = self.a[index], self.b[index]
+        if row_of is not None:
+            a, b = row_of[a], row_of[b]
+        return Factors(a, b, self.means[index], self.weights[index], self.robust[index])
+
+    @cached_property
+    def _by_row(self) -> tuple[Rows, Rows]:
+        """Measurements in the order of their rows, each at both of its ends; and where each row begins."""
+        ends = np.concatenate([self.a, self.b])
+        order = np.argsort(ends, kind="stable")
+        count = int(ends.max(initial=-1)) + 1
+        return order % max(len(self), 1), np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=count))])
+
+    def at(self, rows: Rows) -> Rows:
+        """Measurements that have an end at one of the rows, ascending."""
+        order, starts = self._by_row
+        rows = rows[rows < len(starts) - 1]
+        lengths = starts[rows + 1] - starts[rows]
+        index = np.repeat(starts[rows] - np.cumsum(lengths) + lengths, lengths) + np.arange(lengths.sum())
+        return np.unique(order[index])
+
+    def around(self, rows: Rows, least: int, nodes: int) -> Rows:
+        """Rows and their neighbours, ring by ring, until there are enough or no more.
+
+        Args:
+            rows: to begin with.
+            least: how many are enough.
+            nodes: how many rows there are.
+        """
+        found = np.zeros(nodes, np.bool_)
+        ring = np.unique(rows)
+        out = [ring]
+        found[ring] = True
+        while len(ring) and sum(map(len, out)) < least:
+            index = self.at(ring)
+            ends = np.unique(np.concatenate([self.a[index], self.b[index]]))
+            ring = ends[~found[ends]]
+            found[ring] = True
+            out.append(ring)
+        return np.concatenate(out)
+
+    def strains(self, means: Array) -> Array:
+        """(M,) how far nodes are from where measurements have them, chi-square with 3 degrees of freedom."""
+        between = compose_poses(inverse_poses(means[self.a]), means[self.b])
+        off = compose_poses(inverse_poses(self.means), between)
+        out: Array = np.einsum("ni,nij,nj->n", off, self.weights, off)
+        return out
+
+    def information(self, means: Array, huber: float) -> sparse.csc_matrix:
+        """(3N, 3N) of the right perturbations of all nodes.
+
+        A residual's derivative is (-Ad(b_from_a), identity), to first order in the residual.
+
+        Args:
+            means: (N, 3) where the nodes are.
+            huber: normalised residual from which a robust measurement pulls no harder.
+        """
+        size = np.sqrt(self.strains(means))
+        pull = np.where(self.robust & (size > huber), huber / np.maximum(size, 1e-12), 1.0)
+        weights = self.weights * pull[:, None, None]
+        by_a = -adjoints(compose_poses(inverse_poses(means[self.b]), means[self.a]))
+        transposed = by_a.transpose(0, 2, 1)
+        blocks = np.concatenate([transposed @ weights @ by_a, transposed @ weights, weights @ by_a, weights])
+        rows = np.concatenate([self.a, self.a, self.b, self.b])
+        columns = np.concatenate([self.a, self.b, self.a, self.b])
+        k = np.arange(3)
+        i = np.broadcast_to(3 * rows[:, None, None] + k[:, None], blocks.shape)
+        j = np.broadcast_to(3 * columns[:, None, None] + k, blocks.shape)
+        entries = (blocks.ravel(), (i.ravel(), j.ravel()))
+        return sparse.csc_matrix(sparse.coo_matrix(entries, shape=(3 * len(means), 3 * len(means))))

@@ -1,0 +1,250 @@
+"""The merged map: the union of the maps, the links that join them, and one pose a node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
+from mapweave.hybridmap.superseded import Superseded
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+
+if TYPE_CHECKING:
+    from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+MOST_NAMES = 20
+"""Maps that are named where one is mistyped."""
+NEAREST = 4
+"""Nodes that are named where one is mistyped: their numbers have gaps."""
+
+
+class Placement(NamedTuple):
+    """Where a node is in the merged map.
+
+    Attributes:
+        component: number of the component, 0 is the largest.
+        merged_from_robot: pose in the component's frame, which is the map frame of the component's
+            smallest node id.
+    """
+
+    component: int
+    merged_from_robot: PoseGaussian
+
+
+class Poses(Mapping[NodeId, Placement]):
+    """The poses of all nodes of some solved components, worked out when they are asked for."""
+
+    def __init__(self, graphs: Sequence[PoseGraph]) -> None:
+        """Take the components, largest first."""
+        self._graphs = tuple(graphs)
+        self._numbers: dict[tuple[str, int], list[int]] = {}
+        for number, graph in enumerate(self._graphs):
+            for map_id in graph.maps:
+                self._numbers.setdefault(map_id, []).append(number)
+
+    def number(self, node: NodeId) -> int | None:
+        """Of the node's component; None if it is not there."""
+        for number in self._numbers.get(node[:2], ()):
+            if node in self._graphs[number].rows:
+                return number
+        return None
+
+    def pose(self, node: NodeId) -> Pose2:
+        """Where a node is, without covariance, which costs more than all the rest.
+
+        Raises:
+            KeyError: it is not there.
+        """
+        number = self.number(node)
+        if number is None:
+            raise KeyError(node)
+        return self._graphs[number].pose(node)
+
+    def __getitem__(self, node: NodeId) -> Placement:
+        """Component and pose of a node."""
+        number = self.number(node)
+        if number is None:
+            raise KeyError(node)
+        return Placement(number, self._graphs[number].pose_gaussian(node))
+
+    def __contains__(self, node: object) -> bool:
+        """Whether a node is there."""
+        return isinstance(node, NodeId) and self.number(node) is not None
+
+    def __iter__(self) -> Iterator[NodeId]:
+        """All nodes, component by component."""
+        return (node for graph in self._graphs for node in graph.nodes)
+
+    def __len__(self) -> int:
+        """How many nodes."""
+        return sum(len(graph.nodes) for graph in self._graphs)
+
+
+class WrongGeometry(NamedTuple):
+    """A map that contradicts others, see mapweave.merge.outlier_rejection.wrong_geometry.
+
+    Attributes:
+        which: the map.
+        agreeing: maps that agree with each other and not with it, at least two.
+    """
+
+    which: MapId
+    agreeing: tuple[MapId, ...]
+
+    @property
+    def reason(self) -> str:
+        """For example `map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong`."""
+        *most, last = map(str, self.agreeing)
+        return (
+            f"map {self.which} contradicts {', '.join(most)} and {last}, which agree: its geometry is wrong"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MergedMap:
+    """A merge of maps. It keeps the maps as they are, so it can be explained, and made anew without a link.
+
+    Attributes:
+        maps: the maps, by id.
+        links: that join nodes, in the order of their ids.
+        refused: pairs that looked alike and were not joined, with reasons.
+        components: nodes that belong together, largest first.
+        poses: of all nodes.
+        graphs: the solved graph of each component, for covariances between nodes.
+        rulings: of people on what shall not be linked; the refused say which of them had anything to undo.
+        superseded: nodes that newer ones of the same place stand for, see
+            mapweave.merge.map_maintenance.node_superseding. They go on tying poses; questions are answered
+            from the others.
+        faded: (N,) of nodes, which of their landmarks are thought to be gone, see
+            mapweave.merge.map_maintenance.landmark_removal. Nodes where none is are left out.
+        set_apart: maps that are not among these, because the merge fails with them, and why.
+        wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
+    """
+
+    maps: Mapping[MapId, HybridMap]
+    links: tuple[Link, ...]
+    refused: tuple[RefusedLink, ...]
+    components: tuple[frozenset[NodeId], ...]
+    poses: Mapping[NodeId, Placement]
+    graphs: tuple[PoseGraph, ...] = ()
+    rulings: ManualConstraints = field(default_factory=ManualConstraints)
+    superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
+    faded: Mapping[NodeId, NDArray[np.bool_]] = field(default_factory=dict)
+    set_apart: Mapping[MapId, str] = field(default_factory=dict)
+    wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
+
+    @staticmethod
+    def empty() -> MergedMap:
+        """No maps."""
+        return MergedMap({}, (), (), (), {})
+
+    def pose(self, node: NodeId) -> Pose2:
+        """Where a node is in its component's frame, without covariance: quick also in a large map."""
+        if isinstance(self.poses, Poses):
+            return self.poses.pose(node)
+        return self.poses[node].merged_from_robot.mean
+
+    def component_of(self, node: NodeId) -> int | None:
+        """Number of the node's component."""
+        if isinstance(self.poses, Poses):
+            return self.poses.number(node)
+        placement = self.poses.get(node)
+        return None if placement is None else placement.component
+
+    def relative(self, a: NodeId, b: NodeId) -> PoseGaussian | None:
+        """Pose `a_from_b` through the whole merged map; None if nothing joins them."""
+        component = self.component_of(a)
+        if component is None or component != self.component_of(b):
+            return None
+        found = self.graphs[component].relative([a], [b])
+        return PoseGaussian(Pose2.from_vector(found.means[0]), nearest_covariance(found.covariances[0]))
+
+    def check(self, end: NodeId | MapId) -> None:
+        """Refuse a node or a map that is not there.
+
+        Raises:
+            InvalidValue: the words say what is.
+        """
+        which = MapId(*end[:2])
+        one = self.maps.get(which)
+        if which in self.set_apart:
+            raise InvalidValue(f"map {which} is set apart: {self.set_apart[which]}")
+        if one is None:
+            known = [str(other) for other in self.maps]
+            some = ", ".join(known[:MOST_NAMES]) or "none"
+            more = f" and {len(known) - MOST_NAMES} more" if len(known) > MOST_NAMES else ""
+            raise InvalidValue(f"there is no map {which}; known are: {some}{more}")
+        if isinstance(end, NodeId) and end not in one.nodes:
+            numbers = sorted(node.number for node in one.nodes)
+            nearest = sorted(sorted(numbers, key=lambda number: abs(number - end.number))[:NEAREST])
+            some = f"of its {len(numbers)} nodes the nearest are {', '.join(map(str, nearest))}"
+            span = some if numbers else "it has none"
+            raise InvalidValue(f"map {which} has no node {end.number}; {span}")
+
+    def joined(self, first: MapId, second: MapId) -> bool:
+        """Whether any node of one map is in one component with any of the other."""
+        return any(
+            any(node.map == first for node in component) and any(node.map == second for node in component)
+            for component in self.components
+        )
+
+    def union(self) -> HybridMap:
+        """All nodes and edges of all maps in one graph, with the links as edges.
+
+        A robot's own claims and drives that were refused are left out: nobody shall rely on them.
+        """
+        whole = HybridMap()
+        false = {refusal.edge for refusal in self.refused}
+        for map_id in sorted(self.maps):
+            for body in self.maps[map_id].contents():
+                if not (isinstance(body, EdgePut) and body.edge.id in false):
+                    whole.apply(body)
+        for link in self.links:
+            edge = link.edge()
+            whole.edges[edge.id] = edge
+            whole.graph.add_edge(edge.a, edge.b, key=edge.id)
+        return whole
+
+    def explain(self, a: NodeId, b: NodeId) -> str:
+        """Why two nodes are linked, or are not, in one sentence."""
+        pair = (a, b) if a <= b else (b, a)
+        for link in self.links:
+            if link.pair == pair:
+                numbers = ", ".join(f"{key} {value:.3g}" for key, value in sorted(link.evidence.items()))
+                return f"{link.a} and {link.b} are linked: {numbers}"
+        for refusal in self.refused:
+            if refusal.pair == pair:
+                return f"{refusal.a} and {refusal.b} are not linked: {refusal.reason}"
+        return f"{a} and {b} were not compared: they share too few alike features"
+
+    def summary(self) -> str:
+        """For example `17 nodes, 3 maps, 2 components, 5 links, 1 loop, 2 refused, 4 superseded`.
+
+        Links are between maps, loops within one; superseded nodes and retired maps count as nodes and maps.
+        """
+        loops = sum(link.within for link in self.links)
+        refused = sum(refusal.link is not None for refusal in self.refused)
+        counts = (
+            (len(self.poses), "node"),
+            (len(self.maps), "map"),
+            (len(self.components), "component"),
+            (len(self.links) - loops, "link"),
+            *([(loops, "loop")] if loops else []),
+        )
+        words = [f"{count} {word}{'' if count == 1 else 's'}" for count, word in counts]
+        more = (
+            (len(self.superseded), "superseded"),
+            (len(self.rulings.retired), "retired"),
+            (len(self.set_apart), "set apart"),
+        )
+        words += [f"{refused} refused", *(f"{count} {word}" for count, word in more if count)]
+        return ", ".join(words)

@@ -1,0 +1,126 @@
+"""A solved pose graph: where nodes are, and how well that is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
+
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
+from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+
+HUBER = 2.0
+"""Normalised residual from which a measurement that may be wrong pulls no harder."""
+
+AT_ONCE = 256
+"""Nodes whose marginal covariances are solved for together: all at once would take memory by the square."""
+
+FEW = 2048
+"""Up to as many nodes have their marginal covariances worked out all at once when one is asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """A solved graph of one connected component.
+
+    Attributes:
+        anchor: the node that is held.
+        nodes: in the order of ids.
+        means: (N, 3) m, m, rad, poses of the nodes.
+        information: (3N, 3N) sparse, of the right perturbations of all nodes, anchor held.
+        huber: normalised residual from which a robust measurement pulled no harder; inf: none did.
+    """
+
+    anchor: NodeId
+    nodes: tuple[NodeId, ...]
+    means: Array
+    information: sparse.csc_matrix
+    huber: float = HUBER
+
+    @cached_property
+    def rows(self) -> dict[NodeId, int]:
+        """Row of each node."""
+        return {node: k for k, node in enumerate(self.nodes)}
+
+    @cached_property
+    def _factor(self) -> Any:
+        """Sparse factor of the information, for as many covariances as are asked for."""
+        return factorized(self.information)
+
+    def index(self, nodes: Sequence[NodeId]) -> NDArray[np.int64]:
+        """(K,) rows of nodes."""
+        return np.array([self.rows[node] for node in nodes], dtype=np.int64)
+
+    def pose(self, node: NodeId) -> Pose2:
+        """The pose of a node."""
+        return Pose2.from_vector(self.means[self.rows[node]])
+
+    def covariance(self, nodes: Sequence[NodeId]) -> Array:
+        """(K, 3, K, 3) joint covariance of some nodes, by solving for their columns only."""
+        columns = (3 * self.index(nodes)[:, None] + np.arange(3)).ravel()
+        right = np.zeros((self.information.shape[0], len(columns)))
+        right[columns, np.arange(len(columns))] = 1.0
+        joint = self._factor.solve(right)[columns]
+        joint = 0.5 * (joint + joint.T)
+        blocks: Array = joint.reshape(len(nodes), 3, len(nodes), 3)
+        return blocks
+
+    @cached_property
+    def maps(self) -> frozenset[MapId]:
+        """Of which maps there are nodes."""
+        return frozenset(MapId(agent, epoch) for agent, epoch in {node[:2] for node in self.nodes})
+
+    @cached_property
+    def _known(self) -> dict[NodeId, PoseGaussian]:
+        """Poses that were asked for: all at once where they are few, else one by one."""
+        return self.poses() if len(self.nodes) <= FEW else {}
+
+    def pose_gaussian(self, node: NodeId) -> PoseGaussian:
+        """A node's pose with its marginal covariance."""
+        known = self._known
+        if node not in known:
+            known[node] = PoseGaussian(
+                self.pose(node), nearest_covariance(self.covariance([node])[0, :, 0, :])
+            )
+        return known[node]
+
+    def poses(self) -> dict[NodeId, PoseGaussian]:
+        """Each node's pose with its marginal covariance."""
+        out: dict[NodeId, PoseGaussian] = {}
+        for first in range(0, len(self.nodes), AT_ONCE):
+            some = self.nodes[first : first + AT_ONCE]
+            joint = self.covariance(some)
+            for k, node in enumerate(some):
+                covariance = nearest_covariance(joint[k, :, k, :])
+                out[node] = PoseGaussian(Pose2.from_vector(self.means[first + k]), covariance)
+        return out
+
+    def relative(self, starts: Sequence[NodeId], ends: Sequence[NodeId]) -> PoseGaussians:
+        """Poses `start_from_end` of K pairs, with covariances that know what the two have in common."""
+        involved = sorted({*starts, *ends})
+        joint = self.covariance(involved)
+        row = {node: k for k, node in enumerate(involved)}
+        i, j = np.array([row[n] for n in starts], int), np.array([row[n] for n in ends], int)
+        means = compose_poses(inverse_poses(self.means[self.index(starts)]), self.means[self.index(ends)])
+        # (start @ ds)^-1 (end @ de) = start_from_end @ (de - Ad(end_from_start) ds) to first order.
+        ad = -adjoints(inverse_poses(means))
+        cross = ad @ joint[i, :, j, :]
+        covariances = ad @ joint[i, :, i, :] @ ad.transpose(0, 2, 1) + joint[j, :, j, :]
+        return PoseGaussians(means, covariances + cross + cross.transpose(0, 2, 1))
+
+
+def factorized(information: sparse.spmatrix) -> Any:
+    """Sparse factor of a symmetric positive definite matrix, which needs no pivots."""
+    return splu(
+        sparse.csc_matrix(information),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )

@@ -1,0 +1,70 @@
+"""Candidate pairs become links: do the two nodes' landmarks agree on a pose?"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mapweave.hybridmap.node import Node
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
+
+
+@dataclass(frozen=True)
+class VerificationSettings:
+    """When two nodes are linked.
+
+    Attributes:
+        recognition: when they count as the same place.
+        most_sigma_xy: largest standard deviation of their relative position, m. A link that may be off by
+            half a metre joins nothing that a robot could drive.
+        most_sigma_heading: likewise of the heading, rad.
+    """
+
+    recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
+    most_sigma_xy: float = 0.16
+    most_sigma_heading: float = 0.05
+
+
+def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Link | RefusedLink:
+    """Compare two nodes.
+
+    The answer depends on the two nodes alone: they are put in the order of their ids, and the random draws
+    of the estimator start from the ids, so neither order of arrival nor other nodes have a say.
+
+    Args:
+        a: one node.
+        b: another one.
+        settings: when they are linked.
+
+    Returns:
+        A link, or why there is none.
+    """
+    s = settings or VerificationSettings()
+    if b.id < a.id:
+        a, b = b, a
+    verdict = examine(a, b, s)
+    if isinstance(verdict, Recognition):
+        sigma_xy, sigma_heading = verdict.evidence["sigma_xy"], verdict.evidence["sigma_heading"]
+        if sigma_xy > s.most_sigma_xy or sigma_heading > s.most_sigma_heading:
+            degrees = math.degrees(sigma_heading)
+            reason = f"the same place, but known to {sigma_xy:.2f} m and {degrees:.1f} deg only"
+            return RefusedLink(a.id, b.id, reason)
+        return Link(a.id, b.id, verdict.node_from_robot, verdict.pairs, verdict.evidence)
+    return RefusedLink(a.id, b.id, verdict.reason)
+
+
+def examine(a: Node, b: Node, settings: VerificationSettings | None = None) -> Recognition | Refusal:
+    """What `verify` goes by: the same draws, the same numbers.
+
+    Args:
+        a: the node with the smaller id.
+        b: the other one.
+        settings: when they are linked.
+    """
+    s = settings or VerificationSettings()
+    rng = np.random.default_rng(zlib.crc32(f"{a.id} {b.id}".encode()))
+    return examine_nodes(a, b, s.recognition, rng)

@@ -1,0 +1,67 @@
+"""What a merge has decided, from which the next one of the same maps begins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+
+@dataclass(frozen=True, eq=False)
+class StandingDecisions:
+    """Of links by their pairs: what was decided of each, and where that put the nodes.
+
+    A decision holds for the very link that it was made of, compared by identity: links are never changed,
+    only replaced.
+
+    Attributes:
+        given: the links as they were verified.
+        weighed: the same with the landmarks that are known to be found elsewhere too.
+        believed: which of them join maps.
+        refused: the others, with reasons.
+        refuted: those of them that robots' bodies speak against.
+        graphs: the components.
+        fragments: the pieces of map that these are made of.
+        size: links that there were when all were decided together.
+        changed: links that have come or gone since.
+    """
+
+    given: Mapping[Pair, Link] = field(default_factory=dict)
+    weighed: Mapping[Pair, Link] = field(default_factory=dict)
+    believed: frozenset[Pair] = frozenset()
+    refused: Mapping[Pair, RefusedLink] = field(default_factory=dict)
+    refuted: frozenset[Pair] = frozenset()
+    graphs: tuple[PoseGraph, ...] = ()
+    fragments: tuple[Fragment, ...] = ()
+    size: int = 0
+    changed: int = 0
+
+    @cached_property
+    def _component(self) -> dict[NodeId, int]:
+        return {node: k for k, graph in enumerate(self.graphs) for node in graph.nodes}
+
+    def together(self, a: NodeId, b: NodeId) -> bool:
+        """Whether two nodes are in one component."""
+        return self._component.get(a) == self._component.get(b)
+
+    @staticmethod
+    def union(parts: Iterable[StandingDecisions]) -> StandingDecisions:
+        """Of maps that nothing tied together before."""
+        some = list(parts)
+        return StandingDecisions(
+            {pair: link for one in some for pair, link in one.given.items()},
+            {pair: link for one in some for pair, link in one.weighed.items()},
+            frozenset().union(*(one.believed for one in some)),
+            {pair: refusal for one in some for pair, refusal in one.refused.items()},
+            frozenset().union(*(one.refuted for one in some)),
+            tuple(graph for one in some for graph in one.graphs),
+            tuple(fragment for one in some for fragment in one.fragments),
+            sum(one.size for one in some),
+            sum(one.changed for one in some),
+        )

@@ -1,0 +1,79 @@
+"""Files that are written whole or not at all: a full disk or a loss of power leaves the old one.
+
+Only regular files are read: a device or a pipe may have no end.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from mapweave.hybridmap.errors import InvalidFile
+
+
+def write_whole(path: Path, data: bytes | memoryview) -> None:
+    """Write a file beside its place, then move it there.
+
+    Raises:
+        InvalidFile: the disk does not take it; what was there is as before.
+    """
+    check_place(path)
+    if path.exists() and not path.is_file():
+        # A pipe, a terminal, /dev/null: nothing to keep, and nothing to put in its place.
+        path.write_bytes(data)
+        return
+    path = path.resolve()
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with beside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise _unwritable(path, error.strerror or str(error)) from None
+    except BaseException:
+        # Somebody interrupts: nothing is left lying about.
+        beside.unlink(missing_ok=True)
+        raise
+
+
+def read_whole(path: Path) -> bytes:
+    """Read a regular file.
+
+    Raises:
+        OSError: it is missing, cannot be read, or is a device or a pipe.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return path.read_bytes()
+
+
+def check_place(path: Path) -> None:
+    """Refuse a place where no file can be, before hours of work are written there.
+
+    Raises:
+        InvalidFile: it is a folder, or its folder is missing or takes no files.
+    """
+    if path.is_dir() or not path.name:
+        raise _unwritable(path, os.strerror(errno.EISDIR))
+    if not path.parent.is_dir():
+        raise _unwritable(path, f"there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK) and not path.exists():
+        raise _unwritable(path, os.strerror(errno.EACCES))
+
+
+def _unwritable(path: Path, why: str) -> InvalidFile:
+    return InvalidFile(f"{path}: cannot be written ({why})")
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a move in a folder outlast a loss of power."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,141 @@
+"""SQLite files that survive the loss of power, belong to one process, and say clearly what is wrong."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mapweave.hybridmap.errors import InvalidFile
+
+
+class Database:
+    """One SQLite file in WAL mode, each commit on the disk before it returns (synchronous=FULL).
+
+    The file is locked for as long as it is open: two processes that append to one log would number their
+    changes alike.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        what: str,
+        application_id: int,
+        version: int,
+        schema: str,
+        repair: Callable[[sqlite3.Connection], None] | None = None,
+        advice: str = "",
+    ) -> None:
+        """Open the file, or make it.
+
+        Args:
+            path: of the file; its folder must be there.
+            what: what it is for people, for example "agent journal".
+            application_id: marks files of this kind.
+            version: of the schema.
+            schema: SQL that makes the tables of a new file.
+            repair: called before the check of the file's pages; may take out rows that are damaged.
+            advice: what to do about a damaged file, for people; stands behind the reason.
+
+        Raises:
+            InvalidFile: damaged, of another kind or version, in use, or not readable.
+        """
+        self.path = path
+        self._file = path.absolute()
+        self.what = what
+        self._repair = repair
+        self._advice = f"; {advice}" if advice else ""
+        with self.guard():
+            # Threads take turns: whoever shares a Database holds a lock of its own.
+            self.connection = sqlite3.connect(
+                path, timeout=5.0, isolation_level=None, check_same_thread=False
+            )
+        # Text with a flipped bit may be no UTF-8; what it stands for is checked by whoever reads it.
+        self.connection.text_factory = lambda data: data.decode("utf-8", "replace")
+        try:
+            with self.guard():
+                self._prepare(application_id, version, schema)
+            self._inode = self._inode_now()
+        except BaseException:
+            self.connection.close()
+            raise
+
+    def _inode_now(self) -> tuple[int, int] | None:
+        """By which the file of this name is known; None if there is none."""
+        try:
+            found = self._file.stat()
+        except OSError:
+            return None
+        return found.st_dev, found.st_ino
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Turn SQLite's errors into InvalidFile with one line."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            if "locked" in str(error):
+                raise InvalidFile(f"{self.path}: {self.what} is in use by another process") from None
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF in (
+                sqlite3.SQLITE_CORRUPT,
+                sqlite3.SQLITE_NOTADB,
+            ):
+                raise self._damaged(str(error)) from None
+            raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error})") from None
+
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """All that is done inside is committed at the end, or nothing of it.
+
+        Raises:
+            InvalidFile: the disk does not take it, or the file is gone: what is written would go with it.
+        """
+        if self._inode_now() != self._inode:
+            raise InvalidFile(
+                f"{self.path}: {self.what} was deleted or replaced under the running program; "
+                "put it back, or start the program again"
+            )
+        with self.guard():
+            self.connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield self.connection
+                self.connection.execute("COMMIT")
+            except BaseException:
+                # A full disk may have rolled back by itself.
+                if self.connection.in_transaction:
+                    self.connection.execute("ROLLBACK")
+                raise
+
+    def close(self) -> None:
+        """Let go of the file. Twice is no error."""
+        self.connection.close()
+
+    def _prepare(self, application_id: int, version: int, schema: str) -> None:
+        run = self.connection.execute
+        run("PRAGMA locking_mode=EXCLUSIVE")
+        run("PRAGMA synchronous=FULL")
+        kind = run("PRAGMA application_id").fetchone()[0]
+        empty = run("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        if not empty and kind != application_id:
+            raise InvalidFile(f"{self.path}: is not a Mapweave {self.what}")
+        found = run("PRAGMA user_version").fetchone()[0]
+        if not empty and found != version:
+            raise InvalidFile(f"{self.path}: {self.what} of format {found}, this program uses {version}")
+        run("PRAGMA journal_mode=WAL")
+        if empty:
+            run("BEGIN IMMEDIATE")
+            for statement in filter(str.strip, schema.split(";")):
+                run(statement)
+            run(f"PRAGMA application_id={application_id}")
+            run(f"PRAGMA user_version={version}")
+            run("COMMIT")
+        if self._repair is not None and not empty:
+            self._repair(self.connection)
+        # With its name in front a message may have two lines, the second of which says what is wrong.
+        damage = str(run("PRAGMA quick_check(1)").fetchone()[0])
+        if damage != "ok":
+            raise self._damaged(damage.splitlines()[-1])
+
+    def _damaged(self, reason: str) -> InvalidFile:
+        return InvalidFile(f"{self.path}: {self.what} is damaged ({reason}){self._advice}")

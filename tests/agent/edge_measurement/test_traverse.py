@@ -1,0 +1,156 @@
+"""Which drives are measurements, and how good: a robot that is told where it is, with noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder, TraverseSettings
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_localizer import NodeLocalizer
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+
+ROBOT = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3))
+A, B, C = (NodeId("r0", 1, number) for number in (1, 2, 3))
+NODES = {A: Pose2(), B: Pose2(1.5, 0.3, 0.4), C: Pose2(3.0, 0.3, -0.2)}
+SIGMAS = np.array([0.01, 0.015, 0.006])
+STEP = Odometry(0.02, 0.001)
+CERTAIN = 16.27
+"""99.9 % of chi-square with 3 degrees of freedom."""
+
+
+class Landmarks(NodeLocalizer):
+    """A node in sight, with so many landmarks; nothing is tracked."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    @property
+    def in_sight(self) -> bool:
+        return True
+
+    @property
+    def visible(self) -> np.ndarray:
+        return np.arange(self.count)
+
+
+class Drive:
+    """A robot on its way from A, whose wheels slip."""
+
+    def __init__(self, seed: int = 0, settings: TraverseSettings | None = None) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.surveyor = TraverseRecorder(ROBOT, settings)
+        self.pose = NODES[A]
+        self.measured: list[Traverse] = []
+
+    def by(self, node: NodeId | None, steps: int, odometry: Odometry = STEP, count: int = 12) -> None:
+        """Drive some steps with a node's landmarks in sight; without any, by wheels alone."""
+        landmarks = None if node is None else Landmarks(count)
+        for _ in range(steps):
+            wheels = np.array([-0.5, 0.5]) * ROBOT.axle * odometry.turn + odometry.forward
+            left, right = wheels * (1 + ROBOT.wheel_noise * self.rng.normal(size=2))
+            self.pose = self.pose @ Odometry((left + right) / 2, (right - left) / ROBOT.axle).motion()
+            fix = Fix(A, PoseGaussian(Pose2(9.0), np.eye(3)))
+            if node is not None:
+                noise = Pose2.from_vector(self.rng.normal(0, SIGMAS))
+                pose = PoseGaussian(NODES[node].inverse() @ self.pose @ noise, np.diag(SIGMAS**2))
+                fix = Fix(node, pose, landmarks)
+            self.see(fix, odometry)
+
+    def see(self, fix: Fix | None, odometry: Odometry = STEP) -> None:
+        traverse = self.surveyor.see(fix, Observation(0, odometry))
+        if traverse is not None:
+            self.measured.append(traverse)
+
+    @property
+    def told(self) -> list[tuple[NodeId, NodeId]]:
+        return [(traverse.start, traverse.end) for traverse in self.measured]
+
+
+def test_a_passage_is_told_when_the_next_node_is_reached():
+    drive = Drive()
+    drive.by(A, 20)
+    drive.by(B, 10)
+    assert not drive.told, "the next node is in sight, but far"
+    drive.by(B, 60)
+    assert drive.told == [(A, B)]
+
+
+def test_what_is_measured_is_as_good_as_it_says():
+    """The mean over 60 drives: no surer than it is right, and not much less sure either."""
+    nees = []
+    for seed in range(60):
+        drive = Drive(seed, TraverseSettings(floor=(0.0, 0.0)))
+        drive.by(A, 20)
+        drive.by(None, 10)
+        drive.by(B, 60)
+        [traverse] = drive.measured
+        nees.append(traverse.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[B]))
+    assert 1.0 < np.mean(nees) < 4.0
+
+
+def test_a_node_that_was_not_come_near_is_passed_over():
+    drive = Drive()
+    drive.by(A, 20)
+    drive.by(B, 5, count=7)
+    drive.by(C, 130)
+    [traverse] = drive.measured
+    assert (traverse.start, traverse.end, traverse.landmarks) == (A, C, 7)
+    assert traverse.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[C]) < CERTAIN
+
+
+def test_where_no_node_was_come_near_nothing_begins():
+    drive = Drive()
+    drive.pose = Pose2(-0.8)
+    drive.by(A, 10)
+    drive.by(B, 130)
+    assert not drive.told
+
+
+@pytest.mark.parametrize(("steps", "told"), [(20, [(A, B)]), (30, [])])
+def test_a_gap_without_landmarks_must_be_short(steps, told):
+    drive = Drive()
+    drive.by(A, 10)
+    drive.by(None, steps)
+    drive.by(B, 60)
+    assert drive.told == told
+
+
+def test_a_node_that_was_glimpsed_is_no_node():
+    drive = Drive()
+    drive.by(A, 10)
+    drive.by(B, 2)
+    drive.by(C, 130)
+    assert drive.told == [(A, C)]
+    assert drive.measured[0].start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[C]) < CERTAIN
+
+
+def test_whoever_was_lost_in_between_may_have_been_carried():
+    drive = Drive()
+    drive.by(A, 10)
+    drive.see(None)
+    drive.pose = Pose2(1.5, 0.1)
+    drive.by(B, 10)
+    assert not drive.told
+    drive.by(C, 100)
+    assert drive.told == [(B, C)], "from there on it measures again"
+
+
+def test_a_roundabout_way_says_nothing_of_the_straight_one():
+    drive = Drive()
+    drive.by(A, 10)
+    drive.by(B, 60, Odometry(0.05, 2 * math.pi / 60))
+    drive.by(B, 80)
+    assert not drive.told
+
+
+def test_what_is_known_badly_is_not_told():
+    drive = Drive(settings=TraverseSettings(widest=0.015))
+    drive.by(A, 20)
+    drive.by(B, 60)
+    assert not drive.told

@@ -1,0 +1,125 @@
+"""When a carried robot makes nodes: rule by rule, and on photographs hung on walls."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from mapweave.agent.exploration.carried_mapping import CarriedMapping, CarriedMappingSettings
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.observation import Observation, Odometry
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+
+TICK = Observation(0, Odometry(0.0, 0.0))
+
+
+@dataclass
+class Stage:
+    """A mapper that only says what the test wants."""
+
+    anchor_from_robot: Pose2 = field(default_factory=Pose2)
+    anchored: int = 100
+    anchor_features: int = 100
+    converged_share: float = 0.0
+    typical_depth: float = 2.0
+    started: bool = True
+    finished: int = 0
+
+    def begin(self, observation: Observation) -> None:
+        self.started = observation.image is not None
+
+    def finish(self, observation: Observation) -> bool:
+        self.finished += 1
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stage", "node"),
+    [
+        (Stage(Pose2()), False),
+        (Stage(Pose2(0.49), converged_share=0.9), False),
+        (Stage(Pose2(0.51), converged_share=0.9), True),
+        (Stage(Pose2(0.3, -0.45), converged_share=0.7), True),
+        (Stage(Pose2(0.51), converged_share=0.69), False),
+        (Stage(Pose2(0, 0, -0.36), converged_share=0.7), True),
+        (Stage(Pose2(0, 0, 0.34), converged_share=0.9), False),
+        (Stage(Pose2(0.05), anchored=44), True),
+        (Stage(Pose2(0.05), anchored=46), False),
+        (Stage(Pose2(0, 0, 0.11), anchored=10), True),
+        (Stage(Pose2(0.03), anchored=10), False),
+        (Stage(Pose2(0.05), anchored=15, anchor_features=20), True),
+        (Stage(Pose2(0.05), anchored=16, anchor_features=20), False),
+    ],
+)
+def test_a_node_is_made_when_the_view_is_known_or_leaving(stage, node):
+    CarriedMapping(stage).step(TICK)
+    assert stage.finished == node
+
+
+def test_settings_are_heeded():
+    stage = Stage(Pose2(0.3), converged_share=0.5)
+    CarriedMapping(stage).step(TICK)
+    assert not stage.finished
+    CarriedMapping(stage, CarriedMappingSettings(converged=0.4, depth_step=0.1)).step(TICK)
+    assert stage.finished
+
+
+def test_without_an_image_it_waits():
+    stage = Stage(started=False)
+    passenger = CarriedMapping(stage)
+    assert passenger.detail == "no image yet"
+    passenger.step(TICK)
+    assert not stage.started
+    passenger.step(Observation(0, Odometry(0, 0), np.zeros((240, 320), np.uint8)))
+    assert stage.started
+    assert not stage.finished
+
+
+def test_it_says_what_is_wrong_with_the_view():
+    passenger = CarriedMapping(Stage(anchor_features=3, anchored=2))
+    passenger.step(TICK)
+    assert passenger.detail == "only 3 features in view"
+
+
+def carried(walls, description, poses):
+    """The nodes that a carried robot makes, and its mapper."""
+    mapper = Mapper(MapId("r0", 1), description)
+    passenger = CarriedMapping(mapper)
+    changes, before = [], poses[0]
+    for tick, pose in enumerate(poses):
+        observation = walls.observe(before, pose, tick)
+        mapper.step(observation)
+        passenger.step(observation)
+        changes += mapper.take_changes()
+        before = pose
+    return changes, mapper, passenger
+
+
+def test_a_drive_along_the_walls_becomes_a_chain_of_nodes(walls, description):
+    poses = [Pose2(x) for x in np.arange(0.0, 1.3, 0.025)]
+    changes, mapper, passenger = carried(walls, description, poses)
+    nodes = [change.node for change in changes if isinstance(change, NodePut)]
+    assert len(nodes) >= 2
+    assert len(mapper.map.components()) == 1
+    for node in nodes:
+        true = poses[round(node.stamp_ns / 1e8)]
+        assert node.map_from_robot.mean.distance(true) < 0.03
+        assert abs(node.map_from_robot.mean.heading) < 0.02
+    assert "features left after" in passenger.detail
+
+
+def test_a_robot_that_stands_still_makes_no_node(walls, description):
+    changes, mapper, _ = carried(walls, description, [Pose2()] * 25)
+    assert changes == []
+    assert mapper.started
+
+
+def test_a_blank_wall_makes_no_node_and_says_so(walls, description):
+    poses = [Pose2(-x, 0, np.pi) for x in np.arange(0.0, 0.8, 0.05)]
+    changes, _, passenger = carried(walls, description, poses)
+    assert changes == []
+    assert passenger.detail == "only 0 features in view"

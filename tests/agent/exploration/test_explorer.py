@@ -1,0 +1,110 @@
+"""Exploration: what others have mapped is not mapped again, and the paper's way by chance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.mission import Answer, Explore, WhatIsKnown
+from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import KnownAnswer
+
+MAP = MapId("r0", 1)
+BEARINGS = tuple(np.linspace(-math.pi, math.pi, 24, endpoint=False).tolist())
+BODY = RobotDescription(
+    Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3), ranger_bearings=BEARINGS, ranger_reach=3.0
+)
+"""The robot of the photographs, with rangers."""
+ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(0.0, math.tau, 0.7)])
+
+
+def live(walls, settings: ExplorerSettings, ticks: int, told: dict[int, Answer], seed: int = 0) -> list[Step]:
+    """Let a pipeline explore a wide room with pictures ahead, with what it is told at some ticks."""
+    pipeline = Pipeline(MAP, BODY, PipelineSettings(explorer=settings, seed=seed))
+    pipeline.set_mission(Explore())
+    pose, moved, steps = Pose2(), Odometry(0.0, 0.0), []
+    for tick in range(ticks):
+        seen = Observation(tick * 100_000_000, moved, walls.render(pose), np.full(len(BEARINGS), 2.0))
+        step = pipeline.step(seen, (told[tick],) if tick in told else ())
+        moved = Odometry(step.command.forward * BODY.tick, step.command.turn * BODY.tick)
+        pose = pose @ moved.motion()
+        steps.append(step)
+    return steps
+
+
+def doings(steps: list[Step]) -> list[str]:
+    """What it did, in order, without repetitions."""
+    said = [step.status.doing for step in steps]
+    return [b for a, b in zip([None, *said], said, strict=False) if a != b]
+
+
+def questions(steps: list[Step]) -> list[WhatIsKnown]:
+    return [q for step in steps for q in step.questions if isinstance(q, WhatIsKnown)]
+
+
+def test_it_asks_about_its_own_map_and_nothing_waits_for_the_answer(walls):
+    steps = live(walls, ExplorerSettings(), 40, {})
+    (first, *_) = questions(steps)
+    assert (first.map, first.x, first.y) == (MAP, pytest.approx(0.0), pytest.approx(0.0))
+    assert first.reach > ExplorerSettings().reach
+    assert first.number < 0, "the navigator's questions are positive"
+    silent = live(walls, ExplorerSettings(ask=False), 40, {})
+    assert questions(silent) == []
+    assert [step.command for step in steps] == [step.command for step in silent]
+
+
+@pytest.mark.parametrize("error", ["no map server answered", "no key known"])
+def test_no_answer_changes_nothing(walls, error):
+    steps = live(walls, ExplorerSettings(), 40, {1: Answer(-1, None, error)})
+    assert [step.command for step in steps] == [
+        step.command for step in live(walls, ExplorerSettings(), 40, {})
+    ]
+
+
+def test_where_others_have_looked_around_it_does_not(walls):
+    alone = doings(live(walls, ExplorerSettings(), 12, {}))
+    assert alone[:2] == [Phase.LOOKING, Phase.DRIVING]
+    told = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND, ""))})
+    assert doings(told)[1] == Phase.SCANNING
+    half = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND[:4], ""))})
+    assert doings(half)[1] == Phase.DRIVING
+    far = ALL_AROUND + np.array([2.0, 0.0, 0.0, 0.0])
+    elsewhere = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(far, ""))})
+    assert doings(elsewhere)[1] == Phase.DRIVING
+
+
+def turns(steps: list[Step]) -> list[float]:
+    """Side of each turn between two views: 1 to the left, -1 to the right."""
+    sides, turning = [], False
+    for step in steps:
+        now = step.status.doing == Phase.TURNING and step.command.turn != 0.0
+        if now and not turning:
+            sides.append(math.copysign(1.0, step.command.turn))
+        turning = now
+    return sides
+
+
+def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
+    by_chance = ExplorerSettings(wander=True)
+    steps = live(walls, by_chance, 250, {})
+    sides = turns(steps)
+    assert len(sides) >= 3
+    assert set(sides) == {1.0, -1.0}
+    assert Phase.TRAVELLING in doings(steps)
+    assert questions(steps) == []
+    commands = [step.command for step in steps]
+    assert commands[:50] == [step.command for step in live(walls, by_chance, 50, {})]
+    assert commands[:150] != [step.command for step in live(walls, by_chance, 150, {}, seed=1)]
+
+
+def test_ours_turns_all_the_way_around(walls):
+    sides = turns(live(walls, ExplorerSettings(), 250, {}))
+    assert len(sides) >= 3
+    assert len(set(sides)) == 1

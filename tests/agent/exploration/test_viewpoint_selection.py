@@ -1,0 +1,192 @@
+"""Room to move and places that are known, against counting by hand and brute force."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapweave.agent.clearance import ASIDE, BEFORE, clearance
+from mapweave.agent.exploration.fleet_coverage import FleetCoverage
+from mapweave.agent.exploration.settings import ExplorerSettings
+from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_around, views_of
+from mapweave.agent.mission import Answer, WhatIsKnown
+from mapweave.agent.observation import RobotDescription
+from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import KnownAnswer
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
+BEARINGS = tuple(np.linspace(-math.pi, math.pi, 16, endpoint=False).tolist())
+BODY = RobotDescription(CAMERA, ranger_bearings=BEARINGS, ranger_reach=3.0)
+
+readings = st.lists(st.floats(0.0, 3.0), min_size=16, max_size=16).map(np.array)
+directions = st.sampled_from(BEARINGS)
+
+
+@settings(max_examples=200, deadline=None)
+@given(readings, directions)
+def test_the_footprint_may_move_as_far_as_room_says(proximity, direction):
+    """Moved step by step it comes no nearer to what the rangers hit than room promises."""
+    angles = np.array(BEARINGS)
+    hits = (proximity + BODY.radius)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ahead = np.array([math.cos(direction), math.sin(direction)])
+    before = hits[(hits @ ahead) > 0.3 * np.linalg.norm(hits, axis=1)]
+    for way in np.arange(0.0, clearance(BODY, proximity, direction), 0.01):
+        gone = before - way * ahead
+        along, aside = gone @ ahead, np.abs(gone @ [-ahead[1], ahead[0]])
+        in_way = aside < BODY.radius + ASIDE - 1e-9
+        assert (along[in_way] >= BODY.radius + BEFORE - 1e-6).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(readings, directions, st.integers(0, 15), st.floats(0.0, 1.0))
+def test_what_comes_nearer_leaves_less_room(proximity, direction, which, share):
+    nearer = proximity.copy()
+    nearer[which] *= share
+    assert clearance(BODY, nearer, direction) <= clearance(BODY, proximity, direction) + 1e-9
+
+
+def test_without_rangers_nobody_knows():
+    assert clearance(BODY, np.zeros(0), 0.0) == math.inf
+    assert clearance(BODY, np.zeros(0), 0.0, 0.6) == 0.6
+    one = RobotDescription(CAMERA, ranger_bearings=(math.pi,), ranger_reach=3.0)
+    assert clearance(one, np.array([2.0]), 0.0, 0.6) == 0.6
+    assert clearance(one, np.array([2.0]), math.pi) == pytest.approx(2.0 - BEFORE)
+
+
+def a_map(*poses: Pose2) -> HybridMap:
+    return HybridMap(
+        NodePut(
+            Node(NodeId("r0", 1, k + 1), 0, PoseGaussian.from_sigmas(p, 0.1, 0.1), CAMERA, Landmarks.empty())
+        )
+        for k, p in enumerate(poses)
+    )
+
+
+def test_a_place_is_seen_as_far_as_its_nodes_look():
+    here = np.array([1.0, 2.0])
+    share = 2 * CAMERA.semi_aperture / math.tau
+    assert seen_around(views_of(HybridMap()), here, 0.7) == 0.0
+    one = a_map(Pose2(1.2, 2.0, 0.3))
+    assert seen_around(views_of(one), here, 0.7) == pytest.approx(share, abs=1 / 36)
+    assert seen_around(views_of(one), here, 0.1) == 0.0
+    assert seen_around(
+        views_of(a_map(Pose2(1.2, 2.0, 0.3), Pose2(0.9, 2.0, 0.3))), here, 0.7
+    ) == pytest.approx(share, abs=1 / 36), "twice the same way is no more"
+    around = [Pose2(1.0, 2.1, heading) for heading in np.arange(0, math.tau, 0.9)]
+    assert seen_around(views_of(a_map(*around)), here, 0.7) == 1.0
+
+
+# What others have looked around at
+
+MAP = MapId("r0", 1)
+NOBODY = np.zeros((0, 2))
+
+
+def looks(x: float, y: float, headings: np.ndarray) -> np.ndarray:
+    """(N, 4) views from one place."""
+    return np.array([[x, y, heading, CAMERA.semi_aperture] for heading in headings])
+
+
+ALL_AROUND = np.arange(0.0, math.tau, 0.9)
+
+
+def test_it_does_not_matter_who_looked_around_at_a_place():
+    hearsay = FleetCoverage(MAP, 8.7)
+    assert hearsay.question(np.array([1.0, 2.0])) == WhatIsKnown(-1, MAP, 1.0, 2.0, 8.7)
+    theirs = np.concatenate([looks(3.0, 0.0, ALL_AROUND), looks(6.0, 0.0, ALL_AROUND[:4])])
+    hearsay.take(Answer(-1, KnownAnswer(theirs, "")))
+    places = hearsay.places(hearsay.views, 0.7, 0.75)
+    assert np.unique(places, axis=0).tolist() == [[3.0, 0.0]]
+    mine = looks(6.1, 0.0, ALL_AROUND[4:])
+    both = hearsay.places(np.concatenate([hearsay.views, mine]), 0.7, 0.75)
+    assert np.unique(both, axis=0).tolist() == [[3.0, 0.0], [6.0, 0.0]]
+
+
+def test_a_server_that_does_not_answer_takes_nothing_back():
+    hearsay = FleetCoverage(MAP, 8.7)
+    assert hearsay.places(looks(0.0, 0.0, ALL_AROUND), 0.7, 0.75).shape == (0, 2)
+    hearsay.take(Answer(-1, KnownAnswer(looks(3.0, 0.0, ALL_AROUND), "")))
+    hearsay.take(Answer(-1, None, "no map server answered"))
+    assert len(hearsay.views) == len(ALL_AROUND)
+
+
+def corridor() -> OccupancyGrid:
+    """A robot in the middle of a long corridor, 2.4 m wide, that it has swept from where it is."""
+    floor = OccupancyGrid(BODY)
+    for heading in np.linspace(0.0, math.tau, 90):
+        angles = heading + np.array(BEARINGS)
+        with np.errstate(divide="ignore"):
+            free = np.minimum(1.2 / np.abs(np.sin(angles)) - BODY.radius, 3.0)
+        floor.see(Pose2(0.0, 0.0, float(heading)), free)
+    return floor
+
+
+def test_the_next_place_is_where_nobody_has_been():
+    floor, here = corridor(), np.zeros(2)
+    been = here[None]
+
+    def end(others: np.ndarray) -> np.ndarray:
+        return next_viewpoint(floor, here, been, others, ExplorerSettings())[-1]
+
+    assert abs(end(NOBODY)[0]) > 1.7, "one of the two ends of what it has seen"
+    left = np.array([[-2.5, 0.0]])
+    assert end(left)[0] > 1.7
+    assert end(-left)[0] < -1.7
+    # Where others are everywhere, the way on leads past them.
+    assert abs(end(np.concatenate([left, -left]))[0]) > 1.7
+    everywhere = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-1, 2)), axis=-1).reshape(-1, 2) * 1.0
+    assert next_viewpoint(floor, here, everywhere, NOBODY, ExplorerSettings()) == []
+
+
+def test_what_walls_hide_makes_no_place_worth_a_way():
+    """Along a corridor everything behind its walls is unknown for ever; a wide unknown end is worth more."""
+    floor = corridor()
+    middle, end = floor.unknown_in_sight(np.array([[0.0, 0.0], [2.5, 0.0]]), NOBODY, 1.6, 3.0)
+    assert middle < 0.5
+    assert end > 3.0
+    around = floor.unknown_around(1.6, NOBODY)
+    assert around[tuple(floor.cells(np.zeros(2)))] > 0.1, "which a square around it does not tell"
+    told = floor.unknown_in_sight(np.array([[2.5, 0.0]]), np.array([[4.0, 0.0]]), 1.6, 3.0)
+    assert told[0] < end
+
+
+def test_floor_in_sight_against_looking_at_each_cell():
+    """Every cell is looked at along a line of its own, in steps of a centimetre."""
+    floor, here, reach = corridor(), np.array([2.05, 0.35]), 2.5
+    unknown = floor.unknown_around(0.0, NOBODY) > 0.5
+    occupied = floor.room() == 0.0
+    area = 0.0
+    for row, column in np.argwhere(unknown):
+        cell = floor.centre((int(row), int(column)))
+        away = math.dist(cell, here)
+        if away <= reach:
+            line = here + np.arange(0.0, 1.0, 0.01 / away)[:, None] * (cell - here)
+            at = floor.cells(line)
+            area += 0.01 * (not occupied[at[:, 0], at[:, 1]].any())
+    (found,) = floor.unknown_in_sight(here[None], NOBODY, 1.6, reach)
+    assert area > 2.0
+    assert found == pytest.approx(area, rel=0.1)
+
+
+def test_floor_that_others_know_is_not_unknown():
+    """Against counting the cells of a square one by one."""
+    floor, told = corridor(), np.array([[3.0, 1.0], [-4.0, 0.0]])
+    without, shares = floor.unknown_around(1.0, NOBODY), floor.unknown_around(1.0, told)
+    here = tuple(floor.cells(np.array([3.0, 0.0])))
+    square = [np.array([3.0 + dx, dy]) for dx in np.arange(-10, 11) * 0.1 for dy in np.arange(-10, 11) * 0.1]
+    point = floor.unknown_around(0.0, NOBODY)
+    unknown = [point[tuple(floor.cells(p + 0.05))] > 0.5 for p in square]
+    left = [u and math.dist(p + 0.05, told[0] + 0.05) > 1.0 for u, p in zip(unknown, square, strict=True)]
+    assert without[here] == pytest.approx(np.mean(unknown), abs=1e-6)
+    assert shares[here] == pytest.approx(np.mean(left), abs=0.03)
+    far = tuple(floor.cells(np.array([0.0, 5.0])))
+    assert shares[far] == without[far]

@@ -1,0 +1,138 @@
+"""Recognising places of the own map among others that are alike, in a world with known truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.agent.localization.place_recognition import (
+    PlaceRecognitionSettings,
+    lookalikes,
+    recognise_place,
+    recognise_places,
+)
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Landmarks, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import View
+from synthetic.world import CAMERA, World, room, take_map, take_view
+
+HEADINGS = np.arange(0, 2 * math.pi, math.pi / 4)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    """Two rooms."""
+    rng = np.random.default_rng(0)
+    return room(0, 0, 5, 4, 900, rng) + room(20, 0, 4, 5, 900, rng)
+
+
+@pytest.fixture(scope="module")
+def tour() -> list[Pose2]:
+    """A look around in the first room, then in the second."""
+    first = [Pose2(2.5, 2.0, h) for h in HEADINGS]
+    return first + [Pose2(22.0, 2.5, h) for h in HEADINGS]
+
+
+@pytest.fixture(scope="module")
+def own_map(world: World, tour: list[Pose2]) -> HybridMap:
+    """The map of that tour."""
+    nodes, _ = take_map(world, MapId("r0", 1), tour, np.random.default_rng(1))
+    return HybridMap([NodePut(node) for node in nodes])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_view_is_recognised_where_it_was_taken(world, tour, own_map, seed):
+    rng = np.random.default_rng(seed)
+    near = tour[int(rng.integers(len(tour)))]
+    true = near @ Pose2(*rng.uniform([-0.3, -0.3, -0.2], [0.3, 0.3, 0.2]))
+    view, _ = take_view(world, true, rng)
+    found = recognise_place(own_map, view, rng)
+    assert found is not None
+    node, recognition = found
+    place = tour[(node.id.number - 1) // 2]
+    answered = place @ recognition.node_from_robot.mean
+    assert answered.distance(true) < 0.10
+    assert abs((answered.inverse() @ true).heading) < math.radians(2)
+    assert recognition.node_from_robot.mahalanobis2(place.inverse() @ true) < 25
+    assert recognition.inliers >= PlaceRecognitionSettings().least_inliers
+
+
+def test_the_node_with_the_most_inliers_is_named(world, tour, own_map):
+    rng = np.random.default_rng(3)
+    view, _ = take_view(world, tour[3], rng)
+    found = recognise_place(own_map, view, rng, PlaceRecognitionSettings(tries=16, votes=1))
+    assert found is not None
+    assert found[0].id.number == 2 * 3 + 1
+
+
+def test_a_room_that_was_never_mapped_is_not_recognised(own_map):
+    for seed in range(8):
+        rng = np.random.default_rng(100 + seed)
+        elsewhere = room(0, 0, 5, 4, 900, rng)
+        view, _ = take_view(elsewhere, Pose2(2.5, 2.0, float(rng.uniform(-3, 3))), rng)
+        assert len(view) > 50
+        assert recognise_place(own_map, view, rng) is None
+
+
+def test_nothing_to_recognise(world, own_map):
+    rng = np.random.default_rng(0)
+    view, _ = take_view(world, Pose2(2.5, 2.0), rng)
+    empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), CAMERA)
+    assert recognise_place(HybridMap(), view, rng) is None
+    assert recognise_place(own_map, empty, rng) is None
+    (first, *_) = own_map.nodes.values()
+    bare = HybridMap([NodePut(replace(first, landmarks=Landmarks.empty()))])
+    assert recognise_place(bare, view, rng) is None
+    also_bare = HybridMap(
+        [*own_map.contents(), NodePut(replace(first, id=NodeId("r0", 1, 999), landmarks=Landmarks.empty()))]
+    )
+    assert recognise_place(also_bare, view, rng) is not None
+
+
+def test_the_limits_are_heeded(world, own_map):
+    rng = np.random.default_rng(0)
+    view, _ = take_view(world, Pose2(2.5, 2.0, 0.05), rng)
+    assert recognise_place(own_map, view, rng, PlaceRecognitionSettings(votes=10_000)) is None
+    assert recognise_place(own_map, view, rng, PlaceRecognitionSettings(tries=0)) is None
+    assert recognise_place(own_map, view, rng, PlaceRecognitionSettings(least_inliers=10_000)) is None
+
+
+def test_the_same_chance_gives_the_same_answer(world, own_map):
+    view, _ = take_view(world, Pose2(22.1, 2.4, 1.0), np.random.default_rng(0))
+    one, two = (recognise_place(own_map, view, np.random.default_rng(5)) for _ in range(2))
+    assert one is not None
+    assert two is not None
+    assert one[0].id == two[0].id
+    assert np.array_equal(one[1].pairs, two[1].pairs)
+    assert one[1].node_from_robot.mean == two[1].node_from_robot.mean
+
+
+def test_two_places_that_look_alike_are_told_and_neighbours_are_not(world, own_map):
+    """One node knows two landmarks of three, the other, a little aside or in another room, the third."""
+    view, _ = take_view(world, Pose2(2.5, 2.0), np.random.default_rng(0))
+    whole = next(iter(own_map.nodes.values()))
+    third = np.arange(len(whole.landmarks)) % 3 == 0
+    node, rest = replace(whole, landmarks=whole.landmarks.take(~third)), whole.landmarks.take(third)
+
+    def recalled(aside: float):
+        pose = replace(node.map_from_robot, mean=node.map_from_robot.mean @ Pose2(0.0, aside))
+        other = replace(node, id=node.id._replace(number=99), map_from_robot=pose, landmarks=rest)
+        found = recognise_places(HybridMap([NodePut(node), NodePut(other)]), view, np.random.default_rng(0))
+        assert [one.id.number for one, _ in found] == [node.id.number, 99]
+        return found
+
+    far, near = recalled(3.0), recalled(0.2)
+    share = far[1][1].inliers / far[0][1].inliers
+    assert 0.3 < share < 0.7
+    told = lookalikes(far, 0.9 * share, 0.5)
+    assert told is not None
+    assert [one.id.number for one in told] == [node.id.number, 99]
+    assert lookalikes(far, 1.1 * share, 0.5) is None, "it is not seen about as well"
+    assert lookalikes(near, 0.9 * share, 0.5) is None, "it is not elsewhere"
+    assert lookalikes(far[:1], 0.1, 0.5) is None
+    assert lookalikes([], 0.1, 0.5) is None

@@ -1,0 +1,55 @@
+"""Wheels against image: small slips are no dispute, two different stories are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.agent.mapping.odometry_consistency import OdometryConsistency, OdometryConsistencySettings
+from mapweave.agent.observation import Odometry
+from mapweave.hybridmap.pose import Pose2
+
+
+def drive(steps, wheels):
+    """The pose that truly comes of steps, and a dispute that heard what the wheels made of them."""
+    dispute, true = OdometryConsistency(OdometryConsistencySettings()), Pose2()
+    for step in steps:
+        dispute.step(wheels(step))
+        true = true @ step.motion()
+    return dispute, true
+
+
+steps = st.lists(st.builds(Odometry, st.floats(-0.03, 0.03), st.floats(-0.08, 0.08)), min_size=1, max_size=60)
+
+
+@given(steps, st.floats(-0.03, 0.03), st.floats(-0.03, 0.03))
+def test_wheels_that_are_a_little_wrong_are_believed(moves, longer, wider):
+    """3 % in the way and in the turns: far worse than any wheel of the simulator."""
+    dispute, true = drive(moves, lambda m: Odometry(m.forward * (1 + longer), m.turn * (1 + wider)))
+    assert not dispute.with_filter(true)
+
+
+@pytest.mark.parametrize(
+    ("wheels", "disputed"),
+    [
+        (lambda m: m, False),
+        (lambda m: Odometry(0.0, 0.0), True),  # dead encoders
+        (lambda m: Odometry(m.forward, 0.0), True),  # the room seems to turn, the wheels do not
+        (lambda m: Odometry(2.0 * m.forward, m.turn), True),  # wheels that spin
+    ],
+)
+def test_stories_that_cannot_both_be_true(wheels, disputed):
+    moves = [Odometry(0.02, 0.03)] * 40
+    dispute, true = drive(moves, wheels)
+    assert dispute.with_filter(true) == disputed
+    dispute.settle()
+    assert not dispute.with_filter(Pose2())
+
+
+def test_a_jump_of_the_encoders_is_disputed_at_once():
+    dispute, true = drive([Odometry(0.02, 0.0)] * 10, lambda m: m)
+    dispute.step(Odometry(0.3, 0.0))
+    assert dispute.with_filter(true @ Pose2(0.02))
+    assert np.isclose(true.x, 0.2)

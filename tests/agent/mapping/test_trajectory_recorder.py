@@ -1,0 +1,116 @@
+"""What is kept of the way between two nodes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder, TrajectoryRecorderSettings
+from mapweave.agent.observation import Observation, Odometry
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.trajectory_segment import MOST
+
+STILL = Odometry(0.0, 0.0)
+
+
+@pytest.fixture
+def clocked(description):
+    """A robot whose clock has a name, with two rangers that see others."""
+    return replace(
+        description, clock="net", ranger_bearings=(0.0, 1.0), ranger_reach=3.0, ranges_see_robots=True
+    )
+
+
+def seen(tick: int, proximity: tuple[float, ...] = (1.0, 3.0)) -> Observation:
+    return Observation(tick * 100_000_000, STILL, None, np.array(proximity))
+
+
+def test_a_moment_a_second_with_what_the_sensors_read(clocked):
+    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    wayside.clear(0)
+    for tick in range(1, 46):
+        wayside.step(seen(tick), Pose2(0.01 * tick, 0.0, 0.002 * tick))
+    wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
+    assert wake.ages == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    assert wake.node_from_robot == pytest.approx(np.outer([10, 20, 30, 40], [0.01, 0.0, 0.002]))
+    assert wake.distances == pytest.approx(np.tile([1.0 + clocked.radius, 3.0 + clocked.radius], (4, 1)))
+
+
+def test_a_reading_that_is_missing_says_nothing(clocked):
+    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    wayside.clear(0)
+    for tick, proximity in ((10, (2.0, 2.0)), (20, ()), (30, (2.0, 2.0))):
+        wayside.step(seen(tick, proximity), Pose2())
+    wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
+    # A ray that ends at the sensor tells of nothing behind.
+    assert wake.distances[1] == pytest.approx([0.0, 0.0]) and (wake.distances[[0, 2]] > 2.0).all()
+
+
+def test_a_robot_without_sensors_keeps_poses_and_one_without_a_clock_nothing(description):
+    for clock, count in (("net", 3), ("", 0)):
+        robot = replace(description, clock=clock)
+        wayside = TrajectoryRecorder(robot, TrajectoryRecorderSettings())
+        for tick in range(10, 40):
+            wayside.step(seen(tick), Pose2())
+        wake = wayside.wake(0, robot.ranges(np.zeros(0)))
+        assert (len(wake), wake.distances.shape) == (count, (count, 0))
+
+
+def test_a_long_wait_is_thinned_evenly(clocked):
+    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    for tick in range(1, 2500):
+        wayside.step(seen(tick), Pose2())
+    wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
+    assert MOST / 2 <= len(wake) <= MOST
+    gaps = np.diff(wake.ages)
+    assert gaps.max() <= 16.1 and gaps.min() == pytest.approx(gaps.max(), abs=0.2)
+
+
+def test_moments_before_a_view_that_became_no_node_belong_to_the_next(clocked):
+    wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
+    wayside.clear(0)
+    wayside.step(seen(10), Pose2(0.3, 0.1, 0.5))
+    moved = Pose2(1.0, -0.5, 2.0)
+    wayside.move_anchor(moved)
+    wayside.step(seen(20), Pose2(0.2, 0.0, 0.1))
+    wake = wayside.wake(1_500_000_000, clocked.ranges(np.array([1.0, 3.0])))
+    assert wake.ages == pytest.approx([-0.5, 0.5])
+    first = moved @ Pose2(*wake.node_from_robot[0])
+    assert (first.vector, tuple(wake.node_from_robot[1])) == (
+        pytest.approx([0.3, 0.1, 0.5]), pytest.approx((0.2, 0.0, 0.1))
+    )  # fmt: skip
+
+
+def test_a_mapped_drive_leaves_a_wake_where_the_robot_was(walls, clocked):
+    """Forward and back before photographs: one node, whose wake is the true way."""
+    mapper = Mapper(MapId("r0", 1), clocked)
+    way = [*np.arange(0.0, 0.6, 0.025), *np.arange(0.6, 0.2, -0.025)]
+    before = Pose2(way[0])
+    for tick, x in enumerate(way, 1):
+        observation = replace(walls.observe(before, Pose2(x), tick), proximity=np.array([x, 3.0]))
+        mapper.step(observation)
+        if not mapper.started:
+            mapper.begin(observation)
+        before = Pose2(x)
+    mapper.finish(observation)
+    (node,) = mapper.map.nodes.values()
+    ticks = np.rint((node.wake.ages * 1e9 + node.stamp_ns) / 1e8).astype(int)
+    assert len(ticks) == 3 and (np.diff(ticks) == 10).all()
+    true = np.array(way)[ticks - 1]
+    assert node.wake.node_from_robot[:, 0] == pytest.approx(true, abs=0.01)
+    assert node.wake.node_from_robot[:, 1:] == pytest.approx(0.0, abs=0.02)
+    assert node.wake.distances[:, 0] == pytest.approx(true + clocked.radius)
+    # The next node begins with none of it.
+    mapper.finish(replace(observation, stamp_ns=observation.stamp_ns + 1))
+    assert sum(len(one.wake) for one in mapper.map.nodes.values()) == 3
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, np.nan])
+def test_a_period_that_is_no_time_is_refused(period):
+    with pytest.raises(InvalidValue, match="wayside"):
+        TrajectoryRecorderSettings(period)

@@ -1,0 +1,227 @@
+"""Blocked, alone and on the way: what the navigator says, asks and does; the fleet's answers are scripted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.agent.drive_statistics import DriveStatistics
+from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
+from mapweave.agent.motion_primitives import NO_ANSWER
+from mapweave.agent.navigation.blocked_edges import BlockedEdges, BlockedEdgeSettings
+from mapweave.agent.navigation.navigator import NavigatorSettings, Stage
+from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg
+from synthetic.world import World
+from tests.agent.scripted_fleet import (
+    BODY,
+    EXACT,
+    FREE,
+    NOWHERE,
+    TOUR,
+    WALL_AHEAD,
+    A,
+    B,
+    C,
+    Eyes,
+    Trial,
+    bare,
+    found,
+    here,
+    navigator,
+    straight,
+)
+
+# Blocked
+
+
+def blocked_trial(home: World, forget: float = 15.0) -> tuple[Trial, list[tuple[float, WhichWay]]]:
+    """A robot before a wall through which the only way leads; the fleet knows no other."""
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    settings = NavigatorSettings(
+        blocks=BlockedEdgeSettings(forget=forget), follower=RouteFollowerSettings(blind=1e9)
+    )
+    nav = navigator(eyes, NOWHERE, B, settings)
+    routes: list[tuple[float, WhichWay]] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        routes.append((len(trial.commands) * BODY.tick, question))
+        if {A, B} in [set(pair) for pair in question.blocked]:
+            return Answer(question.number, RouteAnswer((), "every way is blocked"))
+        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+
+    trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
+    return trial, routes
+
+
+def test_a_blocked_robot_says_what_blocks_it_reports_it_and_waits(home):
+    trial, routes = blocked_trial(home)
+    trial.run(40.0, lambda: len(routes) >= 2)
+    assert routes[0][1].blocked == ()
+    assert routes[1][1].blocked == ((A, B),), "the server hears of it with the next question"
+    words = next(detail for stage, detail in trial.said if stage == Stage.BLOCKED)
+    assert "0.06 m off" in words and str(A) in words and str(B) in words
+    trial.run(1.0)
+    assert trial.navigator.stage == Stage.WAITING and "blocked" in trial.navigator.detail
+    assert trial.navigator.fix is not None, "it still knows where it is"
+    assert trial.navigator.tally.blocks == 1 and trial.navigator.tally.relocalizations == 1
+
+
+def test_a_block_is_forgotten_after_a_while_and_for_longer_each_time(home):
+    trial, routes = blocked_trial(home, forget=5.0)
+    trial.run(200.0, lambda: trial.navigator.tally.blocks == 3)
+    tries = [time for time, question in routes if not question.blocked]
+    assert len(tries) >= 3
+    begun = [time for time, question in routes if question.blocked and time > 0]
+    waits = [min(t for t in tries if t > b) - b for b in (begun[0], min(t for t in begun if t > tries[1]))]
+    assert waits[0] == pytest.approx(5.0, abs=3.0)
+    assert waits[1] == pytest.approx(10.0, abs=3.0)
+
+
+def test_it_goes_around_by_another_way(home):
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(follower=RouteFollowerSettings(blind=1e9)))
+    answered: list[tuple[NodeId, ...]] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        legs = straight(bare(A), bare(C), bare(B)) if question.blocked else straight(bare(A), bare(B))
+        answered.append(tuple(leg.node.id for leg in legs))
+        return Answer(question.number, RouteAnswer(legs, "a way"))
+
+    trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
+    trial.run(40.0, lambda: len(answered) == 2)
+    assert answered == [(A, B), (A, C, B)]
+    trial.proximity, trial.held = FREE, False
+    trial.run(20.0, lambda: nav.tally.edges > 0)
+    assert nav.tally.edges == 1 and nav.tally.skipped == 0, "it drove to the node in between"
+
+
+def test_parking_that_comes_to_no_end_is_tried_anew_before_it_is_a_block(home):
+    """Almost at the goal, held there by nothing that anybody else could meet."""
+    eyes = Eyes(home, Pose2(2.5, 2.0))
+    follower = RouteFollowerSettings(blind=1e9, parking_patience=3.0)
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(follower=follower))
+    routes: list[WhichWay] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhereAmI):
+            return found(question, here(A, Pose2()))
+        routes.append(question)
+        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
+
+    trial = Trial(nav, eyes, fleet, held=True)
+    trial.run(20.0, lambda: len(routes) == 3)
+    assert [question.blocked for question in routes] == [(), (), ((A, B),)], "nobody is told at first"
+    assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself anew"
+
+
+def test_blocks_are_kept_for_a_time_that_doubles():
+    blocks = BlockedEdges(BlockedEdgeSettings(forget=10.0, longest=25.0))
+    blocks.add(B, A, 0.0)
+    assert blocks.at(9.9) == ((A, B),) and blocks.at(10.0) == ()
+    blocks.add(A, B, 20.0)
+    assert blocks.at(39.9) == ((A, B),) and blocks.at(40.0) == ()
+    blocks.add(A, B, 50.0)
+    blocks.add(B, C, 50.0)
+    assert set(blocks.at(59.0)) == {(A, B), (B, C)}
+    assert blocks.at(74.9) == ((A, B),) and blocks.at(75.0) == ()
+
+
+# Alone
+
+
+def test_without_a_server_its_own_map_leads_the_way(home, own_map):
+    goal = max(own_map.nodes)
+    eyes = Eyes(home, TOUR[0])
+    silent = Trial(
+        navigator(eyes, own_map, goal), eyes, lambda question: Answer(question.number, None, NO_ANSWER)
+    )
+    silent.run(10.0, lambda: silent.navigator.legs > 0)
+    assert silent.navigator.legs == 3
+    route = onboard_route(own_map, min(own_map.nodes), goal)
+    pose = Pose2()
+    for leg in route.legs:
+        pose = pose @ leg.previous_from_node.mean
+    assert pose.distance(TOUR[0].inverse() @ TOUR[2]) < 0.05
+    nodes = sorted(own_map.nodes)
+    assert "blocked" in onboard_route(own_map, nodes[0], goal, [(nodes[2], nodes[1])]).reason
+    assert "not in the map" in onboard_route(own_map, nodes[0], C).reason
+
+
+def test_a_goal_that_shows_nothing_is_reached_by_its_neighbours_and_said_to_be(home):
+    """The goal has no landmarks: the robot stands there by what it knows of A, looks again, has arrived."""
+    eyes = Eyes(home, Pose2(2.0, 2.0))
+    start = eyes.pose
+    nav = navigator(eyes, NOWHERE, B)
+    goal = bare(B)
+    looks: list[float] = []
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay):
+            leg = RouteLeg(goal, PoseGaussian(Pose2(0.6) if question.start == A else Pose2(), EXACT), None)
+            return Answer(question.number, RouteAnswer((leg,), "a way"))
+        looks.append((start.inverse() @ eyes.pose).x)
+        return found(question, here(A, start.inverse() @ eyes.pose))
+
+    trial = Trial(nav, eyes, fleet)
+    trial.run(60.0, lambda: nav.arrived)
+    assert nav.arrived and "its own landmarks" in nav.detail
+    assert (start @ Pose2(0.6)).distance(eyes.pose) < 0.03
+    assert len(looks) == 2 and looks[1] == pytest.approx(0.6, abs=0.03), "it has looked again at the goal"
+
+
+def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_pose_is_not(home):
+    """Another look from the same spot makes a scale no surer; on the way to the photograph it shows."""
+    vague = PoseGaussian(Pose2(-0.6), np.diag([0.18**2, 0.18**2, 0.01**2]))
+    fixed = []
+    for known in (False, True):
+        eyes = Eyes(home, Pose2(2.0, 2.0))
+        nav = navigator(eyes, NOWHERE, B)
+        certainty = Certainty.FOUND if known else Certainty.PLACE
+        place = replace(here(A, Pose2()), node_from_robot=vague, distance_known=known)
+
+        def fleet(question: Question, certainty=certainty, place=place) -> Answer:
+            if isinstance(question, WhichWay):
+                return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+            return Answer(question.number, RelocalizeAnswer(certainty, (place,), "it looks like a"))
+
+        Trial(nav, eyes, fleet).run(3.0, lambda nav=nav: nav.fix is not None)
+        fixed.append(nav.fix is not None)
+    assert fixed == [True, False]
+
+
+def test_where_it_sees_nothing_it_knows_it_drives_on_a_little_before_it_counts_as_lost(home):
+    """A long way without a view: by wheels as far as `blind`, twice `further`, and only then it is lost."""
+    eyes = Eyes(home, Pose2(0.5, 2.0))
+    settings = NavigatorSettings(follower=RouteFollowerSettings(blind=1.0), further=0.5, looks=2)
+    nav = navigator(eyes, NOWHERE, B, settings)
+    looks: list[float] = []
+    ahead = RouteLeg(bare(B), PoseGaussian(Pose2(9.0), EXACT), None)
+
+    def fleet(question: Question) -> Answer:
+        if isinstance(question, WhichWay):
+            here_first = PoseGaussian(Pose2(), EXACT) if question.start == B else ahead.previous_from_node
+            legs = (replace(ahead, previous_from_node=here_first),)
+            return Answer(question.number, RouteAnswer(legs, "a way"))
+        looks.append(eyes.pose.x - 0.5)
+        return found(question, here(A, Pose2())) if len(looks) == 1 else found(question)
+
+    trial = Trial(nav, eyes, fleet)
+    trial.run(60.0, lambda: nav.stage == Stage.LOST and len(looks) > 3)
+    assert looks[1:4] == pytest.approx([1.0, 1.5, 2.0], abs=0.1)
+    assert nav.stage == Stage.LOST and nav.fix is None
+    assert nav.tally.relocalizations == 1
+
+
+def test_a_tally_counts_nodes_that_were_left_before_they_were_reached():
+    tally = DriveStatistics().passed([0.2]).passed([]).passed([0.9, 0.3]).passed([1.2])
+    assert tally == DriveStatistics(edges=3, skipped=2)

@@ -1,0 +1,178 @@
+"""The end of a route: the robot is at the goal only if a fresh look says so."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.node_detector import Expected, NodeDetector, NodeDetectorSettings
+from mapweave.agent.navigation.local_planner import LocalPlanner
+from mapweave.agent.navigation.progress_monitor import ProgressMonitor
+from mapweave.agent.navigation.route_follower import MOST_LOOKED_FOR, RouteFollower, RouteProgress
+from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.servo.servo_step import ServoStep
+from mapweave.agent.servo.supervisor import Servo
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import RouteLeg
+from mapweave.registration.recognition import recognise
+from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
+from tests.hand_held import photograph
+
+HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
+
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
+ROBOT = RobotDescription(camera=CAMERA)
+
+
+class Deluded:
+    """A localizer whose tracks have slid: it is sure to stand at the goal, wherever it stands."""
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self.pose = PoseGaussian.from_sigmas(Pose2(), 0.002, 0.001)
+        self.visible = np.arange(len(node.landmarks))
+        self.in_sight = True
+
+    def step(self, observation: Observation) -> None:
+        """It learns nothing."""
+
+
+def follower_at_the_goal(node: Node) -> RouteFollower:
+    lens = Lens(ROBOT.camera, ROBOT.distortion)
+    fix = Fix(node.id, HERE, Deluded(node))  # type: ignore[arg-type]
+    route = (RouteLeg(node, HERE, None),)
+    rng = np.random.default_rng(0)
+    return RouteFollower(
+        ROBOT, lens, Sift(lens), route, fix, LocalPlanner(ROBOT), RouteFollowerSettings(), rng
+    )
+
+
+@pytest.mark.parametrize(
+    "begin", [Pose2(-0.03, 0.0, 0.0), Pose2(-0.01, 0.02, -0.015), Pose2(0.02, -0.02, 0.02)]
+)
+def test_slid_tracks_do_not_park_the_robot_beside_the_goal(walls, node, begin):
+    """The robot believes to be parked, 2 to 3 cm off. It looks afresh, and drives the rest."""
+    follower, pose = follower_at_the_goal(node), begin
+    odometry = Odometry(0.0, 0.0)
+    for tick in range(400):
+        command = follower.step(Observation(tick * 100_000_000, odometry, walls.render(pose)))
+        if follower.progress is RouteProgress.ARRIVED:
+            break
+        odometry = Odometry(command.forward * ROBOT.tick, command.turn * ROBOT.tick)
+        pose = pose @ odometry.motion()
+    assert follower.progress is RouteProgress.ARRIVED
+    assert pose.distance(Pose2()) < 0.01
+    assert abs(pose.heading) < np.radians(1.0)
+
+
+@pytest.mark.parametrize(("scale", "pitch", "roll"), [(1.25, 0.02, -0.015), (0.8, -0.02, 0.01)])
+def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch, roll):
+    """Tilted, and of a scale that is off by a quarter: the robot has only the photograph to go by."""
+    held = photograph(node, scale, pitch, roll)
+    pose, lens = Pose2(-0.7, 0.12, -0.1), Lens(ROBOT.camera, ROBOT.distortion)
+    lookout = NodeDetector(ROBOT, lens, Sift(lens), NodeDetectorSettings(), np.random.default_rng(0))
+    believed = Pose2(scale * pose.x, scale * pose.y, pose.heading)
+    found = lookout.find(walls.render(pose), [Expected(0, held, believed)])
+    assert found is not None
+    rng, route = np.random.default_rng(0), (RouteLeg(held, HERE, None),)
+    follower = RouteFollower(
+        ROBOT, lens, Sift(lens), route, Fix.of(found[1]), LocalPlanner(ROBOT), RouteFollowerSettings(), rng
+    )
+    odometry = Odometry(0.0, 0.0)
+    for tick in range(400):
+        command = follower.step(Observation(tick * 100_000_000, odometry, walls.render(pose)))
+        if follower.progress is RouteProgress.ARRIVED:
+            break
+        odometry = Odometry(command.forward * ROBOT.tick, command.turn * ROBOT.tick)
+        pose = pose @ odometry.motion()
+    assert follower.progress is RouteProgress.ARRIVED
+    assert pose.distance(Pose2()) < 0.02
+    assert abs(pose.heading) < np.radians(1.0)
+
+
+def test_who_sees_nothing_of_the_goal_is_not_there(walls, node):
+    follower = follower_at_the_goal(node)
+    dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
+    seen = []
+    for tick in range(40):
+        follower.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), dark))
+        seen.append(follower.progress)
+        if follower.progress is RouteProgress.UNSURE:
+            break
+    assert RouteProgress.ARRIVED not in seen
+    assert seen[-1] is RouteProgress.UNSURE
+
+
+def test_a_fresh_look_takes_over_only_for_many_more_landmarks(walls, node):
+    """Tracks have been filtered for a while; a look that knows hardly more has not."""
+    lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
+    image = walls.render(pose)
+    lookout = NodeDetector(ROBOT, lens, Sift(lens), NodeDetectorSettings(), np.random.default_rng(0))
+    view = Sift(lens).extract(image).view(CAMERA)
+    found = recognise(node, view, None, np.random.default_rng(0))
+    assert found is not None
+    assert found.inliers > 20
+    assert lookout.find(image, [Expected(0, node, pose, tracked=found.inliers - 2)]) is None
+    taken = lookout.find(image, [Expected(0, node, pose, tracked=found.inliers // 2)])
+    assert taken is not None
+    assert taken[1].pose.mean.distance(pose) < 0.05
+
+
+def test_nodes_are_found_where_they_are_expected_only(walls, node):
+    lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
+    lookout = NodeDetector(ROBOT, lens, Sift(lens), NodeDetectorSettings(), np.random.default_rng(0))
+    image, elsewhere = walls.render(pose), pose @ Pose2(-0.5)
+    assert lookout.find(image, [Expected(3, node, elsewhere)]) is None
+    found = lookout.find(image, [Expected(7, node, elsewhere), Expected(3, node, elsewhere, doubt=2.0)])
+    assert found is not None
+    assert found[0] == 3
+
+
+def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypatch):
+    """It once stood before an obstacle for as long as anybody had patience, and the drive around had none."""
+    standing = ServoStep(Command(), "driving", None, "standing still to think the way over", 9)
+
+    monkeypatch.setattr(Servo, "command", lambda *_: standing)
+    follower = follower_at_the_goal(node)
+    follower.fix.localizer.pose = PoseGaussian.from_sigmas(Pose2(-1.0, 0.0, 0.0), 0.002, 0.001)
+    dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
+    commands = [follower.step(Observation(k * 10**8, Odometry(0.0, 0.0), dark)) for k in range(140)]
+    moved = [command.forward > 0.0 for command in commands]
+    stood = round(RouteFollowerSettings().stalled_parking / ROBOT.tick)
+    assert not any(moved[: stood - 1])
+    assert all(moved[stood + 2 : stood + 30])
+    assert follower.progress is RouteProgress.DRIVING
+
+
+@given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=60))
+def test_headway_counts_since_the_robot_came_nearer(distances):
+    headway, best, since = ProgressMonitor(), np.inf, 0
+    for distance in distances:
+        headway.take(distance, 0.1)
+        since += 1
+        if distance < best - headway.step:
+            best, since = distance, 0
+        assert headway.stood == pytest.approx(0.1 * since)
+        assert headway.best == best
+
+
+def test_a_route_with_a_thousand_nodes_in_one_place_costs_a_few_looks(node, monkeypatch):
+    tried = []
+    monkeypatch.setattr(NodeDetector, "find", lambda self, image, wanted: tried.append(len(wanted)))
+    lens = Lens(ROBOT.camera, ROBOT.distortion)
+    ahead = PoseGaussian(Pose2(0.5), np.zeros((3, 3)))
+    route = (RouteLeg(node, HERE, None), *[RouteLeg(node, ahead, None)], *[RouteLeg(node, HERE, None)] * 1000)
+    follower = RouteFollower(
+        ROBOT, lens, Sift(lens), route, Fix(node.id, HERE), LocalPlanner(ROBOT), RouteFollowerSettings(),
+        np.random.default_rng(0),
+    )  # fmt: skip
+    for tick in range(8):
+        follower.step(Observation(tick, Odometry(0.0, 0.0), np.zeros((240, 320), np.uint8)))
+    assert tried
+    assert max(tried) <= MOST_LOOKED_FOR + 1

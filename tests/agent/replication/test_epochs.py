@@ -1,0 +1,92 @@
+"""A new map gets the next number, also after a robot has lost its disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.agent.replication.epochs import FOUR_DIGITS, LARGEST, newest_on_server, next_epoch
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.node import MapId
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.store import Store
+from mapweave.wire.bus import Request
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import NewestMap
+from mapweave.wire.memory import MemoryBus, MemoryHub
+
+KEYS = Keys("test")
+
+
+@given(st.sets(st.integers(1, LARGEST)), st.one_of(st.none(), st.integers(0, LARGEST)))
+def test_the_number_is_new_and_short(taken: set[int], stored: int | None) -> None:
+    epoch = next_epoch(taken, stored)
+    assert epoch not in taken
+    assert stored is None or epoch > stored
+    known = taken | {stored or 0}
+    assert epoch == max(known) + 1 or (not taken and stored is None and epoch in FOUR_DIGITS)
+
+
+def test_two_robots_without_disk_and_server_draw_different_numbers() -> None:
+    drawn = [next_epoch([], None) for _ in range(50)]
+    assert len(set(drawn)) > 40
+
+
+@given(st.integers(0, 2**53))
+def test_the_answer_survives(epoch: int) -> None:
+    assert NewestMap.decode(NewestMap(epoch).encode()) == NewestMap(epoch)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x80", NewestMap(-1).encode(), NewestMap(2**60).encode()])
+def test_a_broken_answer_is_refused(payload: bytes) -> None:
+    with pytest.raises(InvalidMessage):
+        NewestMap.decode(payload)
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    return MemoryHub()
+
+
+@pytest.fixture
+def bus(hub: MemoryHub) -> Iterator[MemoryBus]:
+    made = MemoryBus(hub)
+    yield made
+    made.close()
+
+
+def test_a_server_tells_the_newest_map_that_is_on_its_disk(
+    hub: MemoryHub, bus: MemoryBus, tmp_path: Path
+) -> None:
+    with ExitStack() as stack:
+        store = Store(tmp_path / "s0.sqlite")
+        stack.callback(store.close)
+        for map_id in (MapId("r0", 3), MapId("r0", 12), MapId("r1", 40), MapId("r0", 7)):
+            store.apply(map_id, 5, [], 0)
+        there = MemoryBus(hub)
+        stack.callback(there.close)
+        ingest = Ingest(there, KEYS, store, "s0", lambda change: None)
+        stack.callback(ingest.close)
+        assert newest_on_server(bus, KEYS, "s0", "r0", 0.0) == 12
+        assert newest_on_server(bus, KEYS, "s0", "r1", 0.0) == 40
+        assert newest_on_server(bus, KEYS, "s0", "r9", 0.0) == 0
+        assert newest_on_server(bus, KEYS, "s1", "r0", 0.0) is None
+
+
+def test_who_answers_nonsense_is_not_believed(hub: MemoryHub, bus: MemoryBus) -> None:
+    said = [b"\x00", NewestMap(LARGEST + 1).encode()]
+    liar = MemoryBus(hub)
+
+    def answer(request: Request) -> None:
+        request.reply(said[0])
+
+    liar.serve(KEYS.all_acks("s0"), answer)
+    while said:
+        assert newest_on_server(bus, KEYS, "s0", "r0", 0.0) is None
+        said.pop(0)
+    liar.close()

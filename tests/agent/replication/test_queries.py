@@ -1,0 +1,53 @@
+"""Answers that no robot can act on are refused with a reason."""
+
+from __future__ import annotations
+
+import pytest
+
+from mapweave.agent.mission import WhereAmI, WhichWay
+from mapweave.agent.replication.queries import FARTHEST, decode_answer
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, View, Whereabouts
+from mapweave.wire.messages import encode_relocalize_answer, encode_route_answer
+from tests.agent.scripted_fleet import EXACT, A, B, C, bare, here, straight
+
+
+def route_of(*poses: Pose2) -> RouteAnswer:
+    first, *others = (bare(node) for node in (A, B, C)[: 1 + len(poses)])
+    hops = (RouteLeg(node, PoseGaussian(pose, EXACT), None) for node, pose in zip(others, poses, strict=True))
+    return RouteAnswer((*straight(first), *hops), "a way")
+
+
+def where(view: View, *places: Whereabouts) -> RelocalizeAnswer:
+    payload = encode_relocalize_answer(RelocalizeAnswer(Certainty.FOUND, places, "here"))
+    answer = decode_answer(WhereAmI(1, view), payload)
+    assert isinstance(answer, RelocalizeAnswer)
+    return answer
+
+
+@pytest.mark.parametrize("far", [Pose2(1e6), Pose2(0.0, -FARTHEST - 1.0)])
+def test_a_leg_of_a_million_metres_is_refused(far: Pose2) -> None:
+    question = WhichWay(1, A, C)
+    decode_answer(question, encode_route_answer(route_of(Pose2(1.0), Pose2(FARTHEST - 1.0))))
+    with pytest.raises(InvalidMessage, match=rf"route: the leg to node {C} is \d+ m away, more than 100 m"):
+        decode_answer(question, encode_route_answer(route_of(Pose2(1.0), far)))
+
+
+def test_a_route_to_another_node_is_refused() -> None:
+    with pytest.raises(InvalidMessage, match=f"route: it ends at node {B}, not at {C}"):
+        decode_answer(WhichWay(1, A, C), encode_route_answer(route_of(Pose2(1.0))))
+
+
+def test_no_way_is_an_answer() -> None:
+    answer = decode_answer(WhichWay(1, A, C), encode_route_answer(RouteAnswer((), "all blocked")))
+    assert isinstance(answer, RouteAnswer)
+    assert answer.reason == "all blocked"
+
+
+def test_a_place_a_million_metres_from_its_node_is_refused_and_costs_no_better_one() -> None:
+    view = View(bare(A).camera, bare(A).landmarks.pixels, bare(A).landmarks.codes)
+    near, far = here(A, Pose2(1.0)), here(B, Pose2(1e6))
+    assert where(view, near, far).candidates[0].node == A
+    with pytest.raises(InvalidMessage, match=f"seen from node {B}, is 1000000 m away"):
+        where(view, far, near)

@@ -1,0 +1,353 @@
+"""The replicator against servers that are played by hand."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mapweave.agent.replication.journal import Draft, Journal
+from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
+from mapweave.hybridmap.change import ChangeBody, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.wire.bus import Sample
+from mapweave.wire.codec import decode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, Refusal
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.waiting import eventually
+
+KEYS = Keys("fleet")
+MAP = MapId("r0", 1)
+QUICK = ReplicationSettings(beacon_interval=0.03, answer_bytes=2000, retry_interval=0.05)
+
+
+def bodies(first: int, last: int) -> list[ChangeBody]:
+    return [NodeRetired(NodeId(*MAP, number)) for number in range(first, last + 1)]
+
+
+class HandServer:
+    """Listens, and acknowledges what the test says."""
+
+    def __init__(self, hub: MemoryHub, name: str = "s0") -> None:
+        self.bus, self.name = MemoryBus(hub), name
+        self.changes: list[Sample] = []
+        self.heads: list[Head] = []
+        self.bus.subscribe(KEYS.changes(), self.changes.append)
+        self.bus.subscribe(KEYS.heads(), lambda sample: self.heads.append(Head.decode(sample.payload)))
+
+    def acknowledge(self, log_id: int, watermark: int, *refusals: Refusal, store: int = 0) -> None:
+        ack = Ack(MAP, log_id, watermark, refusals, store)
+        self.bus.publish(KEYS.ack(self.name, "r0"), ack.encode())
+
+    def ask(self, first: int, last: int) -> LogAnswer:
+        (reply,) = self.bus.ask(KEYS.log(MAP), LogRequest(first, last).encode(), 5)
+        if reply.error:
+            raise InvalidMessage(reply.error)
+        return LogAnswer.decode(reply.payload)
+
+
+class Agent:
+    def __init__(self, hub: MemoryHub, path: Path, servers: tuple[str, ...] = ("s0",)) -> None:
+        self.bus = MemoryBus(hub)
+        self.journal = Journal(path, "r0")
+        self.map = self.journal.open_map(1)
+        self.replicator = Replicator(self.bus, KEYS, self.journal, self.map, servers, QUICK)
+        self.log_id = self.journal.log_id(self.map)
+
+    def close(self) -> None:
+        self.replicator.close()
+        self.bus.close()
+        self.journal.close()
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    return MemoryHub()
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "r0.sqlite"
+
+
+@pytest.fixture
+def agent(hub: MemoryHub, path: Path) -> Iterator[Agent]:
+    agent = Agent(hub, path)
+    yield agent
+    agent.close()
+
+
+@pytest.fixture
+def server(hub: MemoryHub) -> Iterator[HandServer]:
+    server = HandServer(hub)
+    yield server
+    server.bus.close()
+
+
+def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: HandServer) -> None:
+    agent.replicator.submit(bodies(1, 3), 10)
+    agent.replicator.submit(bodies(4, 4), 20)
+    eventually(lambda: len(server.changes) == 4)
+    marks = [Mark.decode(sample.attachment) for sample in server.changes]
+    assert marks == [Mark(k, agent.log_id) for k in (1, 2, 3, 4)]
+    changes = [decode_change(sample.payload) for sample in server.changes]
+    assert [(c.map, c.sequence, c.stamp_ns) for c in changes] == [
+        (MAP, 1, 10), (MAP, 2, 10), (MAP, 3, 10), (MAP, 4, 20),
+    ]  # fmt: skip
+    assert {sample.key for sample in server.changes} == {KEYS.change(MAP)}
+    assert agent.replicator.status().bytes_sent == sum(len(s.payload) for s in server.changes)
+
+
+def test_the_disk_comes_first(hub: MemoryHub, path: Path) -> None:
+    """Whoever hears of a change finds it in the journal."""
+    agent = Agent(hub, path)
+    on_disk: list[bool] = []
+    server = MemoryBus(hub)
+    server.subscribe(KEYS.changes(), lambda s: on_disk.append(agent.journal.head(MAP) >= len(on_disk) + 1))
+    for k in range(1, 30):
+        agent.replicator.submit(bodies(k, k), 0)
+    eventually(lambda: len(on_disk) == 29)
+    assert all(on_disk)
+    agent.close()
+    server.close()
+
+
+def test_submitting_never_waits_for_the_disk(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+    release = threading.Event()
+    write = agent.journal.write
+
+    def slow(map_id: MapId, drafts: list[Draft]) -> int:
+        release.wait(60)
+        return write(map_id, drafts)
+
+    monkeypatch.setattr(agent.journal, "write", slow)
+    begin = time.monotonic()
+    for k in range(1, 51):
+        agent.replicator.submit(bodies(k, k), 0)
+    assert time.monotonic() - begin < 20
+    assert not agent.replicator.flush(0.05)
+    assert agent.replicator.status().waiting == 50
+    release.set()
+    assert agent.replicator.flush(30)
+    assert agent.replicator.status().waiting == 0
+    assert agent.journal.head(MAP) == 50
+
+
+def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent) -> None:
+    for bad in (NodeRetired(NodeId("r0", 1, -1)), NodeRetired(NodeId("r1", 1, 1))):
+        with pytest.raises(InvalidValue):
+            agent.replicator.submit([*bodies(1, 2), bad], 0)
+    assert agent.replicator.flush(30)
+    assert agent.journal.head(MAP) == 0
+
+
+def test_a_full_disk_is_said_once_and_tried_again(
+    agent: Agent, server: HandServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tries: list[int] = []
+
+    def full(*_: object) -> None:
+        tries.append(1)
+        raise InvalidFile("r0.sqlite: agent journal cannot be used (database or disk is full)")
+
+    with monkeypatch.context() as patched, caplog.at_level(logging.ERROR):
+        patched.setattr(agent.journal, "write", full)
+        agent.replicator.submit(bodies(1, 2), 0)
+        eventually(lambda: len(tries) >= 3)
+        agent.replicator.submit(bodies(3, 3), 0)
+        assert "disk is full" in agent.replicator.status().failure
+    assert len(caplog.records) == 1
+    assert not server.changes
+    assert agent.replicator.flush(30)
+    assert agent.replicator.status().failure == ""
+    eventually(lambda: [Mark.decode(s.attachment).sequence for s in server.changes] == [1, 2, 3])
+
+
+def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path) -> None:
+    agent = Agent(hub, path)
+    agent.replicator.submit(bodies(1, 100), 0)
+    agent.close()
+    journal = Journal(path, "r0")
+    assert journal.head(MAP) == 100
+    journal.close()
+
+
+def test_the_beacon_says_how_long_the_log_is_and_what_is_known(agent: Agent, server: HandServer) -> None:
+    eventually(lambda: server.heads)
+    assert server.heads[0] == Head(agent.log_id, 0, {})
+    agent.replicator.submit(bodies(1, 3), 0)
+    eventually(lambda: server.heads[-1].newest == 3)
+    server.acknowledge(agent.log_id, 2)
+    eventually(lambda: server.heads[-1] == Head(agent.log_id, 3, {"s0": 2}))
+    count = len(server.heads)
+    eventually(lambda: len(server.heads) >= count + 3)
+
+
+def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer) -> None:
+    agent = Agent(hub, path, ("s0", "s1"))
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    assert not agent.replicator.wait_acknowledged(0.05)
+    assert agent.replicator.status().since_ack == float("inf")
+    server.acknowledge(agent.log_id, 3)
+    other = HandServer(hub, "s1")
+    other.acknowledge(agent.log_id, 2)
+    eventually(lambda: agent.journal.acknowledged(MAP) == {"s0": 3, "s1": 2})
+    assert not agent.replicator.wait_acknowledged(0.05)
+    assert agent.replicator.status().unacknowledged == 1
+    other.acknowledge(agent.log_id, 3)
+    assert agent.replicator.wait_acknowledged(30)
+    assert agent.replicator.status().unacknowledged == 0
+    assert agent.replicator.status().since_ack < 5
+    agent.close()
+    other.bus.close()
+
+
+def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer) -> None:
+    agent = Agent(hub, path, ())
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    assert not agent.replicator.wait_acknowledged(0.05)
+    server.acknowledge(agent.log_id, 3)
+    assert agent.replicator.wait_acknowledged(30)
+    agent.close()
+
+
+def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: HandServer) -> None:
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    server.acknowledge(agent.log_id, 2)
+    server.acknowledge(agent.log_id, 1)
+    server.acknowledge(agent.log_id + 1, 3)
+    server.bus.publish(KEYS.ack("s0", "r0"), Ack(MapId("r0", 9), agent.log_id, 3).encode())
+    server.bus.publish(KEYS.ack("s0", "r0"), b"garbage")
+    server.bus.publish(KEYS.ack("s9", "r0"), Ack(MAP, agent.log_id, 1).encode())
+    eventually(lambda: agent.journal.acknowledged(MAP) == {"s0": 2, "s9": 1})
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_server_that_has_lost_its_store_lacks_everything_again(
+    hub: MemoryHub, path: Path, server: HandServer, again: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    agent = Agent(hub, path)
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    server.acknowledge(agent.log_id, 3, store=5)
+    server.acknowledge(agent.log_id, 1, store=5)
+    assert agent.replicator.wait_acknowledged(30)
+    if again:
+        agent.close()
+        agent = Agent(hub, path)
+    assert agent.replicator.status().unacknowledged == 0
+    server.acknowledge(agent.log_id, 1, store=6)
+    eventually(lambda: agent.replicator.status().unacknowledged == 2)
+    assert agent.journal.acknowledged(MAP) == {"s0": 1}
+    assert "s0 has lost what it had of r0.1 after 1" in caplog.text
+    server.acknowledge(agent.log_id, 3, store=6)
+    assert agent.replicator.wait_acknowledged(30)
+    agent.close()
+
+
+def test_a_server_that_has_more_than_the_disk(
+    agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    with caplog.at_level(logging.WARNING):
+        server.acknowledge(agent.log_id, 9)
+        eventually(lambda: "begin a fresh map" in agent.replicator.status().failure)
+    assert agent.journal.acknowledged(MAP) == {}
+    assert agent.replicator.status().unacknowledged == 3
+
+
+def test_refusals_are_said_once(agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture) -> None:
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            server.acknowledge(agent.log_id, 3, Refusal(2, "landmark 9 is not there"))
+        eventually(lambda: agent.replicator.status().unacknowledged == 0)
+        server.acknowledge(agent.log_id, 3, Refusal(0, "another log"))
+        eventually(lambda: agent.replicator.status().failure == "s0: another log")
+    assert agent.replicator.refusals() == {("s0", 2): "landmark 9 is not there", ("s0", 0): "another log"}
+    assert [record.message for record in caplog.records] == [
+        "s0 refuses r0.1 2: landmark 9 is not there",
+        "s0 refuses r0.1 0: another log",
+    ]
+
+
+def test_the_log_answers_for_ranges(agent: Agent, server: HandServer) -> None:
+    agent.replicator.submit(bodies(1, 30), 0)
+    assert agent.replicator.flush(30)
+    answer = server.ask(4, 6)
+    assert (answer.log_id, answer.first, answer.covered) == (agent.log_id, 4, 6)
+    assert [(s, decode_change(data).sequence) for s, data in answer.changes] == [(4, 4), (5, 5), (6, 6)]
+    assert server.ask(29, 99).covered == 30
+    assert server.ask(31, 40) == LogAnswer(agent.log_id, 31, 30, ())
+    with pytest.raises(InvalidMessage, match="log request"):
+        server.ask(5, 4)
+
+
+def test_the_log_answers_in_pieces(agent: Agent, server: HandServer) -> None:
+    """Not more than 256 changes, and not more than the settings' bytes."""
+    agent.replicator.submit(bodies(1, 600), 0)
+    assert agent.replicator.flush(30)
+    collected: list[int] = []
+    while len(collected) < 600:
+        answer = server.ask(len(collected) + 1, 600)
+        assert 1 <= len(answer.changes) <= 256
+        assert sum(len(data) for _, data in answer.changes) <= 2000
+        assert answer.covered == answer.changes[-1][0]
+        collected += [sequence for sequence, _ in answer.changes]
+    assert collected == list(range(1, 601))
+
+
+def test_a_map_that_was_left_is_still_handed_over(hub: MemoryHub, path: Path, server: HandServer) -> None:
+    agent = Agent(hub, path)
+    agent.replicator.submit(bodies(1, 3), 0)
+    agent.close()
+    old_id = agent.log_id
+    bus, journal = MemoryBus(hub), Journal(path, "r0")
+    fresh = journal.open_map(None)
+    server.heads.clear()
+    replicator = Replicator(bus, KEYS, journal, fresh, ("s0",), QUICK)
+    eventually(lambda: Head(old_id, 3) in server.heads[-3:])
+    assert replicator.status().unacknowledged == 3
+    assert [sequence for sequence, _ in server.ask(1, 9).changes] == [1, 2, 3]
+    server.acknowledge(old_id, 3)
+    assert replicator.wait_acknowledged(30)
+    server.heads.clear()
+    eventually(lambda: len(server.heads) > 12)
+    assert sum(head.log_id == old_id for head in server.heads) <= 2, "it is complete: rarely a beacon"
+    replicator.close()
+    bus.close()
+    journal.close()
+
+
+def test_no_log_answers_for_a_map_that_is_not_there(agent: Agent, server: HandServer) -> None:
+    (reply,) = server.bus.ask(KEYS.log(MapId("r0", 9)), LogRequest(1, 2).encode(), 5)
+    assert reply.error.endswith("agent/r0/log/9: no such log")
+
+
+def test_a_restarted_agent_goes_on_and_prunes_what_all_have(
+    hub: MemoryHub, path: Path, server: HandServer
+) -> None:
+    agent = Agent(hub, path)
+    agent.replicator.submit([*bodies(1, 1), *bodies(1, 1), *bodies(2, 2)], 0)
+    eventually(lambda: len(server.changes) == 3)
+    server.acknowledge(agent.log_id, 3)
+    assert agent.replicator.wait_acknowledged(30)
+    agent.close()
+    agent = Agent(hub, path)
+    assert agent.replicator.status().newest == 3
+    assert agent.replicator.status().unacknowledged == 0
+    agent.replicator.submit(bodies(3, 3), 0)
+    eventually(lambda: Mark.decode(server.changes[-1].attachment) == Mark(4, agent.log_id))
+    assert len(agent.journal.changes(MAP, 1, 9)) == 4, "retirements are kept"
+    agent.close()

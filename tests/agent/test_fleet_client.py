@@ -1,0 +1,374 @@
+"""The link to the fleet: missions, status, and questions that may stay without an answer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.agent.drive_statistics import DriveStatistics
+from mapweave.agent.fleet_client import NO_ANSWER, FleetClient, decode_mission, encode_mission
+from mapweave.agent.mission import (
+    Answer,
+    Carried,
+    Explore,
+    GoTo,
+    Idle,
+    Mission,
+    Question,
+    WhatIsKnown,
+    WhereAmI,
+    WhichWay,
+)
+from mapweave.agent.pipeline import Status
+from mapweave.agent.status_message import MAX_WORDS, AgentStatus, decode_agent_status, encode_agent_status
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty, KnownAnswer, RelocalizeAnswer, RouteAnswer, View
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from mapweave.wire.messages import (
+    MAX_BLOCKED,
+    KnownRequest,
+    decode_known_request,
+    decode_route_request,
+    decode_view,
+    encode_known_answer,
+    encode_relocalize_answer,
+    encode_route_answer,
+)
+from mapweave.wire.traffic_meter import TrafficMeter
+from tests.waiting import eventually
+
+KEYS = Keys("fleet")
+MAP = MapId("r0", 1)
+HERE, THERE = NodeId("r0", 1, 3), NodeId("r1", 1, 9)
+VIEW = View(
+    np.array([[10.0, 20.0], [30.0, 40.0]], np.float32),
+    np.arange(64, dtype=np.uint8).reshape(2, 32),
+    Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3),
+)
+
+# Messages
+
+names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
+node_ids = st.builds(NodeId, names, st.integers(0, 2**53), st.integers(0, 2**40))
+missions = st.one_of(st.just(Idle()), st.just(Explore()), st.just(Carried()), st.builds(GoTo, node_ids))
+finite = st.floats(-1e6, 1e6)
+words = st.text(st.characters(categories=["L", "N", "P", "Zs"]).filter(str.isprintable), max_size=200)
+counts = st.integers(0, 10**4)
+statuses = st.builds(
+    Status,
+    doing=words, detail=words, nodes=st.integers(0, 10**6), tracked=st.integers(0, 500),
+    map_from_robot=st.builds(Pose2, finite, finite, finite), finished=st.booleans(), mission=words,
+    fix_node=st.none() | node_ids, node_from_robot=st.builds(Pose2, finite, finite, finite),
+    legs=st.integers(0, 1000), tally=st.builds(DriveStatistics, counts, counts, counts, counts),
+)  # fmt: skip
+
+
+@given(missions)
+def test_missions_come_back_as_they_were(mission: Mission) -> None:
+    assert decode_mission(encode_mission(mission)) == mission
+
+
+@given(statuses, st.integers(0, 2**53))
+def test_statuses_come_back_as_they_were(status: Status, stamp_ns: int) -> None:
+    report = decode_agent_status(encode_agent_status(AgentStatus(status, stamp_ns)))
+    assert report == AgentStatus(status, stamp_ns)
+    assert report.fix_node == status.fix_node
+
+
+odd_texts = ["goto", "r0.1.2", "r0.².1", "r0.1.٣", "r0.-1.2", "r0.1." + "9" * 400, "nan", "inf", "..", ""]
+scalars = st.one_of(
+    st.sampled_from(odd_texts), st.text(max_size=30), st.integers(-(2**63), 2**63 - 1), st.floats(),
+    st.booleans(), st.none(), st.binary(max_size=9),
+)  # fmt: skip
+
+
+@given(st.binary(max_size=200))
+def test_garbage_is_no_mission_and_no_status(data: bytes) -> None:
+    for decode in (decode_mission, decode_agent_status):
+        with pytest.raises(InvalidMessage):
+            decode(data)
+
+
+@given(st.sampled_from(["goto", "idle", "GOTO", "fly", ""]) | scalars, scalars)
+def test_a_mission_is_read_or_refused(name: object, node: object) -> None:
+    data = msgpack.packb({"v": 1, "s": {"mission": name, "node": node}})
+    try:
+        mission = decode_mission(data)
+    except InvalidMessage:
+        return
+    assert decode_mission(encode_mission(mission)) == mission
+
+
+@given(statuses, st.data())
+def test_a_status_with_a_strange_field_is_read_or_refused(status: Status, data: st.DataObject) -> None:
+    fields = msgpack.unpackb(encode_agent_status(AgentStatus(status, 5)))
+    name = data.draw(st.sampled_from(sorted(fields["s"])))
+    fields["s"][name] = data.draw(scalars)
+    try:
+        report = decode_agent_status(msgpack.packb(fields))
+    except InvalidMessage:
+        return
+    numbers = [*report.status.map_from_robot.vector, *report.status.node_from_robot.vector]
+    assert np.isfinite(numbers).all()
+    assert decode_agent_status(encode_agent_status(report)) == report
+
+
+@given(statuses, st.data())
+def test_a_status_without_a_field_is_refused(status: Status, data: st.DataObject) -> None:
+    fields = msgpack.unpackb(encode_agent_status(AgentStatus(status, 5)))
+    name = data.draw(st.sampled_from(sorted(fields["s"])))
+    del fields["s"][name]
+    with pytest.raises(InvalidMessage, match=name):
+        decode_agent_status(msgpack.packb(fields))
+
+
+@given(st.text(), st.integers(1, 400))
+def test_whatever_was_said_can_be_told(text: str, times: int) -> None:
+    """A status quotes servers and drivers: line breaks and long stories must not end the robot's loop."""
+    status = Status("looking", text * times, 0, 0, Pose2(), False)
+    said = decode_agent_status(encode_agent_status(AgentStatus(status, 0))).status.detail
+    assert said.isprintable()
+    assert len(said) == min(len(text) * times, MAX_WORDS)
+    assert all(c == d for c, d in zip(text * times, said, strict=False) if c.isprintable())
+
+
+# The link
+
+
+@pytest.fixture
+def hub() -> MemoryHub:
+    return MemoryHub()
+
+
+@pytest.fixture
+def other(hub: MemoryHub) -> Iterator[MemoryBus]:
+    """The rest of the fleet."""
+    bus = MemoryBus(hub)
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def link(hub: MemoryHub) -> Iterator[FleetClient]:
+    bus = MemoryBus(hub)
+    link = FleetClient(bus, KEYS, MAP, answer_timeout=0.5)
+    yield link
+    link.close()
+    bus.close()
+
+
+def test_operators_commands_arrive_in_order_and_once(link: FleetClient, other: MemoryBus) -> None:
+    assert link.missions() == []
+    given: list[Mission] = [Explore(), GoTo(THERE), Idle()]
+    for mission in given:
+        (reply,) = other.ask(KEYS.mission("r0"), encode_mission(mission), 2.0)
+        assert (reply.payload, reply.error) == (b"ok", "")
+    assert link.missions() == given
+    assert link.missions() == []
+
+
+@pytest.mark.parametrize(
+    ("payload", "said"),
+    [
+        (b"garbage", "record"),
+        (msgpack.packb({"v": 1, "s": {"mission": "fly"}}), "no mission 'fly'; known are idle, explore"),
+        (msgpack.packb({"v": 1, "s": {"mission": "goto", "node": "kitchen"}}), "is no node id"),
+        (msgpack.packb({"v": 1, "s": {"mission": "goto", "node": "r0.².1"}}), "is no node id"),
+    ],
+)
+def test_what_is_no_command_is_refused_and_changes_nothing(
+    link: FleetClient, other: MemoryBus, payload: bytes, said: str
+) -> None:
+    (reply,) = other.ask(KEYS.mission("r0"), payload, 2.0)
+    assert said in reply.error
+    assert link.missions() == []
+    (reply,) = other.ask(KEYS.mission("r0"), encode_mission(Explore()), 2.0)
+    assert not reply.error, "and the next command is taken"
+
+
+def test_the_fleet_hears_what_the_robot_does(link: FleetClient, other: MemoryBus) -> None:
+    heard: list[AgentStatus] = []
+    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(decode_agent_status(sample.payload)))
+    status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False, "goto", THERE, Pose2(0.1, 0, 0), 4)
+    link.report(status, 123)
+    eventually(lambda: heard == [AgentStatus(status, 123, MAP.epoch)])
+
+
+def test_who_asks_is_told_the_state_of_now(hub: MemoryHub, other: MemoryBus) -> None:
+    """Also when nothing was published: what waits for the server, what has gone over the network."""
+    bus, waiting = TrafficMeter(MemoryBus(hub)), [3]
+    link = FleetClient(bus, KEYS, MAP, unsent=lambda: waiting[0])
+
+    def asked() -> AgentStatus:
+        (reply,) = other.ask(KEYS.agent_status("r0"), b"", 1.0)
+        return decode_agent_status(reply.payload)
+
+    first = asked()
+    assert first.status.doing == "starting"
+    assert (first.unsent, first.linked, first.epoch) == (3, False, MAP.epoch)
+    status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False)
+    heard: list[bytes] = []
+    other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(sample.payload))
+    link.report(status, 5, publish=False)
+    waiting[0] = 0
+    token = other.announce(KEYS.server_alive("s0"))
+    eventually(lambda: asked().linked)
+    second = asked()
+    assert (second.status, second.stamp_ns, second.unsent) == (status, 5, 0)
+    assert second.traffic > first.traffic > 0
+    token.close()
+    eventually(lambda: not asked().linked)
+    assert not heard
+    link.close()
+    bus.close()
+
+
+def test_the_agent_is_alive_until_it_goes(hub: MemoryHub, other: MemoryBus) -> None:
+    seen: list[tuple[str, bool]] = []
+    other.watch(KEYS.agents_alive(), lambda key, alive: seen.append((key, alive)))
+    bus = MemoryBus(hub)
+    link = FleetClient(bus, KEYS, MAP)
+    eventually(lambda: seen == [(KEYS.agent_alive(MAP), True)])
+    link.close()
+    eventually(lambda: seen[-1] == (KEYS.agent_alive(MAP), False))
+    assert other.ask(KEYS.mission("r0"), encode_mission(Idle()), 0.2) == []
+    bus.close()
+
+
+QUESTIONS: list[Question] = [WhereAmI(7, VIEW), WhichWay(7, HERE, THERE), WhatIsKnown(7, MAP, 1.0, 2.0, 9.0)]
+
+
+@pytest.mark.parametrize("question", QUESTIONS, ids=["where", "way", "known"])
+def test_without_a_server_the_answer_says_so(link: FleetClient, question: Question) -> None:
+    link.ask(question)
+    (answer,) = link.answers(wait=True)
+    assert (answer.number, answer.content, answer.error) == (7, None, NO_ANSWER)
+    assert link.answers(wait=True) == (), "nothing is open: there is nothing to wait for"
+
+
+def test_the_servers_answers_come_with_their_numbers(link: FleetClient, other: MemoryBus) -> None:
+    asked: list[object] = []
+
+    def relocalize(request) -> None:
+        asked.append(decode_view(request.payload))
+        request.reply(encode_relocalize_answer(RelocalizeAnswer(Certainty.UNKNOWN, (), "never seen")))
+
+    def route(request) -> None:
+        asked.append(decode_route_request(request.payload))
+        request.reply(encode_route_answer(RouteAnswer((), "no way")))
+
+    other.serve(KEYS.relocalize("s0"), relocalize)
+    other.serve(KEYS.route("s0"), route)
+    link.ask(WhereAmI(1, VIEW))
+    link.ask(WhichWay(2, HERE, THERE, Pose2(0.25, -0.5, 1.0), ((HERE, THERE),)))
+    first, second = link.answers(wait=True)
+    assert isinstance(first.content, RelocalizeAnswer)
+    assert (first.number, first.content.certainty, first.content.reason) == (
+        1,
+        Certainty.UNKNOWN,
+        "never seen",
+    )
+    assert isinstance(second.content, RouteAnswer)
+    assert (second.number, second.content.reason, second.error) == (2, "no way", "")
+    view, request = asked
+    assert np.allclose(view.pixels, VIEW.pixels, atol=0.1)
+    assert np.array_equal(view.codes, VIEW.codes)
+    assert (request.start, request.goal, request.blocked) == (HERE, THERE, ((HERE, THERE),))
+    assert request.start_from_robot == Pose2(0.25, -0.5, 1.0)
+
+
+def test_it_is_told_what_others_have_mapped(link: FleetClient, other: MemoryBus) -> None:
+    asked: list[KnownRequest] = []
+
+    def known(request) -> None:
+        asked.append(decode_known_request(request.payload))
+        request.reply(encode_known_answer(KnownAnswer(np.array([[1.0, 2.0, 0.5, 0.5]]), "one view")))
+
+    other.serve(KEYS.known("s0"), known)
+    link.ask(WhatIsKnown(-1, MAP, 1.5, -2.0, 9.0))
+    (answer,) = link.answers(wait=True)
+    assert asked == [KnownRequest(MAP, 1.5, -2.0, 9.0)]
+    assert isinstance(answer.content, KnownAnswer)
+    assert answer.content.views.tolist() == [[1.0, 2.0, 0.5, 0.5]]
+
+
+def test_a_robot_never_waits(link: FleetClient, other: MemoryBus) -> None:
+    release = threading.Event()
+
+    def slow(request) -> None:
+        release.wait(60)
+        request.reply(encode_route_answer(RouteAnswer((), "at last")))
+
+    other.serve(KEYS.route("s0"), slow)
+    begin = time.monotonic()
+    link.ask(WhichWay(1, HERE, THERE))
+    assert link.answers() == ()
+    assert time.monotonic() - begin < 20
+    release.set()
+    got: list[Answer] = []
+    eventually(lambda: got.extend(link.answers()) or got)
+    assert [answer.number for answer in got] == [1]
+
+
+def test_waiting_ends_when_the_time_is_over(link: FleetClient, other: MemoryBus) -> None:
+    release = threading.Event()
+    other.serve(KEYS.route("s0"), lambda request: release.wait(60))
+    begin = time.monotonic()
+    for number in (1, 2):
+        link.ask(WhichWay(number, HERE, THERE))
+    answers = link.answers(wait=True)
+    assert time.monotonic() - begin < 20
+    assert [(a.number, a.content) for a in answers] == [(1, None), (2, None)]
+    release.set()
+
+
+def test_a_server_that_refuses_is_quoted_and_another_one_is_heard(
+    link: FleetClient, other: MemoryBus
+) -> None:
+    other.serve(KEYS.route("s0"), lambda request: request.refuse("no such node"))
+    link.ask(WhichWay(1, HERE, THERE))
+    (answer,) = link.answers(wait=True)
+    assert answer.content is None
+    assert "no such node" in answer.error
+    other.serve(KEYS.route("s1"), lambda request: request.reply(b"garbage"))
+    link.ask(WhichWay(2, HERE, THERE))
+    (answer,) = link.answers(wait=True)
+    assert answer.content is None
+    assert answer.error
+    other.serve(KEYS.route("s2"), lambda request: request.reply(encode_route_answer(RouteAnswer((), "yes"))))
+    link.ask(WhichWay(3, HERE, THERE))
+    (answer,) = link.answers(wait=True)
+    assert isinstance(answer.content, RouteAnswer)
+
+
+def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
+    link: FleetClient, other: MemoryBus
+) -> None:
+    """A robot that stood before very many closed doors must not lose its voice, nor stop a lock-step."""
+    other.serve(KEYS.route("s0"), lambda request: request.reply(encode_route_answer(RouteAnswer((), "yes"))))
+    link.ask(WhichWay(1, HERE, THERE, Pose2(), ((HERE, THERE),) * (MAX_BLOCKED + 1)))
+    link.ask(WhichWay(2, HERE, THERE))
+    got: list[Answer] = []
+    eventually(lambda: got.extend(link.answers()) or len(got) == 2)
+    assert got[0].content is None
+    assert "at most 256" in got[0].error
+    assert isinstance(got[1].content, RouteAnswer)
+
+
+def test_closing_twice_is_no_error(hub: MemoryHub) -> None:
+    bus = MemoryBus(hub)
+    link = FleetClient(bus, KEYS, MAP)
+    link.close()
+    link.close()
+    bus.close()

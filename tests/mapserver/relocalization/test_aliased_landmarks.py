@@ -1,0 +1,164 @@
+"""What looks alike on the map, and what rests on one thing, in small synthetic worlds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, View
+from mapweave.mapserver.relocalization.aliased_landmarks import AliasedLandmarks, carried, unexplained
+from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, hidden, is_lonely
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.registration.recognition import Recognition, RecognitionSettings, recognise
+from synthetic.world import CAMERA, Sensing, room, take_node, take_view
+
+NOTHING = np.zeros((0, 2))
+HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+AT = Pose2(2.2, 2.0, 0.3)
+WORLD = room(0, 0, 5, 4, 500, np.random.default_rng(1))
+
+
+def node(number: int, at: Pose2, seed: int):
+    return take_node(WORLD, NodeId("r0", 1, number), at, HERE, np.random.default_rng(seed))
+
+
+def test_a_double_explains_what_both_have_and_is_found_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, twin = node(1, AT, 2), node(2, AT @ Pose2(0.1, -0.05, 0.1), 3)
+    view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.05), np.random.default_rng(4))
+    found = recognise(first, view, None, np.random.default_rng(0))
+    assert found is not None
+    doubles = AliasedLandmarks(RecognitionSettings())
+    likeness = doubles.compare(twin, first)
+    assert likeness is not None
+
+    def never(*_: object) -> None:
+        raise AssertionError("found out already")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("mapweave.mapserver.relocalization.aliased_landmarks.register", never)
+        assert doubles.compare(twin, first) is likeness
+        with pytest.raises(AssertionError, match="already"):
+            doubles.compare(twin, replace(first, stamp_ns=first.stamp_ns + 1))  # changed
+    settings = RecognitionSettings().matching
+    told = carried(twin, likeness, NodeMatch(first.id, found), view, settings, 12.0)
+    assert told.alike == first.id and told.node == twin.id
+    # The twin is mapped 0.1 m aside, and the view is where it would be seen from there.
+    expected = (AT @ Pose2(0.1, -0.05, 0.1)).inverse() @ AT @ Pose2(0.05, 0.0, 0.05)
+    assert told.recognition.node_from_robot.mean.distance(expected) < 0.05
+    direct = recognise(twin, view, None, np.random.default_rng(0))
+    assert direct is not None
+    shared = {tuple(pair) for pair in told.recognition.pairs} & {tuple(pair) for pair in direct.pairs}
+    assert len(shared) > 0.6 * direct.inliers
+    assert len(set(told.recognition.pairs[:, 1])) == told.recognition.inliers
+
+
+def nowhere_joined(places: list) -> MergedMap:
+    """A map of parts that nothing joins, one a node."""
+    poses = {one.id: Placement(k, HERE) for k, one in enumerate(places)}
+    graphs = tuple(solve_graph(one.id, Pose2(), []) for one in places)
+    return MergedMap({}, (), (), tuple(frozenset([one.id]) for one in places), poses, graphs)
+
+
+def test_a_place_whose_double_was_not_recognised_is_ambiguous() -> None:
+    first, twin = node(1, AT, 2), node(2, AT, 3)
+    view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.02), np.random.default_rng(4))
+    found = recognise(first, view, None, np.random.default_rng(0))
+    assert found is not None
+    places = [first, twin]
+    by_id = {one.id: one for one in places}
+
+    class Ranked:
+        def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+            return [(first.id, 2.0), (twin.id, 1.0)]
+
+    service = Relocalizer(Ranked(), by_id.get, nowhere_joined(places))
+    alone = service.conclude(view, [NodeMatch(first.id, found)], [(first.id, 2.0)])
+    assert alone.certainty is Certainty.FOUND
+    both = service.conclude(view, [NodeMatch(first.id, found)], Ranked().query(view))
+    assert both.certainty is Certainty.AMBIGUOUS and "look alike on the map" in both.reason
+    assert {one.node for one in both.candidates} == {first.id, twin.id}
+    assert max(one.probability for one in both.candidates) < 0.9
+
+
+def test_what_the_map_has_in_one_place_is_no_double() -> None:
+    first, twin = node(1, AT, 2), node(2, AT, 3)
+    view, _ = take_view(WORLD, AT, np.random.default_rng(4))
+    found = recognise(first, view, None, np.random.default_rng(0))
+    assert found is not None
+    poses = {one.id: Placement(0, PoseGaussian(AT, HERE.covariance)) for one in (first, twin)}
+    merged = MergedMap({}, (), (), (frozenset(poses),), poses, ())
+    service = Relocalizer(PlaceIndex(), {first.id: first, twin.id: twin}.get, merged)
+    assert not service.doubled(view, NodeMatch(first.id, found), [(first.id, 2.0), (twin.id, 1.0)])
+
+
+def test_matches_that_a_pose_explains() -> None:
+    one = node(1, AT, 2)
+    known = np.flatnonzero(one.landmarks.has_depth)[:20]
+    pixels = one.landmarks.pixels[known].copy()
+    pixels[:5] += 30.0
+    pairs = np.column_stack([known, np.arange(20)])
+    assert unexplained(one, pairs, pixels, one.camera, Pose2(), 12.0) == 5
+
+
+def test_what_rests_on_one_thing_is_lonely_only_if_the_rest_is_missing() -> None:
+    one = node(1, AT, 2)
+    points = one.landmarks.points_in_robot(one.camera)
+    known = np.flatnonzero(one.landmarks.has_depth)
+    middle = points[known[len(known) // 2]]
+    near = known[np.argsort(np.linalg.norm(points[known] - middle, axis=1))[:12]]
+    view, _ = take_view(WORLD, AT, np.random.default_rng(4), Sensing(most=150))
+    found = recognise(one, view, None, np.random.default_rng(0))
+    assert found is not None
+    evidence = {**found.evidence, "seen": 0.4}
+
+    def resting_on(landmarks: np.ndarray, camera: Camera, others: np.ndarray = NOTHING) -> bool:
+        """Of a view that shows these landmarks, and other features at these pixels."""
+        pixels = np.concatenate([one.landmarks.pixels[landmarks], others]).astype(np.float32)
+        seen = View(pixels, np.zeros((len(pixels), 32), np.uint8), camera)
+        pairs = np.column_stack([landmarks, np.arange(len(landmarks))])
+        told: Recognition = replace(found, node_from_robot=HERE, pairs=pairs, evidence=evidence)
+        return is_lonely(one, seen, told)
+
+    spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(points[near][:, :2].T))[-1]))
+    assert spread < 0.35
+    assert resting_on(near, one.camera)
+    assert not resting_on(known[:: max(len(known) // 12, 1)], one.camera)  # all over the room
+    # A camera that sees nothing but the thing: nothing else is to be expected.
+    u, v = one.landmarks.pixels[near].mean(axis=0)
+    narrow = replace(
+        one.camera, width=16, height=16, cx=float(one.camera.cx - u) + 8, cy=float(one.camera.cy - v) + 8
+    )
+    assert not resting_on(near, narrow)
+    # Where the whole view is full of other things, some of it may be hidden, not all.
+    clutter = np.random.default_rng(5).uniform(0, [320, 240], (60, 2))
+    assert resting_on(near, one.camera, clutter)
+
+
+def test_one_person_hides_what_lies_in_one_strip_where_hardly_anything_agrees() -> None:
+    """Against all strips that begin at a missing landmark, feature by feature."""
+    rng, counts = np.random.default_rng(6), set()
+    found = recognise(node(1, AT, 2), take_view(WORLD, AT, np.random.default_rng(4))[0], None, rng)
+    assert found is not None
+    for _ in range(60):
+        agree, missing = int(rng.integers(5, 20)), rng.uniform(0, 320, int(rng.integers(1, 15)))
+        across = np.concatenate([rng.normal(rng.uniform(60, 260), 40, agree), rng.uniform(0, 320, 20)])
+        pixels = np.column_stack([across, np.full(len(across), 100.0)]).astype(np.float32)
+        view = View(pixels, np.zeros((len(across), 32), np.uint8), CAMERA)
+        told = replace(found, pairs=np.column_stack([np.arange(agree)] * 2))
+        most = 0
+        for left in missing:
+            strip = [k for k, u in enumerate(pixels[:, 0]) if left <= u <= left + 128]
+            own, others = [k for k in strip if k < agree], [k for k in strip if k >= agree]
+            if len(own) <= agree / 10 and len(others) >= 3:
+                most = max(most, sum(left <= u <= left + 128 for u in missing))
+        assert hidden(missing, view, told) == most
+        counts.add(most)
+    assert len(counts) > 4 and 0 in counts

@@ -1,0 +1,271 @@
+"""Two rooms that look the same, one of them not mapped from where the view was taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import Certainty, View
+from mapweave.mapserver.merge_worker import PREPARED_AT_ONCE, MergeWorker
+from mapweave.mapserver.relocalization.alias_cache import AliasCache
+from mapweave.mapserver.relocalization.aliased_landmarks import between
+from mapweave.mapserver.relocalization.aliased_regions import AliasedRegionSettings
+from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch
+from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.registration.recognition import RecognitionSettings, recognise
+from synthetic.world import room, take_node, take_view
+from tests.waiting import eventually
+
+ROOM = room(0, 0, 5, 4, 700, np.random.default_rng(1))
+OTHER = room(0, 0, 5, 4, 700, np.random.default_rng(2))
+STOP = Pose2(2.2, 2.0, 0.0)
+AWAY = Pose2(30.0, 7.0, 0.8)
+"""Where the second room is."""
+SEEN = Pose2(0.0, 0.0, 0.3)
+ASIDE = (Pose2(0.05, 0.0, 0.85), Pose2(0.0, 0.05, -0.25))
+"""From the stop: where only one room was looked at, and where both were."""
+
+
+def taken(number: int, at: Pose2, shift: Pose2, seed: int, agent: str = "r0", world=ROOM) -> Node:
+    """A node whose map says that it lies in a room that is shifted."""
+    pose = PoseGaussian.from_sigmas(shift @ at, 0.01, 0.01)
+    return take_node(world, NodeId(agent, 1, number), at, pose, np.random.default_rng(seed))
+
+
+def here_and_there(world=ROOM, agent: str = "r0") -> list[Node]:
+    """The node that is recognised, its neighbours, and what was mapped of the second room."""
+    looks = [SEEN, *ASIDE]
+    here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate(looks)]
+    there = [
+        taken(4 + k, STOP @ look @ Pose2(0.06, 0.04, 0.05), AWAY, 20 + k, agent, world)
+        for k, look in enumerate(ASIDE)
+    ]
+    return [*here, *there]
+
+
+def joined(nodes: Sequence[Node]) -> MergedMap:
+    """One map of them all, where each says that it is."""
+    first, *others = nodes
+    start = first.map_from_robot.mean
+    ways = [PoseGaussian.from_sigmas(start.inverse() @ one.map_from_robot.mean, 0.01, 0.01) for one in others]
+    measured = [Measurement(first.id, one.id, way) for one, way in zip(others, ways, strict=True)]
+    graph = solve_graph(first.id, start, measured)
+    poses = {node: Placement(0, pose) for node, pose in graph.poses().items()}
+    return MergedMap({}, (), (), (frozenset(poses),), poses, (graph,))
+
+
+class OnlyTheFirst:
+    """Finds one node for the view, as if nothing else looked like it, and for nodes what is really alike."""
+
+    def __init__(self, nodes: Sequence[Node], view: View) -> None:
+        self.index, self.view, self.first, self.asked = PlaceIndex(), view, nodes[0].id, 0
+        self.index.extend(nodes)
+
+    def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
+        if view is self.view:
+            return [(self.first, 2.0)]
+        self.asked += 1
+        return self.index.query(view, k)
+
+
+VIEW, _ = take_view(ROOM, STOP @ SEEN @ Pose2(0.04, 0.02, 0.03), np.random.default_rng(4))
+
+
+def asked(nodes: Sequence[Node], merged: MergedMap, **regions: float) -> Relocalizer:
+    settings = RelocalizationSettings(regions=AliasedRegionSettings(**regions))  # type: ignore[arg-type]
+    by_id = {one.id: one for one in nodes}
+    return Relocalizer(OnlyTheFirst(nodes, VIEW), by_id.get, merged, settings)
+
+
+def test_neighbours_tell_that_a_room_is_there_twice() -> None:
+    nodes = here_and_there()
+    merged = joined(nodes)
+    assert asked(nodes, merged, least_nodes=0).answer(VIEW).certainty is Certainty.FOUND
+    answer = asked(nodes, merged).answer(VIEW)
+    assert answer.certainty is Certainty.AMBIGUOUS and "3 nodes around" in answer.reason
+    here, there = answer.candidates
+    assert here.node == nodes[0].id and there.node in {nodes[3].id, nodes[4].id}
+    assert there.merged_from_robot is not None
+    true = AWAY @ STOP @ SEEN @ Pose2(0.04, 0.02, 0.03)
+    assert there.merged_from_robot.mean.distance(true) < 0.1
+    assert there.merged_from_robot.mahalanobis2(true) < 16.3
+    assert here.probability + there.probability < 1.0 + 1e-9
+
+
+AROUND = (Pose2(0.0, 0.05, 1.55), Pose2(0.05, 0.0, -0.95), Pose2(0.0, 0.0, 2.8), Pose2(0.0, 0.05, -2.1))
+"""From the stop: what shows nothing of what the view shows."""
+
+
+def test_where_nobody_has_looked_it_may_be_the_same() -> None:
+    """The nodes around have doubles, all in one direction; where the view's own would be there is none."""
+    here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate([SEEN, *AROUND])]
+    there = [
+        taken(6 + k, STOP @ look @ Pose2(0.06, 0.04, 0.05), AWAY, 20 + k) for k, look in enumerate(AROUND)
+    ]
+    nodes = [*here, *there]
+    answer = asked(nodes, joined(nodes)).answer(VIEW)
+    assert answer.certainty is Certainty.AMBIGUOUS
+    assert answer.candidates[1].node in {one.id for one in there}
+    # Somebody who looks there and sees other things settles it; one who looks from elsewhere does not.
+    for turn, told in ((0.0, Certainty.FOUND), (0.9, Certainty.AMBIGUOUS)):
+        other = taken(19, STOP @ SEEN @ Pose2(0.05, 0.0, turn), AWAY, 30, world=OTHER)
+        more = [*nodes, other]
+        assert asked(more, joined(more)).answer(VIEW).certainty is told
+    # One thing that is there twice says nothing of what lies beside it.
+    thing = [
+        replace(one, landmarks=one.landmarks.take(np.abs(one.landmarks.pixels[:, 0] - 160.0) < 35.0))
+        for one in there
+    ]
+    few = [*here[:2], thing[0]]
+    settings = {"least_nodes": 1, "least_around": 1}
+    assert asked(few, joined(few), **settings).answer(VIEW).certainty is Certainty.FOUND
+    few[-1] = there[0]
+    assert asked(few, joined(few), **settings).answer(VIEW).certainty is Certainty.AMBIGUOUS
+    assert asked(few, joined(few), least_nodes=1).answer(VIEW).certainty is Certainty.FOUND
+
+
+def test_what_is_there_once_is_told() -> None:
+    for nodes in (here_and_there(OTHER), here_and_there()[:3]):
+        assert asked(nodes, joined(nodes)).answer(VIEW).certainty is Certainty.FOUND
+
+
+def test_how_many_nodes_must_say_so_and_of_how_much_is_a_setting() -> None:
+    nodes = here_and_there()[:4]
+    merged = joined(nodes)
+    # The node that was recognised and one neighbour have a double, the same one.
+    assert asked(nodes, merged, least_nodes=3).answer(VIEW).certainty is Certainty.FOUND
+    assert (
+        asked(nodes, merged, least_share=0.9, most_looked_at=-1.0).answer(VIEW).certainty is Certainty.FOUND
+    )
+    told = asked(nodes, merged, least_nodes=2, least_share=0.3).answer(VIEW)
+    assert told.certainty is Certainty.AMBIGUOUS
+
+
+def test_the_same_room_mapped_twice_is_one_place() -> None:
+    nodes = here_and_there()
+    twice = [
+        replace(one, map_from_robot=PoseGaussian(AWAY.inverse() @ one.map_from_robot.mean, np.eye(3) * 1e-4))
+        if k > 2
+        else one
+        for k, one in enumerate(nodes)
+    ]
+    assert asked(twice, joined(twice)).answer(VIEW).certainty is Certainty.FOUND
+
+
+def test_maps_that_are_not_merged_have_their_own_frames() -> None:
+    nodes = here_and_there(agent="r1")
+    found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
+    assert found is not None
+    ranked = [(nodes[0].id, 2.0), (nodes[1].id, 0.1), (nodes[2].id, 0.1)]
+    service = asked(nodes, MergedMap.empty())
+    answer = service.conclude(VIEW, [NodeMatch(nodes[0].id, found)], ranked)
+    assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
+    assert answer.candidates[1].node.agent == "r1" and answer.candidates[1].merged_from_robot is None
+
+
+def test_what_looks_alike_is_found_out_once_and_kept_true() -> None:
+    nodes = here_and_there()
+    merged, by_id = joined(nodes), {one.id: one for one in nodes}
+    index, alike = OnlyTheFirst(nodes, VIEW), AliasCache(RecognitionSettings())
+
+    def of(node: Node, known: MergedMap = merged) -> set[NodeId]:
+        found = alike.of(node, index, by_id.get, lambda a, b: between(known, a, b))
+        return {one.other.id for one in found}
+
+    one, twin = nodes[1], nodes[3]
+    assert of(one) == {twin.id} and of(one) == {twin.id} and index.asked == 1
+    # Made anew without any change, as nodes that have lost landmarks are: it still holds.
+    by_id[twin.id] = replace(twin, landmarks=twin.landmarks.take(np.arange(len(twin.landmarks))))
+    assert of(replace(one)) == {twin.id} and index.asked == 1
+    # A node that comes later is entered as soon as it is asked about itself.
+    late = taken(9, STOP @ ASIDE[0] @ Pose2(0.0, 0.08, -0.04), AWAY @ Pose2(0, 50, 0), 31)
+    by_id[late.id] = late
+    index.index.add(late)
+    assert of(late, MergedMap.empty()) >= {one.id, twin.id}
+    assert of(one) == {twin.id, late.id} and index.asked == 2
+    # What has gone or changed is looked for no longer, or anew.
+    del by_id[late.id]
+    assert of(one) == {twin.id}
+    by_id[twin.id] = replace(twin, stamp_ns=twin.stamp_ns + 1)
+    assert of(one) == set()
+    assert of(replace(one, stamp_ns=7)) == {twin.id} and index.asked == 3
+
+
+def test_a_merge_that_is_undone_is_noticed() -> None:
+    nodes = here_and_there()
+    again = taken(8, STOP @ ASIDE[0], Pose2(), 40)
+    merged = joined([*nodes, again])
+    index, alike = OnlyTheFirst([*nodes, again], VIEW), AliasCache(RecognitionSettings())
+    by_id = {one.id: one for one in [*nodes, again]}
+    for known, expected in ((merged, {nodes[3].id}), (MergedMap.empty(), {nodes[3].id, again.id})):
+        found = alike.of(nodes[1], index, by_id.get, lambda a, b, known=known: between(known, a, b))
+        assert {one.other.id for one in found} >= expected
+        assert (again.id in {one.other.id for one in found}) == (again.id in expected)
+
+
+def test_what_is_prepared_is_not_looked_for_when_somebody_asks() -> None:
+    nodes = here_and_there()
+    service = asked(nodes, joined(nodes))
+    index = service._index
+    assert isinstance(index, OnlyTheFirst)
+    assert [service.prepare(2) for _ in range(4)] == [3, 1, 0, 0]
+    assert index.asked == 5
+    assert service.answer(VIEW).certainty is Certainty.AMBIGUOUS
+    assert index.asked == 5
+    assert asked(nodes, joined(nodes), least_nodes=0).prepare(9) == 0
+
+
+@pytest.mark.parametrize("schedule", [LiveSchedule, LockstepSchedule])
+def test_a_server_finds_out_by_itself_what_nodes_look_like(
+    schedule: type[Schedule], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes, looked = here_and_there(), list[int]()
+
+    def noted(service: Relocalizer, most: int) -> int:
+        looked.append(most)
+        return prepare(service, most)
+
+    prepare = Relocalizer.prepare
+    monkeypatch.setattr(Relocalizer, "prepare", noted)
+    upkeep = MergeWorker(schedule(), 1.0)
+    upkeep.start()
+    for k, one in enumerate(nodes):
+        upkeep.take(Change(one.id.map, k + 1, 0, NodePut(one)))
+    assert upkeep.settle(20.0)
+    eventually(lambda: all(upkeep._merger.alike.knows(one) for one in nodes))
+    upkeep.close()
+    assert max(looked) == PREPARED_AT_ONCE
+
+
+def test_landmarks_without_depths_say_nothing_of_regions() -> None:
+    nodes = here_and_there()
+    found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
+    assert found is not None
+    for blind, told in (({0}, Certainty.FOUND), ({0, 1, 2}, Certainty.FOUND), ({1, 2}, Certainty.AMBIGUOUS)):
+        fewer = [
+            replace(
+                one,
+                landmarks=replace(
+                    one.landmarks,
+                    depths=np.full_like(one.landmarks.depths, np.nan),
+                    depth_sigmas=np.full_like(one.landmarks.depths, np.nan),
+                ),
+            )
+            if k in blind
+            else one
+            for k, one in enumerate(nodes)
+        ]
+        service = asked(fewer, joined(fewer))
+        answer = service.conclude(VIEW, [NodeMatch(nodes[0].id, found)], [(nodes[0].id, 2.0)])
+        assert answer.certainty is told

@@ -1,0 +1,114 @@
+"""Cells of descriptors against brute force."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.descriptor import decode, quantise
+from mapweave.mapserver.retrieval.coarse_quantizer import CoarseQuantizer
+from mapweave.mapserver.retrieval.inverted_file import InvertedFile
+from mapweave.registration.matching import squared_distances
+from synthetic.world import random_vectors
+
+Codes = NDArray[np.uint8]
+Ids = NDArray[np.int64]
+
+
+@pytest.fixture(scope="module")
+def landmarks() -> tuple[Codes, Ids]:
+    """Three thousand that are seen again and again, with ids in no order."""
+    rng = np.random.default_rng(1)
+    seen = random_vectors(600, rng)[rng.integers(0, 600, 3000)]
+    codes = quantise(seen + rng.normal(0, 0.05, seen.shape))
+    return codes, rng.permutation(50_000)[: len(codes)].astype(np.int64)
+
+
+def filled(codes: Codes, ids: Ids, count: int) -> InvertedFile:
+    cells = InvertedFile(CoarseQuantizer.learn(codes, count))
+    cells.add(codes, ids)
+    return cells
+
+
+def contents(cells: InvertedFile) -> tuple[Codes, Ids]:
+    """In the order of the ids, read in several blocks."""
+    blocks = list(cells.blocks(500))
+    assert len(blocks) > 1
+    codes, ids, _ = (np.concatenate(column) for column in zip(*blocks, strict=True))
+    order = np.argsort(ids)
+    return codes[order], ids[order]
+
+
+def asked(codes: Codes, n: int, seed: int) -> Codes:
+    rng = np.random.default_rng(seed)
+    vectors = decode(codes[rng.integers(0, len(codes), n)])
+    return quantise(vectors + rng.normal(0, 0.04, vectors.shape))
+
+
+def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
+    codes, ids = landmarks
+    cells, questions = filled(codes, ids, 64), asked(codes, 50, 2)
+    every = squared_distances(decode(questions), decode(codes))
+    squared, found = cells.nearest(questions, 10, probes=1000)
+    assert np.allclose(squared, np.sort(every, axis=1)[:, :10], atol=1e-4)
+    # Equal distances may come in any order.
+    column = {int(number): k for k, number in enumerate(ids)}
+    again = np.array([[every[r, column[int(number)]] for number in row] for r, row in enumerate(found)])
+    assert np.allclose(again, squared, atol=1e-4)
+
+
+def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes, Ids]) -> None:
+    codes, ids = landmarks
+    cells, questions = filled(codes, ids, 64), asked(codes, 300, 3)
+    every = squared_distances(decode(questions), decode(codes))
+    squared, _ = cells.nearest(questions, 1, probes=8)
+    assert np.mean(squared[:, 0] < every.min(axis=1) + 1e-4) > 0.9
+
+
+def test_what_is_removed_is_gone_and_the_rest_is_kept(landmarks: tuple[Codes, Ids]) -> None:
+    codes, ids = landmarks
+    cells = filled(codes[:2000], ids[:2000], 64)
+    cells.add(codes[2000:], ids[2000:])
+    cells.remove(10_000, 20_000)
+    left = (ids < 10_000) | (ids >= 20_000)
+    kept_codes, kept_ids = contents(cells)
+    order = np.argsort(ids[left])
+    assert np.array_equal(kept_ids, ids[left][order]) and np.array_equal(kept_codes, codes[left][order])
+    assert len(cells) == left.sum()
+
+
+def test_the_same_landmarks_make_the_same_cells(landmarks: tuple[Codes, Ids]) -> None:
+    codes, ids = landmarks
+    questions = asked(codes, 100, 4)
+    one, two = (filled(codes, ids, 64).nearest(questions, 5, probes=2) for _ in range(2))
+    assert np.array_equal(one[1], two[1]) and np.array_equal(one[0], two[0])
+
+
+def test_fewer_landmarks_than_cells() -> None:
+    codes = quantise(random_vectors(3, np.random.default_rng(5)))
+    cells = filled(codes, np.arange(3), 64)
+    squared, ids = cells.nearest(codes, 4, probes=64)
+    assert ids[:, 0].tolist() == [0, 1, 2] and np.allclose(squared[:, 0], 0.0) and (ids[:, 3] == -1).all()
+
+
+@pytest.mark.parametrize("told", ["all", "others"])
+def test_what_is_forgotten_where_it_lies_is_gone_like_what_is_looked_for(
+    landmarks: tuple[Codes, Ids], told: str
+) -> None:
+    codes, ids = landmarks
+    ids = np.argsort(np.argsort(ids))
+    cells, searched = filled(codes, ids, 64), filled(codes, ids, 64)
+    lists = cells._index
+    for first in (0, 700, 2900):
+        gone = codes[(ids >= first) & (ids < first + 100)]
+        # Whoever is wrong about the codes makes it slow, not false.
+        cells.remove(first, first + 100, gone[::-1] if told == "all" else 63 - gone)
+        searched.remove(first, first + 100)
+    assert len(cells) == len(searched) == 2700
+    for one, other in zip(contents(cells), contents(searched), strict=True):
+        assert np.array_equal(one, other)
+    assert sum(lists.invlists.list_size(k) for k in range(lists.nlist)) == 2700
+    questions = asked(codes, 50, 4)
+    for one, other in zip(cells.nearest(questions, 8, 64), searched.nearest(questions, 8, 64), strict=True):
+        assert np.array_equal(np.sort(one, axis=1), np.sort(other, axis=1))
+    cells.add(codes[:100], np.arange(10_000, 10_100))
+    assert len(cells) == 2800

@@ -1,0 +1,287 @@
+"""The place index against exhaustive search."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.descriptor import decode, quantise
+from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.query import View
+from mapweave.mapserver.retrieval import place_index
+from mapweave.mapserver.retrieval.inverted_file import InvertedFile
+from mapweave.mapserver.retrieval.landmark_index import MOST_WITHIN, LandmarkIndexSettings
+from mapweave.mapserver.retrieval.place_index import MOST_LANDMARKS, SLOT_BITS, PlaceIndex, PlaceIndexSettings
+from mapweave.merge.pose_graph.candidates import overlaps
+from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
+
+
+@pytest.fixture(scope="module")
+def building() -> tuple[World, list[Node], list[Pose2]]:
+    """Four rooms, six nodes in each."""
+    rng = np.random.default_rng(1)
+    rooms = [room(5.0 * k, 0, 5, 4, 500, rng) for k in range(4)]
+    world = rooms[0] + rooms[1] + rooms[2] + rooms[3]
+    tour = [
+        Pose2(5.0 * r + rng.uniform(1.5, 3), rng.uniform(1.5, 2.5), k) for r in range(4) for k in range(6)
+    ]
+    return world, take_map(world, MapId("a", 1), tour, rng)[0], tour
+
+
+def filled(nodes: list[Node], settings: PlaceIndexSettings | None = None) -> PlaceIndex:
+    index = PlaceIndex(settings)
+    for node in nodes:
+        index.add(node)
+    return index
+
+
+def brute_force(nodes: list[Node], view: View, s: PlaceIndexSettings) -> dict[NodeId, float]:
+    """The votes by plain loops over all descriptors of all nodes."""
+    scores = dict.fromkeys((node.id for node in nodes), 0.0)
+    everything = [(v, node.id) for node in nodes for v in decode(node.landmarks.codes)]
+    for feature in decode(view.codes):
+        nearest = sorted((float(((feature - v) ** 2).sum()), node) for v, node in everything)[: s.votes]
+        best: dict[NodeId, float] = {}
+        for squared, node in nearest:
+            if squared < s.reach**2:
+                best[node] = max(best.get(node, 0.0), 1 - squared / s.reach**2)
+        for node, weight in best.items():
+            scores[node] += weight / np.sqrt(len(best))
+    return scores
+
+
+def test_scores_against_brute_force(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    few, s = nodes[:8], PlaceIndexSettings(votes=6)
+    view, _ = take_view(world, tour[2], np.random.default_rng(2))
+    view = View(view.pixels[:40], view.codes[:40], view.camera)
+    expected = brute_force(few, view, s)
+    found = filled(few, s).query(view, k=8)
+    assert found
+    for node, score in found:
+        assert score == pytest.approx(expected[node], rel=1e-3)
+    assert [node for node, _ in found] == sorted(
+        (n for n in expected if expected[n] > 0), key=lambda n: -expected[n]
+    )
+
+
+def test_the_right_place_comes_first(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    index, rng = filled(nodes), np.random.default_rng(3)
+    first = 0
+    for node, stop in zip(nodes, tour, strict=True):
+        view, _ = take_view(world, stop @ Pose2(0.1, -0.1, 0.05), rng)
+        first += index.query(view, 1)[0][0] == node.id
+    assert first >= 22
+
+
+def test_overlaps_are_those_of_the_exhaustive_table(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    _, nodes, _ = building
+    table = overlaps(nodes)
+    index = filled(nodes)
+    assert len(table) > 10
+    for node in nodes:
+        expected = {(a if b == node.id else b): v for (a, b), v in table.items() if node.id in (a, b)}
+        found = index.overlaps(node, {}.get)
+        assert set(found) == set(expected)
+        for other, value in found.items():
+            assert value == pytest.approx(expected[other], rel=1e-3)
+
+
+def test_nodes_whose_landmarks_are_all_alike_cost_no_more_than_others() -> None:
+    """Pairs of them would grow by the square: 12 million for the third such node."""
+    rng, index = np.random.default_rng(5), PlaceIndex()
+    nodes = []
+    for k in range(3):
+        vectors = np.repeat(random_vectors(1, np.random.default_rng(6)), 2000, axis=0)
+        codes = quantise(vectors + rng.normal(0.0, 0.005, vectors.shape))
+        depths = np.full(2000, 2.0, np.float32)
+        marks = Landmarks(np.ones((2000, 2), np.float32), codes, depths, 0.1 * depths)
+        pose = PoseGaussian(Pose2(), np.zeros((3, 3)))
+        nodes.append(Node(NodeId("a", 1, k), k, pose, CAMERA, marks))
+        index.add(nodes[-1])
+    assert len(index.landmarks) == 3 * MOST_LANDMARKS
+    told = index.landmarks.within(nodes[0].landmarks.codes[:10], 0.5)
+    assert told is not None and np.bincount(told[0]).max() <= MOST_WITHIN
+    # The first of equals are told: they need not be of every node.
+    assert index.overlaps(nodes[2], {}.get).keys() <= {nodes[0].id, nodes[1].id}
+    index.remove(nodes[1].id, nodes[1].landmarks.codes)
+    assert len(index.landmarks) == 2 * MOST_LANDMARKS
+
+
+def test_overlaps_in_a_large_fleet_are_exact_of_those_that_are_compared(
+    building: tuple[World, list[Node], list[Pose2]],
+) -> None:
+    _, nodes, _ = building
+    table, known = overlaps(nodes), {node.id: node for node in nodes}
+    landmarks = LandmarkIndexSettings(small=300, exact=600)
+    few, all_of_them = (
+        filled(nodes, PlaceIndexSettings(landmarks=landmarks, compared=compared)) for compared in (3, 99)
+    )
+    assert few.landmarks.within(nodes[0].landmarks.codes, 0.5) is None
+    missed = 0
+    for node in nodes:
+        expected = {(a if b == node.id else b): v for (a, b), v in table.items() if node.id in (a, b)}
+        found = all_of_them.overlaps(node, known.get)
+        assert all(found[other] == pytest.approx(expected[other], rel=1e-3) for other in found)
+        missed += len(expected) - len(found)
+        best = few.overlaps(node, known.get)
+        assert len(best) <= 3 and best.items() <= found.items() and node.id not in best
+    assert missed <= 0.1 * 2 * len(table)
+    assert few.overlaps(nodes[0], {}.get) == {}
+
+
+def test_added_is_found_at_once_and_removed_never(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    index = filled(nodes[:-1])
+    view, _ = take_view(world, tour[-1], np.random.default_rng(4))
+    last = nodes[-1]
+    assert last.id not in dict(index.query(view, 99))
+    index.add(last)
+    assert index.query(view, 1)[0][0] == last.id and last.id in index
+    assert last.id not in dict(index.query(view, 99, exclude=[last.id]))
+    index.remove(last.id)
+    index.remove(last.id)
+    assert last.id not in dict(index.query(view, 99)) and last.id not in index
+    assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes[:-1])
+
+
+def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    _, nodes, _ = building
+    index = filled(nodes)
+    before = len(index.landmarks)
+    index.add(nodes[3])
+    assert len(index.landmarks) == before and len(index) == len(nodes)
+
+
+def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=500, exact=1500)))
+    assert index.landmarks._flat is None
+    rng = np.random.default_rng(5)
+    hits = 0
+    for node, stop in zip(nodes, tour, strict=True):
+        view, _ = take_view(world, stop, rng)
+        hits += node.id in dict(index.query(view, 3))
+    assert hits >= 23
+    index.remove(nodes[0].id)
+    index.add(nodes[0])
+    assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes)
+
+
+@pytest.mark.parametrize("told", ["its own", "some of them", "another's", "none"])
+def test_a_node_is_gone_whatever_one_says_of_its_landmarks(
+    building: tuple[World, list[Node], list[Pose2]], told: str
+) -> None:
+    nodes = building[1]
+    index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=100, exact=100)))
+    index.extend(nodes)
+    before, codes = len(index.landmarks), nodes[3].landmarks.codes
+    known = {"its own": codes, "some of them": codes[:5], "another's": nodes[4].landmarks.codes, "none": None}
+    index.remove(nodes[3].id, known[told])
+    assert len(index.landmarks) == before - len(codes)
+    left = np.concatenate([block.ids >> SLOT_BITS for block in index.landmarks.blocks()])
+    assert set(left.tolist()) == set(index.slots.values())
+
+
+@pytest.mark.parametrize("few", [0, 1000])
+def test_what_is_not_kept_is_gone_however_much_it_is(
+    building: tuple[World, list[Node], list[Pose2]], few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(place_index, "FEW_GONE", few)
+    searched: list[bool] = []
+    real = InvertedFile.remove
+
+    def remove(cells: InvertedFile, first: int, last: int, codes: NDArray[np.uint8] | None = None) -> None:
+        searched.append(codes is None)
+        real(cells, first, last, codes)
+
+    monkeypatch.setattr(InvertedFile, "remove", remove)
+    nodes = building[1]
+    index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=100, exact=100)))
+    index.extend(nodes)
+    kept = [node.id for node in nodes[::3]]
+    assert index.retain(kept) == len(nodes) - len(kept) == len(searched)
+    assert all(searched) if few else not any(searched)
+    assert set(index.slots) == set(kept)
+    assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes[::3])
+    assert index.retain(kept) == 0
+
+
+def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    view, _ = take_view(world, tour[0], np.random.default_rng(6))
+    empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), CAMERA)
+    assert PlaceIndex().query(view) == [] and filled(nodes[:1]).query(empty) == []
+    bare = Node(NodeId("a", 1, 99), 0, nodes[0].map_from_robot, CAMERA, Landmarks.empty())
+    index = filled([bare])
+    assert index.query(view) == [] and index.overlaps(bare, {}.get) == {} and len(index) == 1
+    index.remove(bare.id)
+    assert len(index) == 0
+
+
+def everywhere() -> PlaceIndexSettings:
+    """Cells, of which all are searched: then nothing may be missing."""
+    landmarks = LandmarkIndexSettings(small=300, growth=2.0, probes=10_000)
+    return PlaceIndexSettings(landmarks=landmarks)
+
+
+def test_cells_of_which_all_are_searched_answer_like_no_cells(
+    building: tuple[World, list[Node], list[Pose2]],
+) -> None:
+    world, nodes, tour = building
+    plain, cells = filled(nodes), filled(nodes, everywhere())
+    for index in (plain, cells):
+        index.remove(nodes[4].id)
+        index.add(nodes[7])
+    assert cells.landmarks.means is not None and len(cells.landmarks) == len(plain.landmarks)
+    for stop in tour[::5]:
+        view, _ = take_view(world, stop, np.random.default_rng(7))
+        one, two = plain.query(view, 6), cells.query(view, 6)
+        assert [score for _, score in one] == pytest.approx([score for _, score in two], rel=1e-3)
+        assert {node for node, _ in one[:3]} == {node for node, _ in two[:3]}
+
+
+def test_many_at_once_are_the_same_as_one_by_one(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    world, nodes, tour = building
+    one, many = filled(nodes), PlaceIndex()
+    many.extend([*nodes, nodes[2]])
+    view, _ = take_view(world, tour[3], np.random.default_rng(8))
+    assert one.query(view, 9) == many.query(view, 9) and len(many.landmarks) == len(one.landmarks)
+
+
+def test_cells_are_learned_beside_the_questions(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    """What comes and goes while new cells are learned is in them."""
+    world, nodes, tour = building
+    landmarks = LandmarkIndexSettings(small=300, exact=600, growth=2.0, patience=500, probes=10_000)
+    index = PlaceIndex(PlaceIndexSettings(landmarks=landmarks))
+    index.extend(nodes[:8])
+    index.add(nodes[8])
+    index.remove(nodes[0].id)
+    index.extend(nodes[9:])
+    for stop, node in zip(tour[9:12], nodes[9:12], strict=True):
+        view, _ = take_view(world, stop, np.random.default_rng(9))
+        assert node.id in dict(index.query(view, 3)), "searchable at once"
+    index.settle()
+    plain = filled(nodes[1:])
+    assert len(index.landmarks) == len(plain.landmarks)
+    view, _ = take_view(world, tour[5], np.random.default_rng(10))
+    ours, theirs = dict(index.query(view, 5)), dict(plain.query(view, 5))
+    assert set(ours) == set(theirs)
+
+
+def test_an_index_that_cannot_learn_says_so_and_goes_on(
+    building: tuple[World, list[Node], list[Pose2]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    world, nodes, tour = building
+    monkeypatch.setattr("mapweave.mapserver.retrieval.landmark_index.InvertedFile", None)
+    index = PlaceIndex(
+        PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=300, growth=2.0, patience=300))
+    )
+    index.extend(nodes)
+    index.settle()
+    view, _ = take_view(world, tour[1], np.random.default_rng(11))
+    assert index.query(view, 1)[0][0] == nodes[1].id
+    assert "could not be made faster" in caplog.text

@@ -1,0 +1,46 @@
+"""What nodes get, against plain loops."""
+
+import numpy as np
+import pytest
+
+from mapweave.mapserver.retrieval import voting
+from mapweave.merge.pose_graph.candidates import overlap
+
+
+def test_votes_against_plain_loops() -> None:
+    rng = np.random.default_rng(1)
+    squared = np.sort(rng.uniform(0, 0.6, (40, 7)), axis=1).astype(np.float32)
+    slots = rng.integers(-1, 9, (40, 7))
+    expected = dict.fromkeys(range(9), 0.0)
+    for distances, whose in zip(squared, slots, strict=True):
+        best: dict[int, float] = {}
+        for d, slot in zip(distances.tolist(), whose.tolist(), strict=True):
+            if slot >= 0 and d < 0.5**2:
+                best[slot] = max(best.get(slot, 0.0), 1 - d / 0.5**2)
+        for slot, weight in best.items():
+            expected[slot] += weight / np.sqrt(len(best))
+    found, scores = voting.votes(squared, slots, 0.5)
+    assert dict(zip(found.tolist(), scores.tolist(), strict=True)) == pytest.approx(
+        {slot: score for slot, score in expected.items() if score > 0}
+    )
+
+
+def test_nobody_votes_for_what_is_too_far() -> None:
+    found, scores = voting.votes(np.full((3, 2), 1.0, np.float32), np.array([[1, 2]] * 3), 0.5)
+    assert len(found) == len(scores) == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_overlaps_against_one_node_at_a_time(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(0, 400))
+    rows, columns = rng.integers(0, 30, n), rng.integers(0, 150, n)
+    slots, squared = rng.integers(0, 12, n) ** 2, rng.uniform(0, 0.25, n).astype(np.float32)
+    expected = {
+        int(slot): overlap(rows[slots == slot], columns[slots == slot], squared[slots == slot], 0.5)
+        for slot in set(slots.tolist())
+    }
+    found, values = voting.overlaps(rows, columns, squared, slots, 0.5, 3.0)
+    assert dict(zip(found.tolist(), values.tolist(), strict=True)) == pytest.approx(
+        {slot: value for slot, value in expected.items() if value >= 3.0}
+    )

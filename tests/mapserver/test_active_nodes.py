@@ -1,0 +1,135 @@
+"""What questions are answered from: not from retired maps, not from landmarks that have gone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty, View
+from mapweave.mapserver.active_nodes import ActiveNodes, without_faded
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.merging.merger import Merger
+from synthetic.world import World, room, take_map, take_view
+
+HERE, THERE = MapId("a", 1), MapId("b", 1)
+RETIRED = ManualConstraint((THERE, THERE), True, "anna", 1, "rebuilt")
+
+
+class Two:
+    """Two robots in two rooms that share nothing."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(6)
+        self.merger, self.worlds, self.truth = Merger(), dict[MapId, World](), dict[NodeId, Pose2]()
+        for map_id in (HERE, THERE):
+            self.worlds[map_id] = room(0, 0, 5, 4, 700, rng)
+            tour = [Pose2(1.5 + 0.7 * k, 2.0, 0.2 * k) for k in range(3)]
+            nodes, edges = take_map(self.worlds[map_id], map_id, tour, rng)
+            self.truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
+            bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+            for number, body in enumerate(bodies, start=1):
+                self.merger.on_change(Change(map_id, number, 0, body))
+
+    def answers(self) -> Answers:
+        return Answers.of(self.merger, self.merger.merged(), self.merger.node)
+
+    def view(self, map_id: MapId) -> View:
+        return take_view(self.worlds[map_id], Pose2(2.1, 1.95, 0.15), np.random.default_rng(1))[0]
+
+
+@pytest.fixture(scope="module")
+def two() -> Two:
+    return Two()
+
+
+def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two) -> None:
+    for rulings, known in (([], True), ([RETIRED], False), ([RETIRED, replace(RETIRED, apart=False)], True)):
+        two.merger.rule(ManualConstraints(rulings))
+        answers = two.answers()
+        assert answers.relocalizer.answer(two.view(HERE)).certainty is Certainty.FOUND
+        there = answers.relocalizer.answer(two.view(THERE))
+        assert (there.certainty is Certainty.FOUND) == known
+        start, goal = (node for node in sorted(two.truth) if node.map == THERE and node.number in (1, 5))
+        route = answers.router.route(start, goal)
+        assert bool(route.legs) == known
+        if not known:
+            assert "retired by anna" in route.reason and '"rebuilt"' in route.reason
+            assert "1 retired" in answers.merged.summary()
+
+
+def told(merger: Merger, views: Sequence[View]) -> list[Certainty]:
+    """Answers once it is known what all nodes look like, as on a server that has nothing else to do."""
+    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
+    while relocalizer.prepare(50):
+        pass
+    return [relocalizer.answer(view).certainty for view in views]
+
+
+def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
+    rng = np.random.default_rng(4)
+    world, maps = room(0, 0, 5, 4, 700, rng), [MapId(agent, 1) for agent in "abc"]
+    logs: dict[MapId, list[Change]] = {}
+    for map_id in maps:
+        tour = [Pose2(*rng.uniform([1.2, 1.0], [3.8, 3.0]), 1.26 * k) for k in range(10)]
+        nodes, edges = take_map(world, map_id, tour, rng)
+        bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+        logs[map_id] = [Change(map_id, number, 0, body) for number, body in enumerate(bodies, start=1)]
+    views = [take_view(world, Pose2(2.5, 2.0, 0.5 * k), rng)[0] for k in range(12)]
+    merger, retired = Merger(), ManualConstraint((maps[2], maps[2]), True, "anna", 1, "moved")
+    for map_id in maps[:2]:
+        for change in logs[map_id]:
+            merger.on_change(change)
+    before = told(merger, views)
+    for change in logs[maps[2]]:
+        merger.on_change(change)
+    with_it = told(merger, views)
+    assert merger.merged().joined(maps[0], maps[2])
+    merger.rule(ManualConstraints([retired]))
+    assert told(merger, views) == before and before.count(Certainty.FOUND) >= 8
+    # A node that comes meanwhile looks like some of the retired map's, and that is known once it is taken
+    # back.
+    late = take_map(world, MapId("d", 1), [Pose2(2.3, 2.0, 0.6)], rng)[0]
+    merger.on_change(Change(MapId("d", 1), 1, 0, NodePut(late[0])))
+    told(merger, views)
+    merger.rule(ManualConstraints([retired, replace(retired, apart=False)]))
+    assert told(merger, views) == with_it
+    alike = merger.alike.of(late[0], merger.index, merger.node, lambda a, b: None)
+    assert any(one.other.id.map == maps[2] for one in alike)
+
+
+def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
+    two.merger.rule(ManualConstraints([RETIRED]))
+    merged = two.merger.merged()
+    rng = np.random.default_rng(3)
+    nodes, _ = take_map(two.worlds[THERE], THERE, [Pose2(2.0, 2.0, 0.1)], rng)
+    late = replace(nodes[0], id=NodeId("b", 1, 99))
+    two.merger.on_change(Change(THERE, 99, 0, NodePut(late)))
+    places = ActiveNodes(two.merger.index, two.merger.node, merged)
+    assert all(node.map == HERE for node, _ in places.query(two.view(THERE), 5))
+    two.merger.rule(ManualConstraints())
+    assert any(node == late.id for node, _ in two.merger.index.query(two.view(THERE), 5))
+
+
+def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
+    two.merger.rule(ManualConstraints())
+    merged = two.merger.merged()
+    one = NodeId("a", 1, 3)
+    node = merged.maps[HERE].nodes[one]
+    gone = np.zeros(len(node.landmarks), np.bool_)
+    gone[::3] = True
+    faded = replace(merged, faded={one: gone})
+    shown = without_faded(node, faded)
+    assert np.array_equal(shown.landmarks.pixels, node.landmarks.pixels[~gone])
+    answers = Answers.of(two.merger, faded, two.merger.node)
+    legs = answers.router.route(NodeId("a", 1, 1), NodeId("a", 1, 5)).legs
+    assert [len(leg.node.landmarks) for leg in legs if leg.node.id == one] == [len(shown.landmarks)]
+    assert ActiveNodes(two.merger.index, two.merger.node, merged).node(one) is node
+    anew = replace(node, landmarks=node.landmarks.take(np.arange(len(gone) - 1)))
+    assert without_faded(anew, faded) is anew, "it is known better than what was found out"

@@ -1,0 +1,259 @@
+"""The desk: in time or refused, and who is refused comes back when there is room."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.errors import Busy, SettingsError
+from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
+from mapweave.mapserver.schedule import LockstepSchedule
+
+
+class Clock:
+    """Time that passes when the test says so."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Counter:
+    """A desk whose workers are all held up until they are let go."""
+
+    def __init__(self, settings: AdmissionSettings) -> None:
+        self.clock = Clock()
+        self.desk = AdmissionControl(settings, self.clock)
+        self.go = threading.Event()
+        self.taken = self.asked = 0
+
+    def ask(self, ticket: int | None = None) -> float:
+        """One more question: 0 if it is taken on, else the seconds after which to ask again."""
+        self.asked += 1
+        try:
+            self.desk.submit(lambda: self.go.wait(60), self.asked if ticket is None else ticket)
+        except Busy as busy:
+            return busy.retry_after
+        self.taken += 1
+        return 0.0
+
+    def end(self) -> None:
+        self.go.set()
+        self.desk.close()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_is_unusual_teaches_the_desk_nothing(workers: int) -> None:
+    """A person's question takes seconds; no robot is turned away for it afterwards."""
+    clock = Clock()
+    desk = AdmissionControl(AdmissionSettings(workers, first_guess=0.1), clock)
+
+    def work() -> None:
+        clock.now += 8.0
+
+    desk.submit(work, usual=False).result(20.0)
+    assert desk.counters()["answer_ms"] == 100.0 and desk.counters()["answered"] == 1
+    desk.submit(work).result(20.0)
+    assert float(desk.counters()["answer_ms"]) > 800.0
+    desk.close()
+
+
+@pytest.mark.parametrize(("workers", "seconds", "in_time"), [(1, 0.1, 0.65), (2, 0.05, 0.51), (4, 0.2, 0.23)])
+def test_what_is_taken_on_is_answered_in_time(workers: int, seconds: float, in_time: float) -> None:
+    counter = Counter(AdmissionSettings(workers, in_time=in_time, first_guess=seconds))
+    while not counter.ask():
+        assert counter.taken < 1000
+    # The last one taken waits for all that were behind those at work; one more would wait too long.
+    behind = counter.taken - workers
+    assert behind * seconds / workers + seconds <= in_time or behind == 0
+    assert (behind + 1) * seconds / workers + seconds > in_time
+    counter.end()
+
+
+def test_a_free_worker_takes_on_whatever_it_costs() -> None:
+    counter = Counter(AdmissionSettings(2, in_time=0.1, first_guess=5.0))
+    assert [counter.ask() > 0.0 for _ in range(4)] == [False, False, True, True]
+    counter.end()
+
+
+def test_a_crowd_that_was_refused_comes_back_one_after_the_other() -> None:
+    """Fifty ask at once and keep to what they are told: the queue never fills again."""
+    workers, seconds = 2, 0.05
+    settings = AdmissionSettings(workers, in_time=0.5, first_guess=seconds)
+    counter = Counter(settings)
+    pauses = [pause for pause in (counter.ask() for _ in range(50)) if pause]
+    assert counter.taken + len(pauses) == 50
+    assert pauses == sorted(pauses)
+    gaps = [b - a for a, b in itertools.pairwise(pauses)]
+    assert gaps == pytest.approx([seconds / workers] * len(gaps))
+    # By hand: from now on one is done each 25 ms, and the refused come as they were told.
+    open_ones = counter.taken
+    step = seconds / workers
+    for k, pause in enumerate(pauses):
+        waiting = open_ones + k - pause / step - workers
+        assert waiting * step + seconds <= settings.in_time
+    assert pauses[-1] < 50 * step + 0.1, "and nobody waits for nothing"
+    counter.end()
+
+
+class Simulated:
+    """A desk whose time is simulated: each question takes as long, and every robot asks on and on.
+
+    Only the desk's own rules are used; who is at work and when it ends is told by hand.
+    """
+
+    def __init__(self, robots: int, seconds: float, keep: bool, rng: np.random.Generator) -> None:
+        self.clock = Clock()
+        self.desk = AdmissionControl(AdmissionSettings(1, in_time=0.7, first_guess=seconds), self.clock)
+        self.pool = self.desk._pool
+        queue: list[tuple[float, int]] = []  # when it came, and whose it is
+
+        class Waiting:
+            def submit(self, _work: object, _call: object, ticket: int, *_rest: object) -> None:
+                queue.append((0.0, ticket))
+
+        self.desk._pool = Waiting()  # type: ignore[assignment]
+        begin = {robot: 100.0 + 0.01 * robot for robot in range(robots)}
+        due, number = dict(begin), dict.fromkeys(begin, 0)
+        self.waits: list[float] = []
+        self.refusals = 0
+        free = 100.0
+        while self.clock.now < 200.0:
+            robot = min(due, key=lambda one: due[one]) if due else None
+            if queue and (robot is None or free <= due[robot]):
+                self.clock.now = max(self.clock.now, free)
+                _, ticket = queue.pop(0)
+                done, asker = self.clock.now + seconds, ticket % robots
+                free = done
+                with self.desk._lock:
+                    self.desk._open -= 1
+                self.waits.append(done - begin[asker])
+                number[asker] += 1
+                begin[asker] = due[asker] = done + rng.uniform(0.0, 0.01)
+                continue
+            assert robot is not None
+            self.clock.now = max(self.clock.now, due[robot])
+            ticket = robot + robots * number[robot] if keep else int(rng.integers(1 << 40)) * robots + robot
+            try:
+                self.desk.submit(lambda: None, ticket)
+            except Busy as busy:
+                self.refusals += 1
+                due[robot] = self.clock.now + busy.retry_after
+                continue
+            if len(queue) == 1:
+                free = max(free, self.clock.now)
+            del due[robot]
+        self.longest = max(self.clock.now - since for since in begin.values())
+        self.pool.shutdown()
+
+
+def test_everybody_has_a_turn() -> None:
+    """Fifty robots ask on and on: with appointments, none waits much longer than a round takes."""
+    seconds, robots = 0.06, 50
+    fair = Simulated(robots, seconds, keep=True, rng=np.random.default_rng(1))
+    unfair = Simulated(robots, seconds, keep=False, rng=np.random.default_rng(1))
+    whole_round = robots * seconds
+    assert max(*fair.waits, fair.longest) < 1.5 * whole_round
+    assert unfair.longest > 3.0 * whole_round, "without them, who comes first goes on coming first"
+    # The worker is never without work for long, and nobody comes in vain more than about once.
+    assert len(fair.waits) > 0.95 * 100.0 / seconds
+    assert fair.refusals < 1.1 * len(fair.waits)
+
+
+def test_an_appointment_has_precedence_and_is_lost_by_who_does_not_come() -> None:
+    counter = Counter(AdmissionSettings(1, in_time=0.5, first_guess=0.1))
+    while not counter.ask():
+        pass
+    pause = counter.ask(ticket=77)
+    assert pause > 0.0
+    assert counter.ask(ticket=88) > pause
+    counter.clock.now += pause
+    # Nobody was served meanwhile: one more would be too late, but who was told to come is taken on.
+    assert counter.ask(ticket=99) > 0.0
+    assert counter.ask(ticket=77) == 0.0
+    counter.clock.now += 30.0
+    assert counter.ask(ticket=88) > 0.0
+    counter.end()
+
+
+def test_the_time_that_a_question_takes_is_learned() -> None:
+    clock = Clock()
+    desk = AdmissionControl(AdmissionSettings(1, first_guess=0.01, smoothing=0.5), clock)
+
+    def work() -> None:
+        clock.now += 0.4
+
+    for _ in range(12):
+        desk.submit(work, 1).result(5)
+    assert desk.counters() == {"answered": 12, "busy": 0, "open": 0, "answer_ms": pytest.approx(400, abs=1)}
+    desk.close()
+
+
+def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
+    for executor in (None, LockstepSchedule().executor(1)):
+        desk = AdmissionControl(AdmissionSettings(1), executor=executor)
+        assert desk.submit(lambda: 3 + 4, 1).result(5) == 7
+        for _ in range(3):
+            with pytest.raises(ZeroDivisionError):
+                desk.submit(lambda: 1 / 0, 1).result(5)
+        assert desk.submit(lambda: "still here", 1).result(5) == "still here"
+        assert desk.counters()["open"] == 0
+        desk.close()
+        desk.close()
+
+
+def test_what_has_waited_too_long_is_refused_at_its_turn() -> None:
+    """Each question takes four times as long as was thought."""
+    clock = Clock()
+    settings = AdmissionSettings(1, in_time=0.6, too_late=1.5, first_guess=0.1)
+    desk, go, waited = AdmissionControl(settings, clock), threading.Event(), []
+
+    def work(came: float) -> None:
+        assert go.wait(60)
+        waited.append(clock.now - came)
+        clock.now += 0.4
+
+    futures = [desk.submit(lambda: work(100.0), k) for k in range(5)]
+    go.set()
+    refusals = [future.exception(10) for future in futures]
+    assert waited == pytest.approx([0.0, 0.4])
+    for refusal in refusals[2:]:
+        assert isinstance(refusal, Busy)
+        assert 0.0 < refusal.retry_after <= settings.longest_pause
+    assert refusals[:2] == [None, None]
+    assert desk.counters()["busy"] == 3
+    assert desk.counters()["open"] == 0
+    desk.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("workers", -1), ("workers", 65), ("in_time", 0.0), ("in_time", float("nan")), ("too_late", 0.5),
+     ("first_guess", 0.0), ("longest_pause", -1.0), ("smoothing", 0.0), ("smoothing", 1.5)],
+)  # fmt: skip
+def test_settings_that_cannot_work(name: str, value: float) -> None:
+    with pytest.raises(SettingsError, match=f"{value:g}|{name}"):
+        AdmissionSettings(**{name: value})
+
+
+def test_closing_finishes_what_was_taken_on() -> None:
+    desk = AdmissionControl(AdmissionSettings(1, in_time=60.0))
+    done: list[int] = []
+    for k in range(20):
+        desk.submit(lambda k=k: done.append(k), k)
+    desk.close()
+    assert done == list(range(20))
+
+
+def test_in_lockstep_the_asker_works_and_nobody_is_refused() -> None:
+    schedule = LockstepSchedule()
+    desk = AdmissionControl(
+        AdmissionSettings(1, in_time=0.1, first_guess=100.0), schedule.monotonic, schedule.executor(1)
+    )
+    threads = [desk.submit(threading.current_thread, k).result() for k in range(50)]
+    assert set(threads) == {threading.current_thread()}

@@ -1,0 +1,230 @@
+"""What has become of the maps: told once, with its date, and kept on the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.map_history import BODIES, MOST_AT_ONCE, MapHistory
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.ruling_history import with_rulings
+from mapweave.merge.mutual_exclusion.collision import Collision
+from mapweave.merge.pose_graph.links import refuse
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.history_codec import (
+    KeptHistory,
+    decode_history,
+    decode_kept_history,
+    encode_history,
+    encode_kept_history,
+)
+from mapweave.wire.packing import pack
+from synthetic.world import room, take_map
+
+A, B = MapId("a", 1), MapId("b", 1)
+APART = ManualConstraints([ManualConstraint((A, B), True, "anna", 10**18, "two kitchens")])
+
+
+@pytest.fixture(scope="module")
+def merger() -> Merger:
+    """Two robots have looked around in one room."""
+    rng = np.random.default_rng(6)
+    world = room(0, 0, 5, 4, 700, rng)
+    merger = Merger()
+    for map_id in (A, B):
+        stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(4)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    return merger
+
+
+@pytest.fixture(scope="module")
+def one(merger: Merger) -> MergedMap:
+    merger.rule(ManualConstraints())
+    return merger.merged()
+
+
+@pytest.fixture(scope="module")
+def two(merger: Merger) -> MergedMap:
+    merger.rule(APART)
+    return merger.merged()
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    store = Store(tmp_path / "s0.sqlite")
+    yield store
+    store.close()
+
+
+def told(chronicle: MapHistory) -> list[tuple[MapEventKind, str]]:
+    return [(one.kind, one.words.split(":")[0].split(", by")[0]) for one in chronicle.happenings]
+
+
+JOINED = (MapEventKind.JOINED, "a.1 and b.1 are one map now")
+PARTED = (MapEventKind.PARTED, "a.1 and b.1 are no longer one map")
+
+
+def test_each_thing_is_told_once_with_its_time(one: MergedMap, two: MergedMap) -> None:
+    times = iter(range(10**18, 10**19, 10**9))
+    chronicle = MapHistory(clock=lambda: next(times))
+    for merged in (MergedMap.empty(), one, one, two, two, one):
+        chronicle.follow(merged)
+    assert told(chronicle) == [JOINED, PARTED, JOINED]
+    assert "two kitchens" in chronicle.happenings[1].words and chronicle.newest.startswith("a.1 and b.1")
+    stamps = [happening.stamp_ns for happening in chronicle.happenings]
+    assert stamps == sorted(stamps) and stamps[0] >= 10**18
+
+
+def test_a_server_that_starts_again_tells_only_what_is_new(
+    store: Store, one: MergedMap, two: MergedMap
+) -> None:
+    MapHistory(store).follow(one)
+    again = MapHistory(store)
+    # It merges before it has read its store if people's rulings come first.
+    again.follow(MergedMap.empty())
+    again.follow(one)
+    assert told(again) == [JOINED]
+    third = MapHistory(store)
+    third.follow(two)
+    assert told(third) == [JOINED, PARTED]
+    assert "refused (undone with all links between a.1 and b.1 by anna" in third.newest
+    assert MapHistory(store).happenings == third.happenings
+
+
+def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap) -> None:
+    chronicle = MapHistory(store, most=5)
+    for k in range(12):
+        chronicle.follow(two if k % 2 else one)
+    assert told(chronicle) == [PARTED, JOINED, PARTED, JOINED, PARTED] == told(MapHistory(store))
+
+
+def test_very_much_at_once_is_told_as_a_number(one: MergedMap) -> None:
+    many = {MapId(f"r{k}", 1): one.maps[A] for k in range(200)}
+    nodes = frozenset(next(iter(one.maps[A].nodes))._replace(agent=name.agent) for name in many)
+    chronicle = MapHistory()
+    chronicle.follow(replace(one, maps=many, links=(), components=(nodes,)))
+    assert len(chronicle.happenings) == MOST_AT_ONCE + 1
+    assert chronicle.newest == f"and {199 - MOST_AT_ONCE} more at once"
+
+
+def test_who_cannot_have_been_there_is_told_until_the_maps_are_one(
+    store: Store, one: MergedMap, two: MergedMap
+) -> None:
+    clash = Collision("a", "b", "hall", 40, 0.1, 12.0, 99.0)
+    seen = replace(clash, where="ahead")
+    assert all(any(words in one.reason for words in BODIES) for one in (clash, seen))
+    links = [link for link in one.links if {link.a.map, link.b.map} == {A, B}]
+    held = replace(two, refused=tuple(refuse(link, clash.reason) for link in links))
+    chronicle = MapHistory(store)
+    chronicle.follow(held)
+    chronicle.follow(replace(two, refused=tuple(refuse(link, seen.reason) for link in links)))
+    ((kind, _),) = told(chronicle)
+    assert kind is MapEventKind.KEPT_APART
+    assert chronicle.newest == (f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason})")
+    again = MapHistory(store)
+    again.follow(held)
+    assert again.happenings == chronicle.happenings, "told already"
+    again.follow(one)
+    again.follow(held)
+    # What came apart by it tells the reason itself.
+    assert [kind for kind, _ in told(again)] == [
+        MapEventKind.KEPT_APART,
+        MapEventKind.JOINED,
+        MapEventKind.PARTED,
+    ]
+    assert "same place at the same time" in again.newest
+
+
+def test_however_many_are_kept_apart_each_is_told_once(
+    one: MergedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mapweave.mapserver.map_history.MOST_APART", 3)
+    (link, *_) = (link for link in one.links if {link.a.map, link.b.map} == {A, B})
+    names = [MapId(f"r{k}", 1) for k in range(6)]
+    reason = Collision("a", "b", "hall", 40, 0.1, 12.0, 99.0).reason
+    refused = tuple(
+        refuse(replace(link, a=link.a._replace(agent="r0"), b=link.b._replace(agent=name.agent)), reason)
+        for name in names[1:]
+    )
+    parts = tuple(frozenset([link.a._replace(agent=name.agent)]) for name in names)
+    merged = MergedMap(dict.fromkeys(names, one.maps[A]), (), refused, parts, {})
+    chronicle = MapHistory()
+    for _ in range(3):
+        chronicle.follow(merged)
+    assert [kind for kind, _ in told(chronicle)] == [MapEventKind.KEPT_APART] * 3
+
+
+def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> None:
+    other = Merger()
+    for map_id in (A, B):
+        for body in one.maps[map_id].contents():
+            other.apply(map_id, body)
+    chronicle = MapHistory()
+    chronicle.follow(other.merged())
+    for node in list(one.maps[B].nodes):
+        other.apply(B, NodeRetired(node))
+    chronicle.follow(other.merged())
+    assert told(chronicle) == [JOINED]
+
+
+def test_a_damaged_record_is_begun_anew_and_says_so(store: Store, one: MergedMap) -> None:
+    store.put_result("history", b"rubbish")
+    chronicle = MapHistory(store)
+    (failed,) = chronicle.happenings
+    assert failed.kind is MapEventKind.FAILED and "damaged" in failed.words and chronicle.newest == ""
+    chronicle.failed(failed.words)
+    assert chronicle.happenings == (failed,), "told once"
+    chronicle.follow(one)
+    assert MapHistory(store).happenings == chronicle.happenings
+
+
+def test_a_disk_that_does_not_take_it_ends_nothing(
+    tmp_path: Path, one: MergedMap, two: MergedMap, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = Store(tmp_path / "s0.sqlite")
+    chronicle = MapHistory(store)
+    chronicle.follow(one)
+
+    def full(name: str, value: bytes) -> None:
+        raise InvalidFile("the disk is full")
+
+    store.put_result = full  # type: ignore[method-assign]
+    chronicle.follow(two)
+    assert told(chronicle) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
+    store.close()
+    store = Store(tmp_path / "s0.sqlite")
+    assert told(MapHistory(store)) == [JOINED], "the record of before is whole"
+    store.close()
+
+
+def test_rulings_stand_among_what_happened() -> None:
+    happenings = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
+    kinds = [one.kind for one in with_rulings(happenings, APART)]
+    assert kinds == [MapEventKind.JOINED, MapEventKind.RULED, MapEventKind.JOINED]
+    assert "two kitchens" in with_rulings((), APART)[0].words
+
+
+def test_it_comes_through_bytes() -> None:
+    happenings = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
+    assert decode_history(encode_history(happenings)) == happenings
+    kept = KeptHistory(happenings, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
+    assert decode_kept_history(encode_kept_history(kept)) == kept
+    with pytest.raises(InvalidValue, match="printable"):
+        encode_history([MapEvent(5, MapEventKind.PARTED, "two\nlines")])
+    assert decode_history(pack({"h": [[1, "danced", "x"], [6, "failed", "no"]]})) == happenings[1:]
+    for fields in ({"h": [[1, "joined"]]}, {"h": [[1, 2, "x"]]}, {"h": 5}, {}):
+        with pytest.raises(InvalidMessage):
+            decode_history(pack(fields))

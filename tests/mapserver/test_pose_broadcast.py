@@ -1,0 +1,202 @@
+"""Agents are told where their nodes lie in the merged map: what moved noticeably; all on request."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.agent.replication.merged_poses import MergedPoses
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.pose_broadcast import PoseBroadcast, PoseBroadcastSettings
+from mapweave.mapserver.server import MapServer
+from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.wire.bus import Bus, Sample
+from mapweave.wire.keys import Keys
+from mapweave.wire.pose_messages import PoseNews
+from tests.mapserver.conftest import MappedRoom
+from tests.waiting import eventually
+from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet
+
+KEYS = Keys("fleet")
+A, B = [NodeId("r0", 1, k) for k in range(1, 6)], [NodeId("r1", 4, k) for k in range(1, 4)]
+
+
+def graph(nodes: list[NodeId], shift: float = 0.0, turn: float = 0.0) -> PoseGraph:
+    """Nodes in a row, all of them shifted, m, and turned, rad."""
+    means = np.array([[k + shift, 0.0, turn] for k in range(len(nodes))])
+    return PoseGraph(min(nodes), tuple(nodes), means, None)
+
+
+def merged(*graphs: PoseGraph) -> MergedMap:
+    whole = replace(MergedMap.empty(), poses=Poses(graphs), graphs=graphs)
+    return replace(whole, components=tuple(frozenset(one.nodes) for one in graphs))
+
+
+class Told:
+    """A herald, and what it publishes."""
+
+    def __init__(self, fleet: Fleet, settings: PoseBroadcastSettings | None = None) -> None:
+        self.heard: list[PoseNews] = []
+        self.bus, self.agent = fleet.join(), fleet.join()
+        self.herald = PoseBroadcast(self.bus, KEYS, "s0", settings or PoseBroadcastSettings(beat=math.inf))
+        self.agent.subscribe(KEYS.poses("s0", "r0"), self._hear)
+        self.agent.subscribe(KEYS.server_status("s0"), lambda _: self._marks.append(1))
+        self._marks: list[int] = []
+        self._clock = count(0.0, 10.0)
+
+    def _hear(self, sample: Sample) -> None:
+        self.heard.append(PoseNews.decode(sample.payload, "r0"))
+
+    def tell(self, *graphs: PoseGraph) -> list[PoseNews]:
+        before = len(self.heard)
+        self.herald.tell(merged(*graphs), next(self._clock))
+        self.wait()
+        return self.heard[before:]
+
+    def wait(self) -> None:
+        """Until all has come that was published: what is published later comes later."""
+        seen = len(self._marks)
+        self.bus.publish(KEYS.server_status("s0"), b"")
+        eventually(lambda: len(self._marks) > seen)
+
+
+@pytest.fixture
+def memory() -> Iterator[MemoryFleet]:
+    fleet = MemoryFleet()
+    yield fleet
+    fleet.close()
+
+
+@pytest.fixture
+def zenoh() -> Iterator[ZenohFleet]:
+    fleet = ZenohFleet()
+    yield fleet
+    fleet.close()
+
+
+def test_a_jiggle_is_not_told_and_jiggles_add_up(memory: MemoryFleet) -> None:
+    told = Told(memory)
+    (first,) = told.tell(graph(A))
+    assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
+    assert told.tell(graph(A, 0.049)) == []
+    assert told.tell(graph(A, 0.0, math.radians(0.9))) == []
+    # Each step is small; what counts is how far it is from what was told.
+    steps = [told.tell(graph(A, 0.03 * k)) for k in range(1, 5)]
+    assert [len(news) for news in steps] == [0, 1, 0, 1]
+    (turned,) = told.tell(graph(A, 0.12, math.radians(1.1)))
+    assert turned.placed[A[2]].merged_from_node.vector == pytest.approx([2.12, 0, math.radians(1.1)])
+
+
+def test_only_those_that_moved_are_told_each_agent_of_its_own(memory: MemoryFleet) -> None:
+    told = Told(memory)
+    told.tell(graph(A), graph(B))
+    one = graph(A)
+    one.means[3, 1] = 0.2
+    (news,) = told.tell(one, graph(B, 5.0))
+    assert set(news.placed) == {A[3]}
+    # One component now, in the frame of the smallest node of all: same numbers, other frame.
+    (news,) = told.tell(graph([*A, *B]))
+    assert set(news.placed) == {A[3]}, "the frame of the first is that of both"
+    (reply,) = told.agent.ask(KEYS.poses("s0", "r1"), b"", 5.0)
+    assert {place.frame for place in PoseNews.decode(reply.payload, "r1").placed.values()} == {A[0]}
+
+
+def test_nodes_that_are_gone_are_told(memory: MemoryFleet) -> None:
+    told = Told(memory)
+    told.tell(graph(A))
+    (news,) = told.tell(graph(A[:-1]))
+    assert news.gone == (A[-1],) and not news.placed
+    (reply,) = told.agent.ask(KEYS.poses("s0", "r0"), b"", 5.0)
+    whole = PoseNews.decode(reply.payload, "r0")
+    assert set(whole.placed) == set(A[:-1]) and whole.after == 0 and whole.sequence == 2
+
+
+def test_much_is_told_in_pieces_and_seldom(memory: MemoryFleet) -> None:
+    told = Told(memory, PoseBroadcastSettings(most=2, beat=math.inf))
+    pieces = told.tell(graph(A))
+    assert [len(news.placed) for news in pieces] == [2, 2, 1]
+    assert [(news.after, news.sequence) for news in pieces] == [(0, 1), (1, 2), (2, 3)]
+    herald, heard = told.herald, told.heard
+    herald.tell(merged(graph(A, 1.0)), 100.0)
+    herald.tell(merged(graph(A, 2.0)), 101.9)
+    told.wait()
+    assert len(heard) == 6, "two seconds lie between"
+
+
+def kept(bus: Bus) -> MergedPoses:
+    return MergedPoses(bus, KEYS, "r0", "s0")
+
+
+def at(poses: MergedPoses, node: NodeId, x: float) -> Callable[[], bool]:
+    def there() -> bool:
+        place = poses.of(node)
+        return place is not None and abs(place.merged_from_node.x - x) < 1e-6
+
+    return there
+
+
+def test_what_is_lost_is_made_up_over_zenoh(zenoh: ZenohFleet) -> None:
+    """A late agent, lost news, lost last news, a server that starts again, and one that knows less."""
+    fast = PoseBroadcastSettings(every=0.0, beat=0.0)
+    server = zenoh.join()
+    herald = PoseBroadcast(server, KEYS, "s0", fast)
+    herald.tell(merged(graph(A)))
+    alive = server.announce(KEYS.server_alive("s0"))
+    poses = kept(zenoh.join())
+    eventually(at(poses, A[2], 2.0))
+    assert poses.count(A[0].map) == len(A) and poses.of(B[0]) is None
+    herald.tell(merged(graph(A, 1.0)))
+    eventually(at(poses, A[2], 3.0))
+    zenoh.cut()
+    herald.tell(merged(graph(A, 2.0)))
+    assert at(poses, A[2], 3.0)()
+    zenoh.mend()
+    assert server.wait_connected(30)
+
+    def beaten() -> bool:
+        herald.tell(merged(graph(A, 2.0)))
+        return at(poses, A[2], 4.0)()
+
+    eventually(beaten)
+    alive.close()
+    herald.close()
+    again = zenoh.join()
+    herald = PoseBroadcast(again, KEYS, "s0", fast)
+    herald.tell(merged(graph(A[:3], 7.0)))
+    alive = again.announce(KEYS.server_alive("s0"))
+    eventually(at(poses, A[2], 9.0))
+    assert poses.of(A[4]) is None and poses.count(A[0].map) == 3
+    herald.tell(merged(graph(A[:2], 7.0)))
+    eventually(lambda: poses.of(A[2]) is None)
+    poses.close()
+    alive.close()
+    herald.close()
+
+
+def test_a_map_server_tells_what_it_has_merged(
+    zenoh: ZenohFleet, mapped_room: Callable[[], MappedRoom]
+) -> None:
+    """From the store on the disk to an agent in another session, twice: the server starts again."""
+    room = mapped_room()
+    poses = kept(zenoh.join())
+    for _ in range(2):
+        bus = zenoh.join()
+        with MapServer(bus, KEYS, Path(room.path), "s0") as server:
+            assert server.settle(30)
+            eventually(lambda: all(poses.of(node) for node in room.truth))
+            first = min(room.truth)
+            for node in room.truth:
+                place = poses.of(node)
+                assert place is not None and place.frame == first
+                off = place.merged_from_node.inverse() @ (room.truth[first].inverse() @ room.truth[node])
+                assert off.distance(Pose2()) < 0.3
+        bus.close()
+    poses.close()

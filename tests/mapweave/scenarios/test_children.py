@@ -1,0 +1,81 @@
+"""Child processes: none is left behind, whatever becomes of who started them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from mapweave.processes import parent_watchdog
+from mapweave.scenarios.children import ChildFailed, Children, free_port
+from tests.waiting import eventually
+
+PARENT = """
+import sys, time
+from pathlib import Path
+from mapweave.scenarios.children import Children
+folder, endpoint = Path(sys.argv[1]), sys.argv[2]
+children = Children(folder)
+children.start("server", ["server", "--listen", endpoint, "--data", str(folder)])
+print(children.pid("server"), flush=True)
+time.sleep(60.0)
+"""
+
+
+def said(folder: Path) -> str:
+    log = folder / "server.log"
+    return log.read_text() if log.exists() else ""
+
+
+def runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # Whose parent is gone may stay as an entry without a process until somebody takes it away.
+    state = Path(f"/proc/{pid}/stat")
+    return not state.exists() or state.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_children_of_a_process_that_is_killed_end_by_themselves(tmp_path: Path, how: signal.Signals) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [sys.executable, "-c", PARENT, str(tmp_path), endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        try:
+            eventually(lambda: "listens at" in said(tmp_path))
+            assert runs(child)
+        finally:
+            parent.send_signal(how)
+    eventually(lambda: not runs(child))
+    assert "Traceback" not in said(tmp_path)
+
+
+def test_a_child_is_ended_and_one_that_failed_is_told(tmp_path: Path) -> None:
+    with Children(tmp_path) as children:
+        children.start(
+            "server", ["server", "--listen", f"tcp/127.0.0.1:{free_port()}", "--data", str(tmp_path)]
+        )
+        eventually(lambda: "listens at" in said(tmp_path))
+        children.check()
+        pid = children.pid("server")
+        children.end("server")
+        assert not runs(pid)
+        children.start("wrong", ["map", "show", str(tmp_path / "none.mapweave")])
+        with pytest.raises(ChildFailed, match=r"wrong ended with status 1: mapweave: .*none\.mapweave"):
+            eventually(children.check)
+
+
+def test_the_stdin_of_all_others_means_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(parent_watchdog.NAME, raising=False)
+    stop = threading.Event()
+    parent_watchdog.hold(stop)
+    assert not stop.wait(0.2)
+    assert "lifeline" not in {thread.name for thread in threading.enumerate()}

@@ -1,0 +1,88 @@
+"""Figures: flat, documented, and the same after a way through JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import fields, replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.scenarios.figures import MORE_IS_BETTER, Figures, RobotFigures, as_text, kinds, measured
+from mapweave.scenarios.report_page import GROUPS
+
+COUNTS = {f.name: 3 for f in fields(Figures) if f.type == "int"}
+BARE = Figures(**COUNTS, map_hash="ab", sim_s=60.0, wall_s=15.0)
+ROBOT = RobotFigures(1, 20, 0, 1000, 2000, 0, "cd")
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(numbers, st.booleans(), numbers, st.none() | numbers)
+def test_json_gives_the_same_figures_back(error, found, seconds, ate):
+    figures = replace(
+        BARE, merged_ate_m=error, found=found, found_s=seconds,
+        robots={"r1": ROBOT, "r0": replace(ROBOT, trajectory_ate_m=ate)},
+    )  # fmt: skip
+    text = json.dumps(figures.as_dict(), allow_nan=False)
+    assert Figures.from_dict(json.loads(text)) == figures
+    assert list(json.loads(text)["robots"]) == ["r0", "r1"]
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [({"nodes": "many"}, "nodes"), ({"noodles": 1}, "noodles"), ({"robots": [1]}, "no figures"),
+     ({"robots": {"r0": {"nodes": 1}}}, "r0"), ({"components": None}, "components is missing")],
+)  # fmt: skip
+def test_what_is_no_figures_is_refused_in_one_line(change, word):
+    with pytest.raises(InvalidFile, match=word) as refusal:
+        Figures.from_dict(BARE.as_dict() | change)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("of", [Figures, RobotFigures])
+def test_every_figure_is_explained_and_has_a_unit_where_it_needs_one(of):
+    explained = set(re.findall(r"^        (\w+):", of.__doc__, re.MULTILINE))
+    assert explained == {f.name for f in fields(of)}
+    for one in fields(of):
+        if "float" in str(one.type):
+            units = ("_m", "_deg", "_s", "_minute", "_per_node", "_precision", "_recall", "_factor", "_share")
+            assert one.name.endswith(units), one.name
+
+
+def test_the_kinds_are_those_of_the_class():
+    found = kinds()
+    assert found["nodes"] is int
+    assert found["merged_ate_m"] is float
+    assert found["found"] is bool
+    assert found["map_hash"] is str
+    assert set(found) == {f.name for f in fields(Figures)} - {"robots"}
+    assert set(found) > MORE_IS_BETTER
+
+
+def test_the_page_has_every_figure_once():
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(kinds())
+
+
+@given(st.floats())
+def test_what_json_cannot_say_is_none(value):
+    assert measured(value) == (value if math.isfinite(value) else None)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "-"),
+        (True, "yes"),
+        (False, "no"),
+        (3, "3"),
+        (0.0123456, "0.01235"),
+        (12345.6, "12346"),
+        ("x", "x"),
+    ],
+)
+def test_figures_for_people(value, text):
+    assert as_text(value) == text

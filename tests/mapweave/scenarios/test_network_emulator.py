@@ -1,0 +1,107 @@
+"""The cable between a robot and the router, on real sockets."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import threading
+import time
+
+import pytest
+
+from mapweave.scenarios.network_emulator import NetworkEmulator
+
+
+class Echo:
+    """Sends back what comes."""
+
+    def __init__(self):
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listener.getsockname()[1]
+        threading.Thread(target=self.accept, daemon=True).start()
+
+    def accept(self):
+        while True:
+            try:
+                connection, _ = self.listener.accept()
+            except OSError:
+                return
+            threading.Thread(target=self.serve, args=(connection,), daemon=True).start()
+
+    def serve(self, connection):
+        with connection:
+            while data := connection.recv(4096):
+                connection.sendall(data)
+
+
+@pytest.fixture
+def cable():
+    echo = Echo()
+    made = NetworkEmulator(echo.port, seed=1)
+    yield made
+    made.close()
+    echo.listener.close()
+
+
+def talk(connection, data):
+    connection.sendall(data)
+    answer = b""
+    while len(answer) < len(data):
+        piece = connection.recv(65536)
+        if not piece:
+            break
+        answer += piece
+    return answer
+
+
+def test_it_carries_bytes_both_ways_and_counts_them(cable):
+    data = bytes(range(256)) * 400
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
+        assert talk(one, data) == data
+    assert cable.carried == 2 * len(data)
+
+
+def test_cut_it_breaks_and_takes_nobody_until_it_is_restored(cable):
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
+        assert talk(one, b"hello") == b"hello"
+        cable.cut()
+        assert one.recv(10) == b""
+    with (
+        socket.create_connection(("127.0.0.1", cable.port), 2) as two,
+        contextlib.suppress(ConnectionError),
+    ):
+        assert talk(two, b"hello") == b""
+    cable.restore()
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as three:
+        assert talk(three, b"hello") == b"hello"
+
+
+def test_a_bad_one_is_slow_but_loses_nothing(cable):
+    cable.worsen(loss=0.5, delay=0.02)
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
+        began = time.monotonic()
+        for number in range(5):
+            assert talk(one, b"%d" % number) == b"%d" % number
+        slow = time.monotonic() - began
+        # Ten pieces, each delayed; with this seed some have to be sent again.
+        assert slow > 0.2 + 0.2
+        cable.restore()
+        best = math.inf
+        for _ in range(20):
+            began = time.monotonic()
+            assert talk(one, b"quick") == b"quick"
+            best = min(best, time.monotonic() - began)
+        assert best < 0.04, "not even there and back is delayed"
+
+
+def test_without_a_router_connections_end(cable):
+    lonely = NetworkEmulator(1, seed=0)
+    try:
+        with (
+            socket.create_connection(("127.0.0.1", lonely.port), 2) as one,
+            contextlib.suppress(ConnectionError),
+        ):
+            assert one.recv(10) == b""
+    finally:
+        lonely.close()

@@ -1,0 +1,22 @@
+"""The scenarios that come with Mapweave, with a seed that nothing was developed with, in real processes."""
+
+from __future__ import annotations
+
+import pytest
+
+from mapweave.scenarios.run import TrialOptions, run_trial
+from mapweave.scenarios.scenario import load_scenario, scenario_names, scenario_path
+
+SEED = 77
+
+
+@pytest.mark.scenario
+@pytest.mark.timeout(500)
+@pytest.mark.parametrize("name", [name for name in scenario_names() if name != "demo"])
+def test_scenario(name, tmp_path):
+    options = TrialOptions(seed=SEED, out=tmp_path / "out", quiet=True)
+    trial = run_trial(load_scenario(scenario_path(name)), options)
+    complaints = [str(verdict) for verdict in trial.verdicts if not verdict.good]
+    print(name, trial.figures.as_dict())
+    assert complaints == [], [f"{m.stamp_ns / 1e9:.0f} s: {m.text}" for m in trial.recording.moments]
+    assert (tmp_path / "out" / "film.webm").stat().st_size > 10_000

@@ -1,0 +1,218 @@
+"""Recognition on recordings: small ones are made here, of photographs, with known truth."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+
+from mapweave.cli import main
+from mapweave.evaluation.photographs import evidence
+from mapweave.evaluation.verdict import Verdict, figures
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
+CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+
+
+def render(world_from_robot: Pose2) -> np.ndarray:
+    """(240, 320) grey: two photographs on walls 2.2 m and 3.2 m from the origin, by exact homographies."""
+    image = np.full((CAMERA.height, CAMERA.width), 128, np.uint8)
+    hung = [(skimage.data.coffee(), 3.2, 0.2, 1.5, 2.6), (skimage.data.astronaut(), 2.2, 1.9, 1.3, 1.8)]
+    for picture, x, y, z, width in hung:
+        grey = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+        height = width * grey.shape[0] / grey.shape[1]
+        corners = np.array([[x, y, z], [x, y - width, z], [x, y - width, z - height], [x, y, z - height]])
+        seen = CAMERA.project(world_from_robot.inverse().apply(corners)).astype(np.float32)
+        own = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (grey.shape[1], grey.shape[0]) - 0.5
+        to_image = cv2.getPerspectiveTransform(own.astype(np.float32), seen)
+        drawn = cv2.warpPerspective(grey, to_image, (320, 240), flags=cv2.INTER_AREA)
+        mask = cv2.warpPerspective(np.full_like(grey, 255), to_image, (320, 240))
+        image = np.where(mask > 127, drawn, image).astype(np.uint8)
+    return image
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One robot drives ahead; another one later, beside it, then looks back at a blank wall."""
+    folder = tmp_path_factory.mktemp("recordings") / "drive"
+    (folder / "images").mkdir(parents=True)
+    first = [Pose2(0.03 * k, 0.0, 0.0) for k in range(36)]
+    second = [Pose2(0.1 + 0.09 * k, 0.06, 0.02) for k in range(9)] + [Pose2(0.5, 0.0, math.pi)] * 3
+    with (folder / "odometry.csv").open("w") as odometry, (folder / "truth.csv").open("w") as truth:
+        odometry.write("forward_m,turn_rad\n")
+        truth.write("stamp_s,x_m,y_m,heading_rad\n")
+        before = first[0]
+        for k, pose in enumerate(first + second):
+            cv2.imwrite(str(folder / "images" / f"{k}.png"), render(pose))
+            moved = before.inverse() @ pose
+            odometry.write(f"{moved.x},{moved.heading}\n")
+            truth.write(f"{0.1 * k:.3f},{pose.x},{pose.y},{pose.heading}\n")
+            before = pose
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.3f}\n" for k in range(48)))
+    (folder / "camera.toml").write_text(CAMERA_TOML)
+    (folder / "splits.toml").write_text(
+        '[[robot]]\nname = "a"\nfirst = 0\nlast = 35\n[[robot]]\nname = "b"\nfirst = 36\nlast = 47\n'
+    )
+    return folder
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    """Photographs of three places, the same ones taken again from elsewhere, and one of nothing known."""
+    folder = tmp_path / "walk"
+    (folder / "images").mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    scenes = [skimage.data.coffee(), skimage.data.astronaut(), skimage.data.chelsea()]
+    for number, scene in enumerate(scenes, 1):
+        grey = cv2.resize(cv2.cvtColor(scene, cv2.COLOR_RGB2GRAY), (320, 240))
+        cv2.imwrite(str(folder / "images" / f"img{number}.png"), grey)
+        corners = np.array([[0, 0], [320, 0], [320, 240], [0, 240]], np.float32)
+        moved = corners + rng.uniform(-18, 18, (4, 2)).astype(np.float32)
+        warped = cv2.warpPerspective(grey, cv2.getPerspectiveTransform(corners, moved), (320, 240))
+        cv2.imwrite(str(folder / "images" / f"img{number + 10}.png"), warped)
+    unknown = cv2.resize(rng.integers(0, 255, (60, 80)).astype(np.uint8), (320, 240))
+    cv2.imwrite(str(folder / "images" / "img14.png"), unknown)
+    (folder / "lap_truth.csv").write_text(
+        "query,ref_best,ref_lo,ref_hi,note\n11,1,1,1,\n12,2,2,2,\n13,3,3,3,\n14,,,,nothing known\n"
+    )
+    return folder
+
+
+def report(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict:
+    assert main(["eval", "relocalize", *map(str, arguments), "--json"]) == 0
+    return json.loads(capfd.readouterr().out.strip().splitlines()[-1])
+
+
+def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
+    found = report(capfd, drive, "--out", tmp_path / "out")
+    assert (found["queries"], found["expected"]) == (12, 9)
+    assert found["nodes"] >= 1
+    assert found["recall_at_1"] >= 0.8
+    assert (found["precision"], found["false_accept"]) == (1.0, 0.0)
+    assert found["error_m_median"] < 0.1
+    assert found["error_deg_median"] < 1.0
+    with (tmp_path / "out" / "answers-depths.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 12
+    assert [row["certainty"] for row in rows[-3:]] == ["unknown"] * 3
+
+
+def test_a_drives_error_is_measured_against_its_truth(drive: Path, capfd, tmp_path: Path) -> None:
+    """The asking robot's truth is moved by 7 m: so are all errors, and nothing is right any more."""
+    folder = Path(shutil.copytree(drive, tmp_path / "moved"))
+    rows = (folder / "truth.csv").read_text().splitlines()
+    moved = rows[:37]
+    for row in rows[37:]:
+        stamp, x, y, heading = row.split(",")
+        moved.append(f"{stamp},{x},{float(y) + 7.0},{heading}")
+    (folder / "truth.csv").write_text("\n".join(moved) + "\n")
+    found = report(capfd, folder)
+    assert found["error_m_median"] == pytest.approx(7.0, abs=0.2)
+    assert (found["expected"], found["recall_at_1"], found["precision"]) == (0, None, 0.0)
+    assert found["false_accept"] > 0.5
+    (folder / "truth.csv").unlink()
+    found = report(capfd, folder)
+    assert (found["truth"], found["precision"], found["false_accept"]) == (False, None, None)
+    assert found["found"] >= 7
+
+
+def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
+    found = report(capfd, walk, "--focal", 300, "--out", tmp_path / "out")
+    assert (found["queries"], found["expected"], found["nodes"]) == (4, 3, 3)
+    assert (found["recall_at_1"], found["precision"], found["unknown_share"]) == (1.0, 1.0, 0.25)
+    assert (found["error_frames_median"], found["false_accept"]) == (0.0, 0.0)
+    assert (tmp_path / "out" / "answers-looks.csv").exists()
+    # Two references changed over: what was right is wrong.
+    table = (walk / "lap_truth.csv").read_text()
+    (walk / "lap_truth.csv").write_text(table.replace("11,1,1,1", "11,2,2,2").replace("12,2,2,2", "12,1,1,1"))
+    (walk / "camera.toml").write_text(CAMERA_TOML)
+    found = report(capfd, walk)
+    assert (found["recall_at_1"], found["precision"]) == (pytest.approx(1 / 3, abs=1e-4),) * 2
+
+
+def test_figures_by_hand() -> None:
+    found, unknown, ambiguous = Certainty.FOUND, Certainty.UNKNOWN, Certainty.AMBIGUOUS
+    verdicts = [
+        Verdict("1", True, found, "a", True, True, error_m=0.2, error_deg=1.0, answer_ms=10.0),
+        Verdict("2", True, found, "a", True, True, error_m=0.4, error_deg=3.0, answer_ms=20.0),
+        Verdict("3", True, found, "b", False, False, error_m=9.0, error_deg=3.0, answer_ms=30.0),
+        Verdict("4", True, unknown, first=True),
+        Verdict("5", True, ambiguous, "a", True, True),
+        Verdict("6", False, found, "a", False, False, error_m=30.0, error_deg=90.0),
+        Verdict("7", False, unknown, first=False),
+        Verdict("8", None, found, "a"),
+    ]
+    told = figures(verdicts)
+    assert (told["queries"], told["expected"], told["found"]) == (8, 5, 5)
+    assert (told["recall_at_1"], told["retrieved_at_1"], told["precision"]) == (0.4, 0.8, 0.5)
+    assert (told["unknown_share"], told["ambiguous_share"], told["false_accept"]) == (0.25, 0.125, 0.5)
+    assert (told["recall_0.25m_2deg"], told["recall_0.5m_5deg"], told["recall_5m_10deg"]) == (0.2, 0.4, 0.4)
+    assert told["error_m_median"] == 4.7
+    assert told["answer_ms_p50"] == 20.0
+    assert "error_frames_median" not in told
+
+
+def test_evidence_bounds_chance() -> None:
+    """Chernoff's bound is above the exact binomial tail, and not by much in its exponent."""
+    for inliers, matches in ((12, 20), (20, 25), (30, 60)):
+        k, n, p = inliers - 7, matches - 7, 4.0 / 384
+        exact = sum(math.comb(n, i) * p**i * (1 - p) ** (n - i) for i in range(k, n + 1))
+        bound = math.exp(-(evidence(inliers, matches, 2.0, 384) + math.log(2000)))
+        assert exact <= bound
+        assert math.log(bound) < 0.75 * math.log(exact)
+    assert evidence(7, 50, 2.0, 384) == 0.0
+    assert evidence(5, 6, 2.0, 384) == 0.0
+
+
+def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert main(["eval", "relocalize", *map(str, arguments)]) == 1
+    said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("mapweave: ")]
+    assert len(said) == 1
+    return said[0]
+
+
+def test_folders_that_are_none(walk: Path, capfd, tmp_path: Path) -> None:
+    assert "no such folder" in complaint(capfd, tmp_path / "nothing")
+    assert "two passes cannot be told apart" in complaint(capfd, tmp_path)
+    assert "camera.toml: no such file" in complaint(capfd, walk)
+    assert "focal lengths must be positive" in complaint(capfd, walk, "--focal", -3)
+    assert "not both" in complaint(capfd, walk, "--focal", 300, "--camera", walk / "camera.toml")
+    table = walk / "lap_truth.csv"
+    for content, words in (
+        ("", "no questions in it"),
+        ("query\n1\n", "no column 'ref_best'"),
+        ("query,ref_best,ref_lo,ref_hi\n11,1,x,1\n", "invalid literal"),
+        ("query,ref_best,ref_lo,ref_hi\n99,1,1,1\n", "there is no image 99"),
+        (
+            "query,ref_best,ref_lo,ref_hi\n" + "".join(f"{n},,,\n" for n in (1, 2, 3, 11, 12, 13, 14)),
+            "first pass",
+        ),
+    ):
+        table.write_text(content)
+        assert words in complaint(capfd, walk, "--focal", 300)
+    table.write_text("query,ref_best,ref_lo,ref_hi\n11,1,1,1\n")
+    (walk / "images" / "img2.png").write_text("no image")
+    assert "not an image" in complaint(capfd, walk, "--focal", 300)
+
+
+def test_drives_that_are_none(drive: Path, capfd, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(drive, tmp_path / "spoilt"))
+    assert "leave --camera and --focal out" in complaint(capfd, folder, "--focal", 300)
+    (folder / "truth.csv").write_text("stamp_s,x_m\n0,0\n")
+    assert "no column 'y_m'" in complaint(capfd, folder)
+    (folder / "truth.csv").write_text("stamp_s,x_m,y_m,heading_rad\n1,0,0,0\n1,0,0,0\n")
+    assert "stamps must ascend" in complaint(capfd, folder)
+    (folder / "splits.toml").write_text('[[robot]]\nname = "a"\nfirst = 0\nlast = 5\n')
+    assert "there is only 1" in complaint(capfd, folder)
+    (folder / "splits.toml").write_text("[[robot")
+    assert "splits.toml" in complaint(capfd, folder)

@@ -1,0 +1,368 @@
+"""Every number of an explanation, computed a second time in another way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.explanation import Standing
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
+from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
+from mapweave.merge.explanation.node_explanation import explain_nodes
+from mapweave.merge.explanation.own_edges import reach_words
+from mapweave.merge.outlier_rejection.link_probability import (
+    FLOOR,
+    LEAST_AREA,
+    link_probabilities,
+    prior_odds,
+    standpoints,
+)
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.outlier_rejection.segmentation import fragments_of
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verification import VerificationSettings
+from mapweave.registration.recognition import RecognitionSettings
+from synthetic.world import room, take_map
+
+A, B, C = MapId("a", 1), MapId("b", 1), MapId("c", 1)
+
+
+@pytest.fixture(scope="module")
+def merged() -> MergedMap:
+    """Two robots in two rooms, of which they share one; a third in a room of its own."""
+    return fleet().merged()
+
+
+def fleet() -> Merger:
+    rng = np.random.default_rng(5)
+    world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng) + room(20, 0, 5, 4, 600, rng)
+    merger = Merger()
+    for map_id, rooms in ((A, (0, 5)), (B, (5,)), (C, (20,))):
+        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    return merger
+
+
+def between(merged: MergedMap) -> list[Link]:
+    return [link for link in merged.links if not link.within]
+
+
+def test_residuals_are_those_of_the_pinhole(merged: MergedMap) -> None:
+    link = between(merged)[0]
+    told = explain_nodes(merged, link.b, link.a)
+    assert told.standing is Standing.LINKED and (told.a.id, told.b.id) == link.pair
+    a, b, camera = told.a.landmarks, told.b.landmarks, told.a.camera
+    x, y, heading = link.a_from_b.mean.vector
+    turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+    for (i, j), residual in zip(told.shared, told.residuals_px, strict=True):
+        here, there, inverse = (a, b, False) if np.isfinite(a.depths[i]) else (b, a, True)
+        k, other = (j, i) if inverse else (i, j)
+        depth = float(here.depths[k])
+        u, v = here.pixels[k]
+        point = np.array([depth + camera.mount_forward, -(u - camera.cx) / camera.fx * depth])
+        height = camera.mount_height - (v - camera.cy) / camera.fy * depth
+        seen = turn @ point + [x, y] if inverse else turn.T @ (point - [x, y])
+        ahead = seen[0] - camera.mount_forward
+        predicted = [
+            camera.cx - camera.fx * seen[1] / ahead,
+            camera.cy - camera.fy * (height - camera.mount_height) / ahead,
+        ]
+        assert residual == pytest.approx(np.linalg.norm(predicted - there.pixels[other]), abs=1e-3)
+    assert {tuple(pair) for pair in told.shared} <= {tuple(pair) for pair in told.matches}
+
+
+def test_the_misfit_is_the_difference_to_the_merged_poses(merged: MergedMap) -> None:
+    for link in between(merged)[:5]:
+        misfit = explain_nodes(merged, *link.pair).misfit
+        assert misfit is not None
+        a, b = (merged.poses[node].merged_from_robot.mean for node in link.pair)
+        off = (link.a_from_b.mean.inverse() @ a.inverse() @ b).vector
+        assert np.allclose(misfit.off, off, atol=1e-12)
+        own = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2)
+        assert misfit.strain2 == pytest.approx(off @ np.linalg.inv(own) @ off, rel=1e-9)
+        assert not misfit.alone
+
+
+def without(merged: MergedMap, left_out: Link | None) -> PoseGaussian:
+    """The relative pose of a link's nodes in a graph that is solved anew without it."""
+    assert left_out is not None
+    measurements = [m for fragment in fragments_of(merged.maps) for m in fragment.measurements]
+    measurements += [
+        Measurement(*link.pair, link.a_from_b, robust=True) for link in merged.links if link is not left_out
+    ]
+    graph = solve_graph(left_out.a, Pose2(), measurements)
+    found = graph.relative([left_out.a], [left_out.b])
+    return PoseGaussian(Pose2.from_vector(found.means[0]), found.covariances[0])
+
+
+def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap) -> None:
+    links = between(merged)
+    graph = merged.graphs[0]
+    found = standpoints(links, graph, kept=True)
+    area = max(np.prod(np.ptp(graph.means[:, :2], axis=0)), LEAST_AREA)
+    for link, one in list(zip(links, found, strict=True))[::3]:
+        rest = without(merged, link)
+        off = (link.a_from_b.mean.inverse() @ rest.mean).vector
+        spread = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2) + rest.covariance + FLOOR
+        density = math.exp(-0.5 * off @ np.linalg.inv(spread) @ off) / math.sqrt(
+            np.linalg.det(2 * np.pi * spread)
+        )
+        # The graph is not quite linear, and without a link the others are weighed a little otherwise.
+        assert one.log_factor == pytest.approx(math.log(density * area * 2 * np.pi), abs=0.1)
+
+
+def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap) -> None:
+    link = between(merged)[0]
+    graph = solve_graph(
+        link.a,
+        Pose2(),
+        [m for f in fragments_of(merged.maps) for m in f.measurements]
+        + [Measurement(*link.pair, link.a_from_b, robust=True)],
+    )
+    (found,) = standpoints([link], graph, kept=True)
+    assert found.alone and found.log_factor == 0.0
+
+
+def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap) -> None:
+    rng = np.random.default_rng(1)
+    true = link_probabilities(merged)
+    assert len(true) == len(merged.links) and min(true.values()) > 0.9
+    links = between(merged)
+    shifted = [
+        Link(x.a, x.b, PoseGaussian(x.a_from_b.mean @ Pose2(*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)),
+             x.a_from_b.covariance), x.shared, x.evidence)
+        for x in links
+    ]  # fmt: skip
+    assert all(one.log_factor < -10 for one in standpoints(shifted, merged.graphs[0], kept=False))
+    assert prior_odds(merged) > 1
+
+
+def test_witnesses_close_loops_as_poses_composed_one_by_one(merged: MergedMap) -> None:
+    link = between(merged)[1]
+    told = explain_nodes(merged, *link.pair)
+    s = ConsistencySettings()
+    by_pair = {other.pair: other for other in merged.links}
+    pieces = {node: fragment for fragment in fragments_of(merged.maps) for node in fragment.nodes}
+    assert len(told.witnesses) >= 3
+    for witness in told.witnesses:
+        if (witness.a, witness.b) not in by_pair:
+            continue
+        # The merge begins each loop at the smaller pair.
+        one, other = sorted([link, by_pair[witness.a, witness.b]], key=lambda x: x.pair)
+        back = pieces[one.b].graph.relative([one.b], [other.b])
+        home = pieces[one.a].graph.relative([other.a], [one.a])
+        there, here = (PoseGaussian(Pose2.from_vector(r.means[0]), r.covariances[0]) for r in (back, home))
+        loop = one.a_from_b @ there @ other.a_from_b.inverse() @ here
+        floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+        distance2 = PoseGaussian(loop.mean, loop.covariance + floor).mahalanobis2(Pose2())
+        assert witness.distance2 == pytest.approx(distance2, rel=1e-6)
+        assert witness.agrees == (distance2 < s.gate) and witness.kept
+
+
+def test_what_was_refused_says_what_it_lacks(merged: MergedMap) -> None:
+    refused = next(r for r in merged.refused if r.link is None and r.edge is None)
+    told = explain_nodes(merged, refused.a, refused.b)
+    assert (told.standing, told.reason) == (Standing.REFUSED, refused.reason)
+    assert told.probability is None and len(told.matches) > 0
+
+
+def test_too_few_that_agree_are_told_with_their_pose(merged: MergedMap) -> None:
+    link = between(merged)[0]
+    strict = VerificationSettings(RecognitionSettings(least_inliers=12))
+    # One of the two nodes has kept eleven landmarks, all of which agree.
+    shared = link.shared[:11]
+    a = merged.maps[link.a.map].nodes[link.a]
+    few = HybridMap([NodePut(replace(a, landmarks=a.landmarks.take(shared[:, 0])))])
+    both = replace(merged, maps={**merged.maps, link.a.map: few}, links=(), refused=())
+    told = explain_nodes(both, *link.pair, strict)
+    assert told.standing is Standing.UNCOMPARED and told.a_from_b is None
+    assert "11 features match" in told.reason
+    told = explain_nodes(both, *link.pair, VerificationSettings(RecognitionSettings(least_cells=25)))
+    assert told.reason.endswith("of 24 image cells") and told.a_from_b is not None
+    assert len(told.shared) == told.evidence["inliers"] == len(told.residuals_px) >= 10
+    assert {(int(shared[i, 0]), int(j)) for i, j in told.shared} <= set(map(tuple, shared.tolist()))
+    assert told.a_from_b.mean.distance(link.a_from_b.mean) < 0.1
+    assert told.misfit is not None and told.witnesses == () and told.probability is None
+
+
+def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> None:
+    told = explain_nodes(merged, sorted(merged.maps[A].nodes)[0], sorted(merged.maps[C].nodes)[0])
+    assert told.standing is Standing.UNCOMPARED and "compared now: " in told.reason
+
+
+def test_a_robot_s_own_edge_is_told_with_its_pose(merged: MergedMap) -> None:
+    edge = min(merged.maps[A].edges.values(), key=lambda edge: edge.id)
+    told = explain_nodes(merged, edge.b, edge.a)
+    assert told.standing is Standing.OWN and told.reason.endswith(f" (edge {edge.id})")
+    assert told.a_from_b is edge.a_from_b and told.probability is None and not told.witnesses
+    assert told.misfit is not None and not told.claims
+    relative = merged.relative(edge.a, edge.b)
+    assert relative is not None
+    off = (edge.a_from_b.mean.inverse() @ relative.mean).vector
+    assert np.allclose(told.misfit.off, off, atol=1e-9)
+
+
+def test_a_loop_of_the_robot_s_own_is_told_and_what_is_ruled_of_it() -> None:
+    merger = fleet()
+    first, *_, last = sorted(merger.merged().maps[A].nodes)
+    true = merger.merged().relative(first, last)
+    assert true is not None
+    loop = Edge(NodeId("a", 1, 99), first, last, true, EdgeKind.LOOP)
+    merger.apply(A, EdgePut(loop))
+    told = explain_nodes(merger.merged(), first, last)
+    assert told.standing is Standing.OWN and told.probability is not None
+    ruling = ManualConstraint((first, last), True, "anna", 0, "no")
+    merger.rule(ManualConstraints([ruling]))
+    told = explain_nodes(merger.merged(), first, last)
+    assert told.standing is Standing.UNDONE and told.reason == reason_of(ruling)
+    assert any("(edge a.1.99); refused: undone by anna" in claim for claim in told.claims)
+    wrong = replace(loop, a_from_b=PoseGaussian(true.mean @ Pose2(2.0, 1.0, 1.0), true.covariance))
+    merger.rule(ManualConstraints())
+    merger.apply(A, EdgePut(wrong))
+    told = explain_nodes(merger.merged(), first, last)
+    assert told.standing is Standing.REFUSED and "contradicts" in told.reason
+    assert told.misfit is not None and told.misfit.strain2 > 100.0
+
+
+def test_landmarks_that_have_faded_hold_no_servo(merged: MergedMap) -> None:
+    link = next(one for one in between(merged) if "can be driven" in reach_words(merged, one.edge()))
+    count = len(merged.maps[link.a.map].nodes[link.a].landmarks)
+    faded = replace(merged, faded={link.a: np.ones(count, np.bool_)})
+    told = explain_nodes(faded, *link.pair)
+    (words,) = [claim for claim in told.claims if claim.startswith("the link ")]
+    assert "not driven: no landmark stays in view" in words
+    assert words.endswith(f"({len(link.shared)} more have faded)")
+
+
+def test_two_maps(merged: MergedMap) -> None:
+    one = explain_maps(merged, B, A)
+    assert one.joined and one.links == len(between(merged)) and "are one map" in one.reason
+    assert one.landmarks == sum(int(link.evidence["inliers"]) for link in between(merged))
+    weights = sorted(link.weight for link in between(merged))
+    assert [near.inliers for near in one.nearest] == weights[:5]
+    apart = explain_maps(merged, A, C)
+    assert not apart.joined and "are not one map" in apart.reason
+    assert apart.unverified == sum({r.a.map, r.b.map} == {A, C} for r in merged.refused)
+    assert [e.joined for e in explain_fleet(merged, 10)] == [False, False, True]
+    assert explain_fleet(merged, 10) == tuple(
+        explain_maps(merged, told.second, told.first) for told in explain_fleet(merged, 10)
+    )
+
+
+def test_what_people_ruled_is_told() -> None:
+    merger = fleet()
+    link = between(merger.merged())[0]
+    ruling = ManualConstraint(link.pair, True, "anna", 0, "no")
+    merger.rule(ManualConstraints([ruling]))
+    told = explain_nodes(merger.merged(), *link.pair)
+    assert told.standing is Standing.UNDONE and told.rulings == (ruling,)
+    assert told.probability is not None and told.probability > 0.9, (
+        "a ruling changes nothing of what was seen"
+    )
+    merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
+    apart = explain_maps(merger.merged(), A, B)
+    assert not apart.joined and "undone" in apart.reason and len(apart.nearest) == 5
+
+
+def test_a_merge_that_loses_its_support_says_so() -> None:
+    merger = fleet()
+    alone = MergedMap.empty()
+    before = merger.merged()
+    parts = joined_maps(before)
+    assert partings(parts, before.links, before) == () == joinings(parts, before)
+    (joined,) = [one for one in joinings(joined_maps(alone), before) if "a.1 and b.1" in one]
+    assert joined == f"a.1 and b.1 are one map now, by {len(between(before))} links"
+    merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
+    for links in (before.links, None):
+        (words,) = partings(parts, links, merger.merged())
+        assert words.startswith("a.1 and b.1 are no longer one map: ") and "refused (undone" in words
+    merger.rule(ManualConstraints())
+    for node in before.maps[B].nodes:
+        merger.apply(B, NodeRetired(node))
+    assert partings(parts, before.links, merger.merged()) == ()  # a map without nodes is part of nothing
+
+
+def test_what_joins_at_once_is_told_map_by_map_and_each_link_once() -> None:
+    """A server that starts again joins all maps with one merge; it told some links twice."""
+    rng = np.random.default_rng(5)
+    world = room(0, 0, 5, 4, 900, rng)
+    merger = Merger()
+    for map_id in [MapId(name, 1) for name in "abcdef"]:
+        nodes, edges = take_map(world, map_id, [Pose2(2.2 + 0.1 * k, 1.8, 0.9 * k) for k in range(4)], rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    merged = merger.merged()
+    assert len(merged.components) == 1
+    told = joinings((), merged)
+    assert (
+        told[0].startswith("a.1 and ")
+        and told[1].startswith("a.1+")
+        and told[-1].startswith("5 maps with a.1 and ")
+        and len(told) == 5
+    )
+    count = sum(int(words.rsplit(" by ", 1)[1].split()[0]) for words in told)
+    assert count == sum(not link.within for link in merged.links)
+
+
+def test_of_many_maps_that_part_the_number_is_told() -> None:
+    one = MapId("a", 1)
+    node = NodeId(*one, 1)
+    sides = [[MapId(f"{side}{k}", 1) for k in range(count)] for side, count in (("x", 300), ("y", 2))]
+    maps = {name: HybridMap() for side in sides for name in side}
+    parts = tuple(frozenset(node._replace(agent=name.agent) for name in side) for side in sides)
+    apart = MergedMap(maps, (), (), parts, {})
+    (words,) = partings([frozenset(maps)], [], apart)
+    assert words.startswith("300 maps with x0.1 and y0.1+y1.1 are no longer one map: ")
+
+
+def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
+    """Two robots in two rooms, and one that has been in both."""
+    rng = np.random.default_rng(5)
+    world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng)
+    merger = Merger()
+    for map_id, rooms in ((A, (0,)), (B, (0, 5)), (C, (5,))):
+        stops = [Pose2(x + 2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for x in rooms for k in range(6)]
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    before = merger.merged()
+    assert before.joined(A, C)
+    ruling = ManualConstraint((B, B), True, "anna", 0, "moved house")
+    merger.rule(ManualConstraints([ruling]))
+    (words,) = partings(joined_maps(before), before.links, merger.merged())
+    assert words.startswith("a.1 and c.1 are no longer one map: ")
+    assert words.endswith(f" gone, since {reason_of(ruling)}") and "moved house" in words
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "words"),
+    [
+        (NodeId("a", 1, 1), NodeId("a", 1, 1), "give two nodes"),
+        (NodeId("z", 1, 1), NodeId("a", 1, 1), "there is no map z.1; known are: a.1, b.1, c.1"),
+        (
+            NodeId("a", 1, 99),
+            NodeId("a", 1, 1),
+            "of its 12 nodes the nearest are 17, 19, 21, 23",
+        ),
+    ],
+)
+def test_what_is_not_there_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str) -> None:
+    with pytest.raises(InvalidValue, match=words):
+        explain_nodes(merged, a, b)
+    with pytest.raises(InvalidValue, match="two maps"):
+        explain_maps(merged, A, A)

@@ -1,0 +1,38 @@
+"""Links by their nodes: whatever came before, the last links alone are told."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.map_maintenance.adjacency import Adjacency
+from mapweave.merge.pose_graph.links import Link
+
+NODES = [NodeId(agent, 1, number) for agent in ("r0", "r1") for number in range(4)]
+Ends = tuple[NodeId, NodeId]
+PAIRS = [(a, b) for k, a in enumerate(NODES) for b in NODES[k + 1 :]]
+
+
+def link(pair: Ends) -> Link:
+    return Link(*pair, PoseGaussian(Pose2(), np.eye(3)))
+
+
+@given(st.lists(st.dictionaries(st.sampled_from(PAIRS), st.integers(0, 1), max_size=12), max_size=6))
+def test_the_last_links_are_told_and_only_new_pairs_are_fresh(
+    rounds: list[dict[Ends, int]],
+) -> None:
+    # Two links of each pair: it may be measured anew.
+    links = [{pair: link(pair) for pair in PAIRS} for _ in range(2)]
+    known, before = Adjacency(), set[Ends]()
+    for chosen in rounds:
+        now = [links[which][pair] for pair, which in chosen.items()]
+        assert {one.pair for one in known.follow(now)} == set(chosen) - before
+        before = set(chosen)
+        for node in NODES:
+            assert {id(one) for one in known.at(node)} == {id(one) for one in now if node in one.pair}
+        for a, b in PAIRS:
+            there = next((one for one in now if one.pair == (a, b)), None)
+            assert known.between(a, b) is there and known.between(b, a) is there

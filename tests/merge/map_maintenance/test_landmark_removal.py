@@ -1,0 +1,251 @@
+"""Landmarks that fade: against enumeration of everything that may have happened, and with moved furniture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.mapserver.active_nodes import without_faded
+from mapweave.mapserver.merging.merger import Merger, MergerSettings
+from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations, expected
+from mapweave.merge.map_maintenance.landmark_removal import (
+    LandmarkRemovalSettings,
+    LandmarkRemover,
+    found_again,
+    presence,
+    things,
+)
+from mapweave.merge.map_maintenance.node_superseding import NodeSupersedingSettings
+from mapweave.merge.pose_graph.links import Link
+from synthetic.world import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
+
+S = LandmarkRemovalSettings()
+L = S.looks
+SHARP = Sensing(unknown_depth=0.0, clutter=5, most=150)
+
+
+ALONE = np.eye(21, dtype=np.bool_)
+"""Each landmark is a thing of its own."""
+WORLD = room(0, 0, 6, 4, 40, np.random.default_rng(0))
+NODE = take_node(
+    WORLD, NodeId("a", 1, 1), Pose2(2, 2, 0), PoseGaussian(Pose2(), np.eye(3)), np.random.default_rng(0)
+)
+
+
+def look(shown: list[bool], found: list[bool], visit: int = 0) -> LandmarkObservations:
+    """A view that finds half of what it should show besides; the first landmarks are those in question."""
+    rest = [True] * 20
+    half = [True, False] * 10
+    link = Link(NodeId("a", 1, 1), NodeId("b", 1, 1), PoseGaussian(Pose2(), np.eye(3)))
+    view = replace(NODE, stamp_ns=visit * 10**12)
+    return LandmarkObservations(NODE, view, link, Pose2(), np.array(shown + rest), np.array(found + half))
+
+
+@pytest.mark.parametrize("story", list(product([None, False, True], repeat=4)))
+def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]) -> None:
+    """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
+    looks = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
+    weights = {True: 0.0, False: 0.0}
+    told = [(seen, found_again(ALONE, one, S)) for seen, one in zip(story, looks, strict=True)]
+    told = [(seen, rate) for seen, rate in told if seen is not None]
+    for states in product([True, False], repeat=len(told) + 1):
+        for veils in product([True, False], repeat=len(told)):
+            weight = S.at_first if states[0] else 1 - S.at_first
+            for (before, now), veil, (seen, rate) in zip(pairwise(states), veils, told, strict=True):
+                stays = 1 - S.goes if before else 1 - S.comes
+                weight *= stays if now == before else 1 - stays
+                weight *= S.hidden if veil else 1 - S.hidden
+                # Who finds by mistake what is gone finds it whatever stands there.
+                likely = (0.0 if veil else rate) if now else S.mistaken
+                weight *= likely if seen else 1 - likely
+            weights[states[-1]] += weight
+    there = presence(ALONE, looks, S)[0]
+    assert there == pytest.approx(weights[True] / sum(weights.values()), abs=1e-12)
+
+
+def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None:
+    """Six landmarks of one thing that all are missed; and one of which nothing is around."""
+    together = np.eye(26, dtype=np.bool_)
+    together[:6, :6] = True
+    # Neighbours that are found tell how often this view finds what is there.
+    together[6:, 6:] = True
+
+    def after(misses: int, hits: int = 0, things: np.ndarray = together) -> np.ndarray:
+        story = [look([True] * 6, [False] * 6, k) for k in range(misses)]
+        story += [look([True] * 6, [True] + [False] * 5, misses + k) for k in range(hits)]
+        return presence(things, story, S)
+
+    course = [after(k)[0] for k in range(12)]
+    assert all(later < earlier for earlier, later in pairwise(course))
+    assert course[1] > S.faint > course[3]
+    assert after(11, 1)[0] > S.faint, "it is back"
+    assert (after(0, 4) > S.faint)[:6].all(), "what is missed beside what is found is not gone"
+    one_visit = [look([True] * 6, [False] * 6, 0)] * 9
+    assert presence(together, one_visit, S)[0] > S.faint, "somebody may have stood before it all the while"
+    lonely = np.eye(26, dtype=np.bool_)
+    lonely[6:, 6:] = True
+    alone = [after(k, things=lonely)[0] for k in range(14)]
+    assert 4 <= next(k for k, there in enumerate(alone) if there < S.faint) <= 12
+    nobody = [look([False] * 6, [False] * 6, k) for k in range(20)]
+    assert presence(together, nobody, S)[0] == S.at_first, "nobody could have seen it"
+
+
+def test_landmarks_near_each_other_may_be_of_one_thing() -> None:
+    together = things(NODE, 0.5)
+    points = NODE.points_in_robot
+    for i, j in product(range(len(points)), repeat=2):
+        near = i == j or bool(np.linalg.norm(points[i] - points[j]) < 0.5)
+        assert together[i, j] == near
+    assert together.any(axis=1).all() and not together.all()
+
+
+def test_expected_is_what_is_in_view_near_enough_and_not_hidden() -> None:
+    """One landmark after the other, from the definition."""
+    rng = np.random.default_rng(5)
+    world = room(0, 0, 6, 4, 1200, rng)
+    here, there = Pose2(1.5, 2.0, 0.1), Pose2(2.1, 1.8, 0.2)
+    nothing = PoseGaussian(Pose2(), np.zeros((3, 3)))
+    old, new = (
+        take_node(world, NodeId("r", k, 1), pose, nothing, rng, SHARP) for k, pose in ((1, here), (2, there))
+    )
+    shown = expected(old, new, here.inverse() @ there, L)
+    points = here.apply(old.points_in_robot)
+    known = there.apply(new.points_in_robot)
+    seen = 0
+    for k, point in enumerate(points):
+        pixel = CAMERA.project(there.inverse().apply(point[None]))[0]
+        inside = bool(CAMERA.contains(pixel, L.margin_px))
+        eyes = [pose.apply(np.array([[CAMERA.mount_forward, 0.0, 0.0]]))[0, :2] for pose in (here, there)]
+        rays = [point[:2] - eye for eye in eyes]
+        far = [float(np.hypot(*ray)) for ray in rays]
+        angle = np.arccos(np.clip(rays[0] @ rays[1] / far[0] / far[1], -1, 1))
+        fits = inside and max(far) / min(far) < L.scale and angle < L.aside
+        depth = there.inverse().apply(point[None])[0, 0] - CAMERA.mount_forward
+        hidden = any(
+            np.hypot(*(new.landmarks.pixels[j] - pixel)) < L.before_px
+            and there.inverse().apply(other[None])[0, 0] - CAMERA.mount_forward < L.before * depth
+            for j, other in enumerate(known)
+        )
+        assert shown[k] == (fits and not hidden)
+        seen += int(shown[k])
+    assert 20 < seen < len(points)
+
+
+def test_furniture_that_is_moved_fades_and_comes_back() -> None:
+    """Landmarks of a thing that stands elsewhere from the second drive on; it returns before the last."""
+    rng = np.random.default_rng(2)
+    world = room(0, 0, 6, 4, 700, rng)
+    thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
+    other = replace(world, vectors=world.vectors.copy())
+    other.vectors[thing] = random_vectors(len(thing), rng)
+    # Nothing is superseded: what has been is linked with no later view.
+    merger = Merger(settings=MergerSettings(renewal=NodeSupersedingSettings(found=10_000)))
+    epochs = [world, *[other] * 8, *[world] * 3]
+    told: dict[int, np.ndarray] = {}
+    first: np.ndarray | None = None
+    for epoch, now in enumerate(epochs, start=1):
+        tour = [Pose2(2.6 + 0.5 * k, 2.0 + rng.normal(0, 0.04), 0.05 * k) for k in range(2)]
+        _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
+        merged = merger.merged()
+        node = merged.maps[MapId("r1", 1)].nodes[NodeId("r1", 1, 1)]
+        if first is None:
+            first = _behind(world, tour[0], node.points_in_robot, thing)
+        told[epoch] = merged.faded.get(node.id, np.zeros(len(node.landmarks), np.bool_))
+        assert len(without_faded(node, merged).landmarks) == (~told[epoch]).sum()
+    assert first is not None and first.sum() >= 10 and (~first).sum() >= 20
+    assert not told[2].any(), "one view is not enough"
+    assert told[9][first].mean() > 0.6, "what has gone has faded"
+    assert told[9][~first].mean() < 0.25, "what is there has not, most of it"
+    assert told[12][first].mean() < 0.5 * told[9][first].mean(), "what is back is used again"
+
+
+def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it() -> None:
+    """The wall behind has stayed, and tells where the robot stands; half of what is there is found."""
+    rng = np.random.default_rng(3)
+    world = room(0, 0, 6, 4, 1200, rng)
+    wall = np.flatnonzero(world.normals[:, 0] < -0.5)
+    other = replace(world, vectors=world.vectors.copy())
+    other.vectors[wall] = random_vectors(len(wall), rng)
+    fading = LandmarkRemovalSettings(usual=0.5)
+    merger = Merger(settings=MergerSettings(renewal=NodeSupersedingSettings(found=10_000), fading=fading))
+    shares = []
+    for epoch, now in enumerate([world, *[other] * 4], start=1):
+        x, y = rng.normal([3.2, 2.0], 0.05)
+        tour = [Pose2(x, y, turn + rng.normal(0, 0.02)) for turn in (np.pi, 0.0)]
+        _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
+        merged = merger.merged()
+        assert len(merged.components) == 1
+        behind, before = (merged.maps[MapId("r1", 1)].nodes[NodeId("r1", 1, k)] for k in (1, 3))
+        if epoch == 1:
+            gone = _behind(world, tour[1], before.points_in_robot, wall)
+        assert not any(before.id in link.pair for link in merged.links)
+        shares.append(
+            [merged.faded.get(n.id, np.zeros(len(n.landmarks), np.bool_)) for n in (behind, before)]
+        )
+    assert gone.sum() >= 30
+    assert not shares[1][1].any(), "one visit is not enough"
+    assert shares[-1][1][gone].mean() > 0.6
+    assert shares[-1][0].mean() < 0.2
+
+
+def test_only_what_is_new_is_looked_at_and_tells_what_all_would(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From drive to drive, nodes that others stand for included, as a fader that sees the last map alone."""
+    rng = np.random.default_rng(4)
+    world = room(0, 0, 8, 4, 950, rng)
+    thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
+    other = replace(world, vectors=world.vectors.copy())
+    other.vectors[thing] = random_vectors(len(thing), rng)
+    fading = LandmarkRemovalSettings(moved=0.01)
+    merger = Merger(settings=MergerSettings(fading=fading))
+    judged: list[int] = []
+
+    def counted(*args: Any) -> Array:
+        judged.append(1)
+        return presence(*args)
+
+    monkeypatch.setattr("mapweave.merge.map_maintenance.landmark_removal.presence", counted)
+    counts, faded, agree = [], 0, []
+    for epoch, now in enumerate([world, *[other] * 6], start=1):
+        # The first drives go through all of the room, the last ones through its western end.
+        xs = np.arange(1.0, 7.0 if epoch < 5 else 2.5, 0.5)
+        tour = [Pose2(x, 2.0 + rng.normal(0, 0.04), rng.normal(0, 0.03)) for x in xs]
+        _drive(merger, now, MapId(f"r{epoch}", 1), tour, rng)
+        judged.clear()
+        merged = merger.merged()
+        counts.append(len(judged))
+        anew = LandmarkRemover(fading).fade(replace(merged, faded={})).faded
+        for one in set(anew) | set(merged.faded):
+            none = np.zeros(len(merged.maps[one.map].nodes[one].landmarks), np.bool_)
+            agree.append((anew.get(one, none) == merged.faded.get(one, none)).mean())
+        faded += sum(gone.sum() for gone in merged.faded.values())
+    assert faded > 10 and np.mean(agree) > 0.98
+    assert len(merged.superseded) > 5
+    assert max(counts[5:]) < 0.7 * counts[3], "the eastern end is left alone"
+
+
+def _drive(
+    merger: Merger, world: World, map_id: MapId, tour: list[Pose2], rng: np.random.Generator
+) -> HybridMap:
+    nodes, edges = take_map(world, map_id, tour, rng, SHARP, sigma_xy=0.01, sigma_heading=0.005)
+    bodies: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+    for number, body in enumerate(bodies, start=1):
+        stamp = int(map_id.agent[1:]) * 10**12
+        if isinstance(body, NodePut):
+            body = NodePut(replace(body.node, stamp_ns=stamp + body.node.stamp_ns, clock="wall"))
+        merger.on_change(Change(map_id, number, 0, body))
+    return merger.maps[map_id]
+
+
+def _behind(world: World, world_from_robot: Pose2, points: np.ndarray, thing: np.ndarray) -> np.ndarray:
+    """(N,) which of a node's landmarks are of the thing: its points are the nearest."""
+    there = world_from_robot.apply(points)
+    nearest = np.linalg.norm(there[:, None] - world.points[None], axis=2).argmin(axis=1)
+    return np.isin(nearest, thing)

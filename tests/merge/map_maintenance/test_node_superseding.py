@@ -1,0 +1,258 @@
+"""Nodes that newer ones stand for: only where that is so, and taken back where it no longer is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import Certainty
+from mapweave.hybridmap.reachability import least_in_view
+from mapweave.hybridmap.reachability_cache import ReachabilityCache
+from mapweave.mapserver.active_nodes import ActiveNodes
+from mapweave.mapserver.map_files import map_file_of, merged_of
+from mapweave.mapserver.merging.merger import Merger, MergerSettings
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.roadmap import Roadmap
+from mapweave.mapserver.routes import Router
+from mapweave.merge.explanation.node_explanation import explain_nodes
+from mapweave.merge.map_maintenance.node_superseding import NodeSupersedingSettings
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verification import verify
+from mapweave.storage.map_file import pack_map_file, unpack_map_file
+from synthetic.world import room, take_map, take_view
+
+OLD, NEW, OTHER = MapId("r0", 1), MapId("r0", 2), MapId("r1", 1)
+
+
+class Drives:
+    """One robot drives the same way twice, another one looks at the opposite wall."""
+
+    def __init__(self, seed: int = 3) -> None:
+        rng = np.random.default_rng(seed)
+        self.world = room(0, 0, 8, 4, 1600, rng)
+        self.truth: dict[NodeId, Pose2] = {}
+        self.changes: dict[MapId, list[Change]] = {}
+        for map_id, y, heading in ((OLD, 2.0, 0.3), (NEW, 2.15, 0.25), (OTHER, 2.1, 3.3)):
+            tour = [Pose2(1.5 + 0.8 * k, y, heading) for k in range(5)]
+            nodes, edges = take_map(self.world, map_id, tour, rng, sigma_xy=0.01, sigma_heading=0.01)
+            self.truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
+            bodies = [*map(NodePut, nodes), *map(EdgePut, edges)]
+            self.changes[map_id] = [Change(map_id, k + 1, 0, body) for k, body in enumerate(bodies)]
+
+    def merger(self, *maps: MapId) -> Merger:
+        merger = Merger()
+        for map_id in maps:
+            for change in self.changes[map_id]:
+                merger.on_change(change)
+        return merger
+
+
+@pytest.fixture(scope="module")
+def drives() -> Drives:
+    return Drives()
+
+
+@pytest.fixture(scope="module")
+def merger(drives: Drives) -> Merger:
+    merger = drives.merger(OLD, OTHER)
+    merger.merged()
+    for change in drives.changes[NEW]:
+        merger.on_change(change)
+    return merger
+
+
+def living(merged: MergedMap) -> set[NodeId]:
+    return set(merged.poses) - set(merged.superseded)
+
+
+def test_the_second_drive_stands_for_the_first(drives: Drives, merger: Merger) -> None:
+    merged, s = merger.merged(), NodeSupersedingSettings()
+    assert len(merged.superseded) >= 3
+    assert {node.map for node in merged.superseded} == {OLD}, "views the other way stand for themselves"
+    assert f"{len(merged.superseded)} superseded" in merged.summary()
+    for node, fate in merged.superseded.items():
+        assert fate.by in living(merged) and fate.by.map == NEW
+        between = drives.truth[node].inverse() @ drives.truth[fate.by]
+        assert math.hypot(between.x, between.y) < s.reach.farthest + 0.1
+        assert abs(between.heading) < s.reach.widest + 0.1
+        link = verify(merger.maps[OLD].nodes[node], merger.maps[NEW].nodes[fate.by])
+        assert isinstance(link, Link) and s.found <= fate.found <= link.weight
+        assert str(fate.by) in str(fate)
+
+
+def test_nothing_that_could_be_reached_is_cut_off(merger: Merger) -> None:
+    """The graph of the living nodes has the same pieces, by networkx."""
+    merged = merger.merged()
+    roads = Roadmap(merged, 0.5, ReachabilityCache())
+    graph: nx.Graph = nx.Graph()
+    graph.add_nodes_from(roads.poses)
+    graph.add_edges_from(
+        (e.a, e.b)
+        for e in roads.union.edges.values()
+        if e.id not in roads.closed and e.id.agent != "superseded"
+    )
+    alive = living(merged)
+    before = {frozenset(piece & alive) for piece in nx.connected_components(graph)}
+    after = {frozenset(piece) for piece in nx.connected_components(graph.subgraph(alive))}
+    assert before - {frozenset()} == after
+
+
+def test_a_robot_that_stands_at_a_superseded_node_or_wants_to_is_led_all_the_same(merger: Merger) -> None:
+    merged = merger.merged()
+    router, alive = Router(merged), living(merged)
+    old = sorted(merged.superseded)
+    far = max(alive, key=lambda n: merged.poses[n].merged_from_robot.mean.x)
+    for start, goal in ((old[0], far), (far, old[0]), (old[0], old[-1])):
+        legs = [leg.node.id for leg in router.route(start, goal).legs]
+        assert legs[0] == start and legs[-1] == goal
+        assert set(legs[1:-1]) <= alive, "on the way there are living nodes only"
+
+
+def test_a_file_tells_what_is_superseded_and_why(merger: Merger) -> None:
+    merged = merger.merged()
+    again = merged_of(unpack_map_file(pack_map_file(map_file_of(merged))))
+    assert again.superseded == merged.superseded
+    node, fate = next(iter(again.superseded.items()))
+    told = explain_nodes(again, node, fate.by)
+    assert any(f"{node} is superseded: {fate.by} stands for it" in claim for claim in told.claims)
+    assert any("stay in view" in claim for claim in told.claims)
+
+
+def test_questions_are_answered_by_living_nodes(drives: Drives, merger: Merger) -> None:
+    merged = merger.merged()
+    places = ActiveNodes(merger.index, merger.node, merged)
+    relocalizer = Relocalizer(places, places.node, merged)
+    for k, node in enumerate(sorted(merged.superseded)):
+        view, _ = take_view(drives.world, drives.truth[node], np.random.default_rng(k))
+        answer = relocalizer.answer(view)
+        assert answer.certainty is Certainty.FOUND
+        assert answer.candidates[0].node in living(merged)
+        there = drives.truth[answer.candidates[0].node] @ answer.candidates[0].node_from_robot.mean
+        assert there.distance(drives.truth[node]) < 0.25
+
+
+def test_what_is_taken_away_gives_life_back(drives: Drives) -> None:
+    merger = drives.merger(OLD, NEW, OTHER)
+    superseded = merger.merged().superseded
+    assert superseded
+    by = next(iter(superseded.values())).by
+    merger.apply(NEW, NodeRetired(by))
+    merged = merger.merged()
+    assert by not in merged.poses
+    assert all(fate.by in living(merged) for fate in merged.superseded.values())
+    merger.rule(
+        ManualConstraints(
+            [ManualConstraint((OLD, NEW), True, "anna", 1), ManualConstraint((OTHER, NEW), True, "anna", 1)]
+        )
+    )
+    assert not merger.merged().superseded, "nothing joins them now"
+    merger.rule(ManualConstraints())
+    assert merger.merged().superseded
+
+
+def test_views_of_one_visit_complete_each_other(drives: Drives) -> None:
+    assert not drives.merger(NEW).merged().superseded
+
+
+def test_drive_after_drive_the_living_stay_few(drives: Drives) -> None:
+    """Each drive as the one before, from the same places: the map holds one of them."""
+    rng = np.random.default_rng(9)
+    merger, counts = Merger(), []
+    for epoch in range(1, 6):
+        tour = [Pose2(1.5 + 0.8 * k + rng.normal(0, 0.1), 2.0 + rng.normal(0, 0.1), 0.3) for k in range(4)]
+        nodes, edges = take_map(
+            drives.world, MapId("r0", epoch), tour, rng, sigma_xy=0.01, sigma_heading=0.01
+        )
+        for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
+            merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
+        counts.append(len(living(merger.merged())))
+    assert counts[0] == 4 and max(counts) <= 8, counts
+
+
+def test_superseded_nodes_are_looked_for_no_more_until_they_live_again(drives: Drives) -> None:
+    merger = drives.merger(OLD, NEW, OTHER)
+    merged = merger.merged()
+    assert merged.superseded
+    assert {node for node in merged.poses if node in merger.index} == living(merged)
+    # Known better, it is judged anew, and superseded again.
+    old = next(iter(merged.superseded))
+    node = merger.node(old)
+    assert node is not None
+    before = {link.pair for link in merged.links}
+    merger.apply(OLD, NodePut(node))
+    merged = merger.merged()
+    assert {one for one in merged.poses if one in merger.index} == living(merged)
+    assert {link.pair for link in merged.links} == before, "what tied it ties it still"
+    merger.rule(
+        ManualConstraints(
+            [ManualConstraint((OLD, NEW), True, "anna", 1), ManualConstraint((OTHER, NEW), True, "anna", 1)]
+        )
+    )
+    merged = merger.merged()
+    assert not merged.superseded and all(one in merger.index for one in merged.poses)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(seed: int) -> None:
+    """Where ways do not matter: each node has a living one that covers it, and none can be spared."""
+    rng = np.random.default_rng(seed)
+    world = room(0, 0, 6, 4, 1200, rng)
+    # Whoever stands in one place gets there: all the room is one.
+    s = NodeSupersedingSettings(near=100.0, detour=1000.0)
+    merger = Merger(settings=MergerSettings(renewal=s))
+    for epoch in range(1, 5):
+        tour = [Pose2(*rng.uniform([1.5, 1.5], [3.5, 2.5]), rng.uniform(-0.6, 0.6)) for _ in range(6)]
+        nodes, edges = take_map(world, MapId("r0", epoch), tour, rng, sigma_xy=0.01, sigma_heading=0.01)
+        for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
+            merger.on_change(Change(MapId("r0", epoch), k + 1, 0, body))
+        merged = merger.merged()
+        alive, stood_for = living(merged), dict[NodeId, list[NodeId]]()
+        for node, fate in merged.superseded.items():
+            assert covers(merged, node, fate.by, s)
+            stood_for.setdefault(fate.by, []).append(node)
+        for one in alive:
+            whom = [one, *stood_for.get(one, [])]
+            spare = all(any(covers(merged, node, by, s) for by in alive - {one}) for node in whom)
+            assert not spare, f"{one} could be spared"
+    assert len(alive) < 18
+
+
+def covers(merged: MergedMap, one: NodeId, other: NodeId, s: NodeSupersedingSettings) -> bool:
+    a, b = (merged.maps[node.map].nodes[node] for node in (one, other))
+    between = merged.pose(one).inverse() @ merged.pose(other)
+    link = verify(*sorted((a, b), key=lambda node: node.id))
+    if one.map == other.map or not isinstance(link, Link) or abs(between.heading) > s.reach.widest:
+        return False
+    shared = link.shared if link.a == one else link.shared[:, ::-1]
+    depths = b.landmarks.has_depth.sum() >= min(s.depths * a.landmarks.has_depth.sum(), s.enough)
+    return bool(depths and least_in_view(shared, a, b, between) >= s.found)
+
+
+def test_nodes_of_today_are_looked_for_superseded_or_not(drives: Drives) -> None:
+    """Another robot's view of the same hour is evidence; an hour later it is past."""
+    rng = np.random.default_rng(8)
+    merger = drives.merger(OLD)
+    tour = [Pose2(1.5 + 0.8 * k, 2.15, 0.25) for k in range(5)]
+    nodes, edges = take_map(drives.world, MapId("r2", 1), tour, rng, sigma_xy=0.01, sigma_heading=0.01)
+    for k, node in enumerate(nodes):
+        nodes[k] = replace(node, stamp_ns=node.stamp_ns + 10**12)
+    for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)]):
+        merger.on_change(Change(MapId("r2", 1), k + 1, 0, body))
+    merged = merger.merged()
+    assert {node.map for node in merged.superseded} == {OLD}
+    assert all(node in merger.index for node in merged.poses)
+    far = replace(
+        nodes[0], id=NodeId("r0", 1, 99), stamp_ns=4 * 10**12, landmarks=nodes[0].landmarks.take([])
+    )
+    merger.apply(OLD, NodePut(far))
+    merged = merger.merged()
+    assert merged.superseded and not any(node in merger.index for node in merged.superseded)

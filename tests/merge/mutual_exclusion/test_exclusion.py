@@ -1,0 +1,276 @@
+"""Two robots in one place at one time: found where it is so, never where robots only meet."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.hybridmap.trajectory_segment import MOST, TrajectorySegment
+from mapweave.merge.mutual_exclusion.collision import Collision
+from mapweave.merge.mutual_exclusion.exclusion import chances_clear, clash_of
+from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
+from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, trajectories_of
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
+
+
+class Walk:
+    """A robot that goes from node to node in a room, straight, stopping and going as it likes.
+
+    Attributes:
+        times: (N,) s, of the nodes.
+        truth: (T, 2) m, where it really was, every 0.1 s.
+    """
+
+    def __init__(self, rng: np.random.Generator, nodes: int = 40, way: Array | None = None) -> None:
+        self.times = np.cumsum(rng.uniform(3.0, 5.0, nodes))
+        way = wander(rng, nodes) if way is None else way
+        self.ticks = np.arange(0, self.times[-1], 0.1)
+        leg = np.clip(np.searchsorted(self.times, self.ticks, side="right") - 1, 0, nodes - 2)
+        share = (self.ticks - self.times[leg]) / (self.times[leg + 1] - self.times[leg])
+        rests = rng.uniform(0, 0.25, (nodes, 2))[leg]
+        share = np.clip((share - rests[:, 0]) / (1 - rests.sum(axis=1)), 0, 1)
+        self.truth = way[leg] + share[:, None] * (way[leg + 1] - way[leg])
+        self.way = way
+
+    def wake(self, node: int) -> TrajectorySegment:
+        """Where it was each second until the next node, beside a node that looks east."""
+        end = self.times[node + 1] if node + 1 < len(self.times) else self.times[node]
+        times = np.arange(self.times[node] + 1.0, end, 1.0)[:MOST]
+        places = [np.interp(times, self.ticks, self.truth[:, k]) - self.way[node, k] for k in range(2)]
+        poses = np.stack([*places, np.zeros(len(times))], axis=1)
+        return TrajectorySegment(times - self.times[node], poses, np.zeros((len(times), 0)))
+
+    def moved(self, by: Array) -> None:
+        self.truth, self.way = self.truth + by, self.way + by
+
+
+def wander(rng: np.random.Generator, nodes: int) -> Array:
+    """(N, 2) m, places in a room of 4 by 3 m."""
+    way = [rng.uniform([0, 0], [4, 3])]
+    while len(way) < nodes:
+        angle = rng.uniform(-np.pi, np.pi)
+        place = way[-1] + rng.uniform(0.0, 0.7) * np.array([np.cos(angle), np.sin(angle)])
+        if (place > 0).all() and (place < [4, 3]).all():
+            way.append(place)
+    return np.array(way)
+
+
+def apart(a: Walk, b: Walk) -> Array:
+    """(T,) m, true distances."""
+    n = min(len(a.truth), len(b.truth))
+    return np.hypot(*(a.truth[:n] - b.truth[:n]).T)
+
+
+def trails(
+    a: Walk, b: Walk, clocks: tuple[str, str] = ("net", "net"), agents: str = "ab",
+    radii: tuple[float, float] = (0.0, 0.0), wakes: bool = False,
+) -> list[BodyTrajectory]:  # fmt: skip
+    found = []
+    for k, walk in enumerate((a, b)):
+        nodes = [
+            Node(NodeId(agents[k], k, i), round(time * 1e9), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
+                 Landmarks.empty(), clocks[k], radii[k], Ranges(), walk.wake(i) if wakes else TrajectorySegment())
+            for i, time in enumerate(walk.times)
+        ]  # fmt: skip
+        found += trajectories_of(nodes)
+    return found
+
+
+def graph(a: Walk, b: Walk, rng: np.random.Generator, agents: str = "ab", sigma: float = 0.02) -> PoseGraph:
+    """Both walks as they were mapped: each node off by 1 cm, b as a whole by `sigma`; the graph knows."""
+    ids = [NodeId(agents[0], 0, k) for k in range(len(a.way))] + [
+        NodeId(agents[1], 1, k) for k in range(len(b.way))
+    ]
+    means = np.zeros((len(ids), 3))
+    means[:, :2] = np.concatenate([a.way, b.way]) + rng.normal(0, 0.01, (len(ids), 2))
+    means[len(a.way) :, :2] += rng.normal(0, sigma, 2)
+    information = np.tile([1, 1, 1e4], len(ids)) / (0.01**2 + sigma**2 / 2)
+    return PoseGraph(ids[0], tuple(ids), means, scipy.sparse.csc_matrix(scipy.sparse.diags(information)))
+
+
+def twins(seed: int) -> tuple[Walk, Walk, np.random.Generator]:
+    """Two robots that do much the same in rooms that look the same, laid over each other."""
+    rng = np.random.default_rng(seed)
+    a = Walk(rng)
+    b = Walk(rng, way=a.way + rng.normal(0, 0.05, a.way.shape))
+    b.times = a.times + rng.uniform(-0.5, 0.5, len(a.times))
+    return a, b, rng
+
+
+def clash(a: Walk, b: Walk, rng: np.random.Generator, **how: tuple[str, str]) -> Collision | None:
+    one, two = trails(a, b, **how)
+    return clash_of(graph(a, b, rng), one, two)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_twins_clash_and_the_reason_has_numbers(seed: int) -> None:
+    a, b, rng = twins(seed)
+    found = clash(a, b, rng)
+    assert found is not None and found.evidence > 10 and found.nearest < 0.1
+    assert found.reason.startswith("a and b would have been at the same place at the same time: 0.0")
+    assert f"{found.time:.1f} s of clock net, {found.moments} such moments" in found.reason
+
+
+def test_it_is_the_same_from_either_side() -> None:
+    a, b, rng = twins(4)
+    one, two = trails(a, b)
+    whole = graph(a, b, rng)
+    forth, back = clash_of(whole, one, two), clash_of(whole, two, one)
+    assert forth is not None and back is not None
+    assert back == replace(forth, first="b", second="a", evidence=back.evidence)
+    assert np.isclose(forth.evidence, back.evidence, rtol=0.1)
+
+
+def scarce(seed: int, late: float) -> tuple[Walk, Walk, np.random.Generator]:
+    """Two robots that do much the same, so late one after the other, and make a node all 16 seconds only."""
+    rng = np.random.default_rng(seed)
+    a = Walk(rng, 80)
+    b = Walk(rng, way=a.way + rng.normal(0, 0.03, a.way.shape))
+    for walk, more in ((a, 0.0), (b, late)):
+        walk.times = (a.times + more)[::4]
+        walk.ticks, walk.truth, walk.way = a.ticks + more, a.truth, walk.way[::4]
+    b.truth = b.truth + rng.normal(0, 0.01, 2)
+    return a, b, rng
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_nodes_are_scarce_their_wakes_tell(seed: int) -> None:
+    """Between nodes nobody knows where the robots were, unless the nodes' wakes do."""
+    a, b, rng = scarce(seed, 0.7)
+    whole = graph(a, b, rng)
+    found = clash_of(whole, *trails(a, b, wakes=True))
+    assert found is not None and found.evidence > 10 and found.nearest < 0.15
+    bare = clash_of(whole, *trails(a, b))
+    assert bare is None or bare.evidence < found.evidence / 2
+
+
+def test_moments_of_wakes_are_where_their_nodes_are_put() -> None:
+    """Against poses composed one by one; a view is a moment of its own, and times ascend."""
+    rng = np.random.default_rng(6)
+    nodes, means = [], rng.uniform(-3, 3, (5, 3))
+    for k in range(5):
+        ages, poses = np.sort(rng.uniform(-1, 9, k)), rng.uniform(-1, 1, (k, 3))
+        nodes.append(
+            Node(NodeId("a", 1, k), round(1e10 * (k + 1)), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
+                 Landmarks.empty(), "net", 0.2, Ranges(), TrajectorySegment(ages, poses, np.zeros((k, 0))))
+        )  # fmt: skip
+    (trail,) = trajectories_of(list(reversed(nodes)))
+    ids = tuple(node.id for node in nodes)
+    found = trail.poses(PoseGraph(ids[0], ids, means, scipy.sparse.eye(15, format="csc")))
+    expected = [
+        (10.0 * (k + 1) + age, k, (Pose2(*means[k]) @ Pose2(*beside)).vector)
+        for k, node in enumerate(nodes)
+        for age, beside in [(0.0, np.zeros(3)), *zip(node.wake.ages, node.wake.node_from_robot, strict=True)]
+    ]
+    expected.sort(key=lambda row: row[0])
+    assert trail.times == pytest.approx([time for time, _, _ in expected])
+    assert trail.nodes == tuple(ids[k] for _, k, _ in expected)
+    assert found[:, :2] == pytest.approx(np.array([vector[:2] for _, _, vector in expected]))
+    assert np.exp(1j * found[:, 2]) == pytest.approx(np.exp([1j * vector[2] for _, _, vector in expected]))
+    assert [view.id for view in trail.views] == list(ids) and trail.view_times == pytest.approx(
+        10.0 * np.arange(1, 6)
+    )
+
+
+def test_nothing_is_said_without_a_clock_that_both_share() -> None:
+    a, b, rng = twins(0)
+    assert clash(a, b, rng, clocks=("net", "own")) is None
+    assert trails(a, b, clocks=("", "")) == []
+    late = Walk(np.random.default_rng(1), way=b.way)
+    late.times = late.times + 1000.0
+    assert clash(a, late, rng) is None
+
+
+def test_a_robot_does_not_clash_with_itself() -> None:
+    a, b, rng = twins(0)
+    one, two = trails(a, b, agents="aa")
+    assert clash_of(graph(a, b, rng, agents="aa"), one, two) is None
+
+
+def test_a_moment_or_two_prove_nothing() -> None:
+    """One of the poses may be wrong: two robots that are far apart but for one node."""
+    a, b, rng = twins(0)
+    b.moved(np.array([5.0, 0.0]))
+    b.way[10] = a.way[10]
+    assert clash(a, b, rng) is None
+
+
+def test_where_nobody_knows_where_the_robot_was_nothing_is_said() -> None:
+    """Every other node is far away in time, so that the straight line between nodes means nothing."""
+    a, b, rng = twins(0)
+    a.times = 4.0 * a.times
+    b.times = a.times + 6.0
+    assert clash(a, b, rng) is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 10**6), st.sampled_from(["follows", "wanders"]), st.sampled_from([0.005, 0.02, 0.04]),
+    st.booleans(),
+)  # fmt: skip
+def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma: float, wakes: bool) -> None:
+    """They come as near as 0.35 m, centre to centre, again and again: bodies of 0.3 m and a hand between."""
+    rng = np.random.default_rng(seed)
+    a = Walk(rng)
+    way = a.way + rng.normal(0, 0.1, a.way.shape) if manner == "follows" else None
+    b = Walk(rng, way=way)
+    angle = rng.uniform(-np.pi, np.pi)
+    step = 0.02 * np.array([np.cos(angle), np.sin(angle)])
+    while apart(a, b).min() < 0.35:
+        b.moved(step)
+    one, two = trails(a, b, wakes=wakes)
+    assert clash_of(graph(a, b, rng, sigma=sigma), one, two) is None
+
+
+@pytest.mark.parametrize("wakes", [False, True])
+def test_robots_that_nearly_touch_all_the_time_seldom_look_like_a_clash(wakes: bool) -> None:
+    """The bound holds even where bodies are exactly as small as supposed: here at 0.2 m, with loose doubt."""
+    s = ExclusionSettings(doubt=0.1, least_witnesses=1)
+    refused = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        a = Walk(rng)
+        b = Walk(rng, way=a.way + rng.normal(0, 0.1, a.way.shape))
+        while apart(a, b).min() < 0.2:
+            b.moved(np.array([0.02, 0.0]))
+        refused += clash_of(graph(a, b, rng), *trails(a, b, wakes=wakes), s) is not None
+    assert refused <= 10
+
+
+def test_robots_that_tell_how_large_they_are_are_kept_apart_by_that() -> None:
+    """Two that pass at 0.25 m: small ones may, large ones cannot, and one that does not tell may be small."""
+    rng = np.random.default_rng(8)
+    a = Walk(rng)
+    b = Walk(rng, way=a.way + np.array([0.25, 0.0]) + rng.normal(0, 0.03, a.way.shape))
+    b.times = a.times
+    whole = graph(a, b, rng)
+    found = clash_of(whole, *trails(a, b, radii=(0.2, 0.2)))
+    assert found is not None and found.nearest > 0.15
+    for radii in ((0.04, 0.04), (0.0, 0.0), (0.4, 0.0)):
+        assert clash_of(whole, *trails(a, b, radii=radii)) is None
+    tiny = ExclusionSettings(least_apart=0.4)
+    assert clash_of(whole, *trails(a, b, radii=(0.04, 0.04)), tiny) is None
+    assert clash_of(whole, *trails(a, b), tiny) is not None
+
+
+def test_chances_against_many_draws() -> None:
+    rng = np.random.default_rng(3)
+    offsets = rng.uniform(-0.3, 0.3, (20, 2))
+    roots = rng.normal(0, 0.07, (20, 2, 2))
+    spreads = roots @ roots.transpose(0, 2, 1)
+    shifts = rng.uniform(0, 0.05, 20)
+    chances = chances_clear(offsets, shifts, spreads, 0.2)
+    for offset, shift, spread, chance in zip(offsets, shifts, spreads, chances, strict=True):
+        centre = offset * (1 + shift / np.hypot(*offset))
+        draws = rng.multivariate_normal(centre, spread + 1e-4 * np.eye(2), 20000)
+        assert abs((np.hypot(*draws.T) >= 0.2).mean() - chance) < 0.05
+    assert chances_clear(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 2, 2)), 0.2)[0] < 0.02

@@ -1,0 +1,191 @@
+"""Which links are believed: planted false links, alike rooms, cliques against brute force."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import (
+    ConsistencySettings,
+    loop_distances2,
+    sort_links,
+)
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import Link
+
+
+def fragment(agent: str, tour: list[Pose2], rng: np.random.Generator, sigma: float = 0.02) -> Fragment:
+    ids = [NodeId(agent, 1, k) for k in range(len(tour))]
+    steps = []
+    for k in range(len(tour) - 1):
+        noise = Pose2.from_vector(rng.normal(0, [sigma, sigma, sigma / 2]))
+        mean = tour[k].inverse() @ tour[k + 1] @ noise
+        covariance = np.diag([sigma**2, sigma**2, sigma**2 / 4])
+        steps.append(Measurement(ids[k], ids[k + 1], PoseGaussian(mean, covariance)))
+    return Fragment(ids[0], solve_graph(ids[0], Pose2(), steps), tuple(steps))
+
+
+def link(
+    a: Fragment, i: int, b: Fragment, j: int, relative: Pose2, rng: np.random.Generator, inliers: int = 20
+) -> Link:
+    sigmas = np.array([0.03, 0.03, 0.01])
+    mean = relative @ Pose2.from_vector(rng.normal(0, sigmas))
+    evidence = {"inliers": float(inliers), "share": 0.8}
+    return Link(a.nodes[i], b.nodes[j], PoseGaussian(mean, np.diag(sigmas**2)), evidence=evidence)
+
+
+class Two:
+    """Two robots on two tours of the same rooms."""
+
+    def __init__(self, seed: int, n: int = 12) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.tour_a = [Pose2(0.8 * k, 0.3 * np.sin(k), 0.2 * np.cos(k)) for k in range(n)]
+        self.tour_b = [Pose2(0.8 * k + 0.3, 0.5, 0.1 * np.sin(k)) for k in range(n)]
+        self.a, self.b = fragment("a", self.tour_a, self.rng), fragment("b", self.tour_b, self.rng)
+
+    def true_link(self, i: int, j: int, inliers: int = 20) -> Link:
+        return link(self.a, i, self.b, j, self.tour_a[i].inverse() @ self.tour_b[j], self.rng, inliers)
+
+    def false_link(self, i: int, j: int, inliers: int = 20) -> Link:
+        wrong = Pose2(*self.rng.uniform([-1, -1, -0.5], [1, 1, 0.5]))
+        return link(self.a, i, self.b, j, wrong, self.rng, inliers)
+
+    def alike_room(self) -> list[Link]:
+        """Links that take the room at b's nodes 8 to 10, 6.4 m on, for the one at a's nodes 0 to 2."""
+        shift = Pose2(-6.4, 0, 0)
+        return [
+            link(self.a, k, self.b, k + 8, self.tour_a[k].inverse() @ shift @ self.tour_b[k + 8], self.rng)
+            for k in range(3)
+        ]
+
+
+@pytest.mark.parametrize("false_ones", [0, 4, 12])
+def test_planted_false_links_are_refused(false_ones: int) -> None:
+    for seed in range(5):
+        two = Two(seed)
+        true = [two.true_link(k, k) for k in range(0, 12, 2)]
+        false = []
+        for _ in range(false_ones):
+            i = int(two.rng.integers(12))
+            false.append(two.false_link(i, (i + int(two.rng.integers(3, 9))) % 12))
+        found = sort_links([*true, *false], two.a, two.b)
+        kept = {one.pair for one in found.kept}
+        assert not kept & ({one.pair for one in false} - {one.pair for one in true})
+        assert len(kept & {one.pair for one in true}) >= 5
+        assert all(one.reason for one in found.refused)
+
+
+def test_loop_misclosures_are_calibrated() -> None:
+    values = []
+    for seed in range(40):
+        two = Two(seed)
+        links = [two.true_link(1, 1), two.true_link(9, 8)]
+        s = ConsistencySettings(floor_xy=1e-4, floor_heading=1e-4)
+        values.append(loop_distances2(links, two.a, two.b, s)[0, 1])
+    assert 2.0 < np.mean(values) < 4.2
+
+
+def test_alike_room_is_refused_when_the_right_one_is_better_supported() -> None:
+    """Links between rooms that look alike agree with each other and are wrong."""
+    two = Two(3)
+    aliased = two.alike_room()
+    # They really close loops with each other: nothing but better support can tell that they are wrong.
+    assert (loop_distances2(aliased, two.a, two.b, ConsistencySettings()) < 11.34).mean() > 0.7
+    right = [two.true_link(k, k) for k in range(0, 12, 2)]
+    found = sort_links([*aliased, *right], two.a, two.b)
+    kept = {one.pair for one in found.kept}
+    assert len(kept) >= 5 and kept <= {one.pair for one in right}
+    assert {one.pair for one in aliased} <= {one.pair for one in found.refused if "contradicts" in one.reason}
+
+
+def test_two_stories_that_are_supported_alike_are_both_refused() -> None:
+    two = Two(4)
+    aliased = two.alike_room()
+    right = [two.true_link(k, k) for k in range(3)]
+    found = sort_links([*aliased, *right], two.a, two.b)
+    assert not found.kept
+    assert len(found.refused) == 6 and all("ambiguous" in one.reason for one in found.refused)
+
+
+def test_one_place_is_not_believed_for_its_many_links_where_another_contradicts_it() -> None:
+    """A corner like another gave five links, the corridor that both came by four of half the weight."""
+    two = Two(8, n=16)
+    shift = Pose2(-8.0, 0.0, 0.0)
+    corner = [(0, 10), (0, 11), (1, 10), (1, 11), (1, 12)]
+    alike = [
+        link(two.a, i, two.b, j, two.tour_a[i].inverse() @ shift @ two.tour_b[j], two.rng, 30)
+        for i, j in corner
+    ]
+    true = [two.true_link(i, j, 15) for i, j in ((7, 7), (7, 8), (8, 7), (8, 8))]
+    assert len(sort_links(alike, two.a, two.b).kept) == 5
+    found = sort_links([*alike, *true], two.a, two.b)
+    assert not found.kept and len(found.rivals) == 2
+    assert all("with 1.0 and 1.0 independent places" in one.reason for one in found.refused)
+    # One link that contradicts is no other story; and two further places decide between the two.
+    assert len(sort_links([*alike, true[0]], two.a, two.b).kept) == 5
+    more = [two.true_link(k, k, 50) for k in (0, 1, 14, 15)]
+    kept = {one.pair for one in sort_links([*alike, *true, *more], two.a, two.b).kept}
+    assert kept == {one.pair for one in [*true, *more]}
+
+
+def test_one_link_is_too_little_unless_overwhelming() -> None:
+    two = Two(5)
+    found = sort_links([two.true_link(2, 2)], two.a, two.b)
+    assert not found.kept and "no 2 links that share no node agree" in found.refused[0].reason
+    assert len(sort_links([two.true_link(2, 2, inliers=60)], two.a, two.b).kept) == 1
+
+
+def test_links_at_one_node_are_one_witness() -> None:
+    two = Two(6)
+    found = sort_links([two.true_link(2, 2), two.true_link(2, 3)], two.a, two.b)
+    assert not found.kept
+    assert independent_links([two.true_link(2, 2), two.true_link(2, 3)], 9) == 1
+    assert independent_links([two.true_link(2, 2), two.true_link(2, 3), two.true_link(3, 2)], 9) == 2
+
+
+def test_loops_within_a_map_must_agree_with_its_own_way() -> None:
+    two = Two(7)
+    a, tour = two.a, two.tour_a
+    true = [link(a, i, a, j, tour[i].inverse() @ tour[j], two.rng) for i, j in ((0, 9), (2, 11), (1, 7))]
+    false = link(a, 3, a, 10, Pose2(0.2, 0.1, 0.0), two.rng, inliers=90)
+    found = sort_links([*true, false], a, a)
+    assert {one.pair for one in found.kept} == {one.pair for one in true}
+    assert "own way" in found.refused[0].reason
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 9), st.integers(0, 10**6))
+def test_best_clique_against_brute_force(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    agree = np.triu(rng.random((n, n)) < 0.6, 1)
+    agree = agree | agree.T
+    weights = rng.integers(1, 30, n)
+    best = max(
+        int(weights[list(subset)].sum())
+        for size in range(1, n + 1)
+        for subset in combinations(range(n), size)
+        if all(agree[i, j] for i, j in combinations(subset, 2))
+    )
+    clique = best_clique(agree, weights)
+    assert all(agree[i, j] for i, j in combinations(clique, 2))
+    assert weights[clique].sum() == best
+    greedy = best_clique(agree, weights, exact=0)
+    assert all(agree[i, j] for i, j in combinations(greedy, 2))
+    assert weights[greedy].sum() >= weights.max()
+
+
+def test_greedy_clique_finds_a_planted_one() -> None:
+    rng = np.random.default_rng(2)
+    agree = np.triu(rng.random((120, 120)) < 0.2, 1)
+    planted = np.sort(rng.choice(120, 30, replace=False))
+    agree[np.ix_(planted, planted)] = True
+    agree = np.triu(agree, 1)
+    agree = agree | agree.T
+    assert set(planted) <= set(best_clique(agree, np.full(120, 20)))

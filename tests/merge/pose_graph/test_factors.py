@@ -1,0 +1,102 @@
+"""The pose graph's columns against matrices of the group and finite differences of them."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Factors, Measurement
+
+HUBER = 1.5
+NODES = 6
+
+
+def matrix(pose: Array) -> Array:
+    """(3, 3) of a pose [x m, y m, heading rad]."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array([[c, -s, pose[0]], [s, c, pose[1]], [0.0, 0.0, 1.0]])
+
+
+def vector(motion: Array) -> Array:
+    """(3,) m, m, rad of a matrix."""
+    return np.array([motion[0, 2], motion[1, 2], math.atan2(motion[1, 0], motion[0, 0])])
+
+
+def drawn(seed: int, noise: float) -> tuple[Array, list[Measurement]]:
+    """(N, 3) poses, and measurements between them, some of which may be wrong."""
+    rng = np.random.default_rng(seed)
+    means = rng.normal(0.0, 1.0, (NODES, 3))
+    measurements = []
+    for a in range(NODES):
+        for b in range(a + 1, NODES):
+            root = 0.1 * rng.normal(0.0, 1.0, (3, 3))
+            off = matrix(rng.normal(0.0, noise, 3))
+            between = vector(np.linalg.inv(matrix(means[a])) @ matrix(means[b]) @ off)
+            said = PoseGaussian(Pose2.from_vector(between), root @ root.T + 0.01 * np.eye(3))
+            measurements.append(Measurement(NodeId("a", 1, a), NodeId("a", 1, b), said, bool((a + b) % 2)))
+    return means, measurements
+
+
+def factors_of(measurements: list[Measurement]) -> Factors:
+    return Factors.of(measurements, [m.a.number for m in measurements], [m.b.number for m in measurements])
+
+
+def residual(m: Measurement, a: Array, b: Array) -> Array:
+    measured = matrix(m.a_from_b.mean.vector)
+    return vector(np.linalg.inv(measured) @ np.linalg.inv(matrix(a)) @ matrix(b))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_strains_are_those_of_the_group(seed: int) -> None:
+    means, measurements = drawn(seed, 0.3)
+    found = factors_of(measurements).strains(means)
+    for m, strain in zip(measurements, found, strict=True):
+        off = residual(m, means[m.a.number], means[m.b.number])
+        information = np.linalg.inv(m.a_from_b.covariance + np.diag(LEAST_SIGMAS**2))
+        assert strain == pytest.approx(off @ information @ off)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_information_is_that_of_finite_differences(seed: int) -> None:
+    """To first order in the residuals, so they are small here; what is far off is held back."""
+    means, measurements = drawn(seed, 1e-5)
+    far = Measurement(NodeId("a", 1, 0), NodeId("a", 1, 5), PoseGaussian(Pose2(9, 9, 0), np.eye(3)), True)
+    found = factors_of([*measurements, far]).information(means, HUBER).toarray()
+    expected = np.zeros((3 * NODES, 3 * NODES))
+    for m in [*measurements, far]:
+        i, j, step = m.a.number, m.b.number, 1e-5
+        weight = np.linalg.inv(m.covariance)
+        held = m
+        if m is far:
+            off = residual(m, means[i], means[j])
+            weight *= HUBER / math.sqrt(off @ weight @ off)
+            # Its derivative is taken where it would agree.
+            between = vector(np.linalg.inv(matrix(means[i])) @ matrix(means[j]))
+            held = Measurement(m.a, m.b, PoseGaussian(Pose2.from_vector(between), np.eye(3)), True)
+        slopes = np.zeros((3, 3 * NODES))
+        for k in range(3):
+            move = matrix(step * np.eye(3)[k])
+            back = matrix(-step * np.eye(3)[k])
+            for row, ends in ((i, 0), (j, 1)):
+                poses = [[means[i], means[j]] for _ in range(2)]
+                poses[0][ends] = vector(matrix(means[row]) @ move)
+                poses[1][ends] = vector(matrix(means[row]) @ back)
+                slopes[:, 3 * row + k] = (residual(held, *poses[0]) - residual(held, *poses[1])) / (2 * step)
+        expected += slopes.T @ weight @ slopes
+    assert np.allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_neighbours_are_found_ring_by_ring() -> None:
+    """Along a chain of ten nodes, from its middle."""
+    step = PoseGaussian(Pose2(1.0, 0.0, 0.0), np.eye(3))
+    ids = [NodeId("a", 1, k) for k in range(10)]
+    chain = factors_of([Measurement(a, b, step) for a, b in pairwise(ids)])
+    assert sorted(chain.around(np.array([5]), 1, 10)) == [5]
+    assert sorted(chain.around(np.array([5]), 4, 10)) == [3, 4, 5, 6, 7]
+    assert sorted(chain.around(np.array([0]), 99, 10)) == list(range(10))
+    assert chain.at(np.array([3, 4])).tolist() == [2, 3, 4]

@@ -1,0 +1,64 @@
+"""The choice of pairs, change by change, against the choice made anew."""
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.pose_graph.candidates import CandidateSettings, Pair, choose_pairs
+from mapweave.merge.pose_graph.pairs import PairTable
+
+STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_it_chooses_what_is_chosen_anew(seed: int) -> None:
+    """Nodes come, go and are known better, edges come and go; all that has changed is told once."""
+    rng = np.random.default_rng(seed)
+    settings = CandidateSettings(most_per_map=2, least_hops=int(rng.integers(1, 4)))
+    nodes = [NodeId("abc"[k % 3], 1, k) for k in range(24)]
+    table, overlaps, edges = PairTable(settings), dict[Pair, float](), dict[EdgeId, Edge]()
+    known: set[Pair] = set()
+    there: set[NodeId] = set()
+    for number in range(150):
+        what = rng.random()
+        node = nodes[int(rng.integers(len(nodes)))]
+        if what < 0.5:
+            found = {n: float(rng.uniform(2, 9)) for n in there - {node} if rng.random() < 0.4}
+            table.forget(node)
+            table.put(node, found)
+            there.add(node)
+            overlaps = {pair: value for pair, value in overlaps.items() if node not in pair}
+            overlaps |= {(min(node, n), max(node, n)): value for n, value in found.items()}
+        elif what < 0.6:
+            table.forget(node)
+            there.discard(node)
+            overlaps = {pair: value for pair, value in overlaps.items() if node not in pair}
+        elif what < 0.85 or not edges:
+            other = nodes[int(rng.integers(len(nodes)))]
+            edge = Edge(EdgeId("e", 1, number), node, other, STEP, EdgeKind.MAPPED)
+            edges[edge.id] = edge
+            table.connect(edge.a, edge.b)
+        else:
+            gone = edges.pop(list(edges)[int(rng.integers(len(edges)))])
+            table.disconnect(gone.a, gone.b)
+        if what < 0.6 and rng.random() < 0.5:
+            near = [p for p in choose_pairs(overlaps, edges.values(), settings) if node in p]
+            assert table.of(node) == near
+        if rng.random() < 0.4:
+            wanted = set(choose_pairs(overlaps, edges.values(), settings))
+            changed = set(table.changed())
+            assert changed >= wanted ^ known
+            assert all((pair in table) == (pair in wanted) for pair in changed | wanted | known)
+            known = wanted
+
+
+def test_a_node_that_is_known_better_has_its_pairs_told_again() -> None:
+    a, b = NodeId("a", 1, 1), NodeId("b", 1, 1)
+    table = PairTable()
+    table.put(a, {})
+    table.put(b, {a: 5.0})
+    assert table.changed() == [(a, b)] and table.changed() == []
+    table.forget(b)
+    table.put(b, {a: 6.0})
+    assert table.changed() == [(a, b)] and (a, b) in table

@@ -1,0 +1,162 @@
+"""The pose graph against an independent least squares."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.pose_graph import solved_graph
+from mapweave.merge.pose_graph.component import solve_graph
+from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+IDS = [NodeId("a", 1, k) for k in range(8)]
+
+
+def random_graph(seed: int, loops: int = 4) -> tuple[list[Pose2], list[Measurement]]:
+    rng = np.random.default_rng(seed)
+    true = [Pose2(*rng.uniform([-5, -5, -3], [5, 5, 3])) for _ in IDS]
+    pairs = [(k, k + 1) for k in range(7)] + [tuple(rng.choice(8, 2, replace=False)) for _ in range(loops)]
+    measurements = []
+    for i, j in pairs:
+        sigmas = rng.uniform([0.02, 0.02, 0.01], [0.1, 0.1, 0.05])
+        mean = true[i].inverse() @ true[j] @ Pose2.from_vector(rng.normal(0, sigmas))
+        measurements.append(Measurement(IDS[i], IDS[j], PoseGaussian(mean, np.diag(sigmas**2))))
+    return true, measurements
+
+
+def logarithm(pose: Pose2) -> np.ndarray:
+    """(3,) the twist that leads to a pose in unit time: the residual that GTSAM minimises."""
+    half = pose.heading / 2
+    along = half / np.tan(half) if abs(half) > 1e-8 else 1.0
+    return np.array([along * pose.x + half * pose.y, along * pose.y - half * pose.x, pose.heading])
+
+
+def scipy_optimum(true: list[Pose2], measurements: list[Measurement]) -> tuple[np.ndarray, np.ndarray]:
+    """(8, 3) poses, and (8, 3, 3) covariances in the moving frames, with the first node held."""
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        poses = [true[0], *(Pose2.from_vector(p) for p in x.reshape(-1, 3))]
+        out = []
+        for m in measurements:
+            relative = poses[m.a.number].inverse() @ poses[m.b.number]
+            d = logarithm(m.a_from_b.mean.inverse() @ relative)
+            root = np.linalg.inv(np.linalg.cholesky(m.a_from_b.covariance + np.diag(LEAST_SIGMAS**2)))
+            out.append(root @ d)
+        return np.concatenate(out)
+
+    start = np.concatenate([p.vector for p in true[1:]])
+    optimum = scipy.optimize.least_squares(residuals, start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    joint = np.linalg.inv(optimum.jac.T @ optimum.jac)
+    means = np.vstack([true[0].vector, optimum.x.reshape(-1, 3)])
+    covariances = np.zeros((8, 3, 3))
+    for k in range(1, 8):
+        turn = np.eye(3)
+        turn[:2, :2] = Pose2.from_vector(means[k]).rotation
+        block = joint[3 * k - 3 : 3 * k, 3 * k - 3 : 3 * k]
+        covariances[k] = turn.T @ block @ turn
+    return means, covariances
+
+
+def test_optimum_and_covariances_against_scipy() -> None:
+    for seed in range(4):
+        true, measurements = random_graph(seed)
+        graph = solve_graph(IDS[0], true[0], measurements)
+        means, covariances = scipy_optimum(true, measurements)
+        assert np.allclose(graph.means[:, :2], means[:, :2], atol=1e-4)
+        assert np.allclose(np.sin(graph.means[:, 2] - means[:, 2]), 0, atol=1e-4)
+        found = np.stack([graph.poses()[i].covariance for i in IDS])
+        assert np.allclose(found, covariances, rtol=0.08, atol=2e-5)
+
+
+def test_a_tree_is_solved_by_composition() -> None:
+    true, measurements = random_graph(5, loops=0)
+    graph = solve_graph(IDS[0], true[0], measurements)
+    chained = PoseGaussian(true[0], np.zeros((3, 3)))
+    for k in range(7):
+        relative = PoseGaussian(measurements[k].a_from_b.mean, measurements[k].covariance)
+        chained = chained @ relative
+        pose = graph.poses()[IDS[k + 1]]
+        assert pose.mean.distance(chained.mean) < 1e-9
+        assert np.allclose(pose.covariance, chained.covariance, rtol=1e-4, atol=1e-8)
+
+
+def test_relative_covariance_against_sampling_the_joint() -> None:
+    true, measurements = random_graph(6)
+    graph = solve_graph(IDS[0], true[0], measurements)
+    rng = np.random.default_rng(1)
+    i, j = 3, 6
+    joint = graph.covariance([IDS[i], IDS[j]]).reshape(6, 6)
+    samples = rng.multivariate_normal(np.zeros(6), joint, 20_000)
+    a, b = graph.pose(IDS[i]), graph.pose(IDS[j])
+    relative = (a.inverse() @ b).inverse()
+    deviations = np.array(
+        [
+            (relative @ (a @ Pose2.from_vector(d[:3])).inverse() @ (b @ Pose2.from_vector(d[3:]))).vector
+            for d in samples[:4000]
+        ]
+    )
+    found = graph.relative([IDS[i]], [IDS[j]])
+    assert np.allclose(np.cov(deviations.T), found.covariances[0], rtol=0.12, atol=2e-4)
+    assert np.allclose(found.means[0][:2], (a.inverse() @ b).vector[:2])
+
+
+def test_covariances_are_calibrated() -> None:
+    distances = []
+    for seed in range(40):
+        true, measurements = random_graph(seed + 100)
+        graph = solve_graph(IDS[0], true[0], measurements)
+        distances.append(graph.poses()[IDS[7]].mahalanobis2(true[7]))
+    assert 2.2 < np.mean(distances) < 3.9
+
+
+def test_robust_measurements_pull_less() -> None:
+    true, measurements = random_graph(7)
+    wrong = PoseGaussian.from_sigmas(Pose2(3.0, 3.0, 1.0), 0.05, 0.02)
+
+    def off(graph: PoseGraph) -> float:
+        return max(graph.pose(i).distance(true[k]) for k, i in enumerate(IDS))
+
+    plain = solve_graph(IDS[0], true[0], [*measurements, Measurement(IDS[1], IDS[5], wrong)])
+    robust = solve_graph(IDS[0], true[0], [*measurements, Measurement(IDS[1], IDS[5], wrong, robust=True)])
+    assert off(robust) < 0.5 * off(plain)
+
+
+def test_order_does_not_matter_and_what_is_not_connected_is_left_out() -> None:
+    true, measurements = random_graph(8)
+    apart = Measurement(NodeId("z", 1, 1), NodeId("z", 1, 2), measurements[0].a_from_b)
+    one = solve_graph(IDS[0], true[0], [*measurements, apart])
+    two = solve_graph(IDS[0], true[0], [apart, *measurements[::-1]])
+    assert one.nodes == two.nodes == tuple(IDS)
+    assert np.array_equal(one.means, two.means)
+    alone = solve_graph(IDS[3], true[3], [])
+    assert alone.nodes == (IDS[3],)
+    assert np.allclose(alone.means[0], true[3].vector)
+
+
+def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    true, measurements = random_graph(9)
+    graph = solve_graph(IDS[0], true[0], measurements)
+    joint = graph.covariance(graph.nodes)
+    monkeypatch.setattr(solved_graph, "AT_ONCE", 3)
+    found = graph.poses()
+    assert list(found) == IDS
+    for k, node in enumerate(IDS):
+        assert np.allclose(found[node].covariance, joint[k, :, k, :], rtol=1e-9, atol=1e-14)
+        assert np.array_equal(found[node].mean.vector, graph.means[k])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_covariance_that_is_hardly_one_makes_a_graph_all_the_same(seed: int) -> None:
+    """Of any rank, with the greatest variance there is, and an eigenvalue that rounding made negative."""
+    rng = np.random.default_rng(seed)
+    measurements = []
+    for k in range(7):
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        covariance = axes * [1e4, 1e4 * rng.integers(0, 2), -3e-3 * rng.integers(0, 2)] @ axes.T
+        step = PoseGaussian(Pose2(*rng.uniform(-5, 5, 3)), covariance)
+        measurements.append(Measurement(IDS[k], IDS[k + 1], step))
+        assert np.linalg.eigvalsh(measurements[-1].covariance)[0] > 0.0
+    graph = solve_graph(IDS[0], Pose2(), [*measurements, measurements[0]])
+    assert all(np.isfinite(pose.covariance).all() for pose in graph.poses().values())

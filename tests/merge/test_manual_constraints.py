@@ -1,0 +1,104 @@
+"""What a person has ruled out is not merged, whatever comes, until it is taken back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.explanation.map_explanation import explain_maps
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from synthetic.world import room, take_map
+
+A, B = MapId("a", 1), MapId("b", 1)
+NOON = 1_772_366_400_000_000_000
+"""2026-03-01 12:00 UTC."""
+
+
+@pytest.fixture
+def merger() -> Merger:
+    """Two robots have looked around in one room."""
+    rng = np.random.default_rng(3)
+    world = room(0, 0, 5, 4, 700, rng)
+    stops = [Pose2(2.4 + 0.05 * k, 2.0, 0.7 * k) for k in range(6)]
+    merger = Merger()
+    for map_id in (A, B):
+        nodes, edges = take_map(world, map_id, stops, rng)
+        for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+            merger.apply(map_id, body)
+    return merger
+
+
+def between(merged: MergedMap) -> set[tuple[NodeId, NodeId]]:
+    return {link.pair for link in merged.links if not link.within}
+
+
+def test_one_link_is_undone_and_comes_back(merger: Merger) -> None:
+    before = merger.merged()
+    pair = before.links[0].pair
+    apart = ManualConstraint(pair, True, "anna", NOON, "two kitchens")
+    merger.rule(ManualConstraints([apart]))
+    after = merger.merged()
+    assert pair not in {link.pair for link in after.links}
+    (refusal,) = [r for r in after.refused if r.pair == pair]
+    assert refusal.reason == 'undone by anna on 2026-03-01 12:00 UTC: "two kitchens"'
+    assert refusal.link is not None
+    assert after.rulings.in_force == (apart,)
+    merger.rule(ManualConstraints([apart, ManualConstraint(pair, False, "bob", NOON + 1)]))
+    again = merger.merged()
+    assert [link.pair for link in again.links] == [link.pair for link in before.links]
+    for node, place in before.poses.items():
+        assert np.array_equal(
+            place.merged_from_robot.mean.vector, again.poses[node].merged_from_robot.mean.vector
+        )
+
+
+def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) -> None:
+    assert merger.merged().joined(A, B)
+    merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", NOON)]))
+    apart = merger.merged()
+    assert not between(apart) and not apart.joined(A, B)
+    assert all("all links between a.1 and b.1" in r.reason for r in apart.refused if r.link is not None)
+    node = merger.node(min(apart.components[0]))
+    assert node is not None
+    merger.on_change(Change(node.id.map, 99, 0, NodePut(node)))  # known better: its links are found anew
+    assert not merger.merged().joined(A, B)
+
+
+def test_who_parts_two_maps_that_a_third_joins_is_told_how(merger: Merger) -> None:
+    rng = np.random.default_rng(3)
+    world = room(0, 0, 5, 4, 700, rng)
+    third = MapId("c", 1)
+    nodes, edges = take_map(world, third, [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)], rng)
+    for body in [*map(NodePut, nodes), *map(EdgePut, edges)]:
+        merger.apply(third, body)
+    assert "links join them" in explain_maps(merger.merged(), A, B).reason
+    merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", NOON)]))
+    told = explain_maps(merger.merged(), A, B).reason
+    assert "by way of c.1; no link joins the two directly, as was ruled" in told and "undo the links" in told
+    merger.rule(
+        ManualConstraints(
+            [ManualConstraint((A, B), True, "anna", NOON), ManualConstraint((A, third), True, "anna", NOON)]
+        )
+    )
+    assert explain_maps(merger.merged(), A, B).reason.startswith("a.1 and b.1 are not one map")
+
+
+def test_a_robot_s_own_loop_can_be_undone_and_its_way_cannot(merger: Merger) -> None:
+    one = merger.maps[A]
+    nodes = sorted(one.nodes)
+    way = next(e for e in one.edges.values() if {e.a, e.b} == set(nodes[:2]))
+    true = one.nodes[nodes[0]].map_from_robot.inverse() @ one.nodes[nodes[4]].map_from_robot
+    loop = Edge(NodeId("a", 1, 50), nodes[0], nodes[4], true, EdgeKind.LOOP)
+    merger.apply(A, EdgePut(loop))
+    assert loop.id in merger.merged().union().edges
+    made = [ManualConstraint((nodes[0], nodes[k]), True, "anna", NOON) for k in (1, 4)]
+    merger.rule(ManualConstraints(made))
+    merged = merger.merged()
+    assert [r.pair for r in merged.refused if r.edge == loop.id] == [(nodes[0], nodes[4])]
+    assert loop.id not in merged.union().edges and way.id in merged.union().edges
+    assert loop.id in merged.maps[A].edges, "the maps themselves are kept whole"

@@ -1,0 +1,82 @@
+"""The old file or the new one, never a part of either."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage.atomic_file import check_place, write_whole
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """A disk that takes 1000 bytes a file."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, small_files: None) -> None:
+    path = tmp_path / "x"
+    write_whole(path, b"old")
+    with pytest.raises(InvalidFile, match=r"x: cannot be written \(File too large\)"):
+        write_whole(path, b"new" * 1000)
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_who_interrupts_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "x"
+    write_whole(path, b"old")
+
+    def interrupted(handle: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(path, b"new")
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_to_a_file_stays_a_link(tmp_path: Path) -> None:
+    path, link = tmp_path / "x", tmp_path / "link"
+    path.write_bytes(b"old")
+    link.symlink_to(path)
+    write_whole(link, b"new")
+    assert link.is_symlink() and path.read_bytes() == b"new"
+
+
+def test_a_pipe_is_written_into(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_whole(pipe, b"new")
+        assert os.read(reader, 100) == b"new" and pipe.is_fifo()
+    finally:
+        os.close(reader)
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("", "Is a directory"),
+        ("nowhere/x", "there is no folder .*nowhere"),
+        ("file/x", "there is no folder .*file"),
+    ],
+)
+def test_places_where_no_file_can_be(tmp_path: Path, place: str, words: str) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    for path in (tmp_path / place, Path("." if not place else f"{tmp_path}/{place}")):
+        with pytest.raises(InvalidFile, match=words):
+            check_place(path)
+        with pytest.raises(InvalidFile, match=words):
+            write_whole(path, b"new")

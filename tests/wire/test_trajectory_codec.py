@@ -1,0 +1,73 @@
+"""Wakes on the wire."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ranges import Ranges
+from mapweave.hybridmap.trajectory_segment import MOST, TrajectorySegment
+from mapweave.wire.trajectory_codec import pack_trajectory, unpack_trajectory
+
+TWO = Ranges(np.array([0.0, 1.0]), np.array([2.0, 0.5]), 2.0)
+
+
+@given(st.binary(max_size=80), st.sampled_from([TWO, Ranges()]))
+def test_any_bytes_are_a_wake_or_refused_and_encode_to_themselves(data, ranges):
+    try:
+        wake = unpack_trajectory(data, ranges)
+    except InvalidMessage:
+        return
+    again = pack_trajectory(wake, ranges.reach)
+    back = unpack_trajectory(again, ranges)
+    assert back.node_from_robot == pytest.approx(wake.node_from_robot) and len(again) == len(data)
+    assert pack_trajectory(back, ranges.reach) == again
+    assert (wake.distances <= ranges.reach).all()
+
+
+def test_the_layout_is_the_one_that_is_written_down():
+    """Columns of little-endian numbers, read by struct."""
+    wake = TrajectorySegment(
+        np.array([-1.5, 2.25]),
+        np.array([[-0.5, 0.25, 1.0], [1.234, -2.0, -3.0]]),
+        np.array([[2.0, 1.0], [0.0, 0.5]]),
+    )
+    data = pack_trajectory(wake, TWO.reach)
+    numbers = struct.unpack("<2h 2h 2h 2h 4B", data)
+    assert numbers == (-150, 225, -500, 1234, 250, -2000, 10000, -30000, 255, 127, 0, 64)
+
+
+def test_a_moment_with_sixteen_sensors_costs_24_bytes():
+    wake = TrajectorySegment(np.arange(3.0), np.zeros((3, 3)), np.ones((3, 16)))
+    assert len(pack_trajectory(wake, 3.0)) == 3 * 24
+
+
+@pytest.mark.parametrize("size", [1, 7, 9, 11, 10 * MOST + 10], ids=str)
+def test_other_lengths_are_refused(size):
+    with pytest.raises(InvalidMessage, match="wake"):
+        unpack_trajectory(bytes(size), TWO)
+
+
+@pytest.mark.parametrize(
+    ("ages", "poses", "distances"),
+    [([0.0], [[0.0, 0.0]], [[]]), ([0.0, 1.0], [[0.0] * 3], [[]]), ([1.0, 0.0], [[0.0] * 3] * 2, [[], []]),
+     ([np.nan], [[0.0] * 3], [[]]), ([301.0], [[0.0] * 3], [[]]), ([0.0], [[31.0, 0.0, 0.0]], [[]]),
+     ([0.0], [[0.0, 0.0, np.inf]], [[]]),
+     (range(MOST + 1), np.zeros((MOST + 1, 3)), np.zeros((MOST + 1, 0)))],
+)  # fmt: skip
+def test_what_does_not_belong_together_is_refused(ages, poses, distances):
+    with pytest.raises(InvalidValue, match="wake"):
+        TrajectorySegment(np.array(ages, float), np.array(poses, float), np.array(distances, float))
+
+
+@pytest.mark.parametrize("distances", [[[1.0]], [[1.0, 3.0]], [[1.0, -0.1]], [[1.0, np.nan]]])
+def test_a_node_takes_no_wake_of_other_sensors(some, distances):
+    node = replace(some.node(), ranges=TWO)
+    with pytest.raises(InvalidValue, match="wake"):
+        replace(node, wake=TrajectorySegment(np.zeros(1), np.zeros((1, 3)), np.array(distances)))

@@ -1,0 +1,257 @@
+"""Many symbols at once, each for the bits that its frequency is worth: asymmetric numeral systems in lanes.
+
+Each lane is a state in [2^m, 2^(m+1)) to which symbols are pushed and from which they come back last in,
+first out (Duda, arXiv:1311.2540, the variant with ranges; side by side after Giesen, arXiv:1402.3392). A
+symbol of frequency f of 2^12 costs 12 - log2(f) bits. What does not fit into the state any more goes to the
+stream bit by bit; so a lane costs its m bits at the end and hardly half a bit more, and its first state may
+hold m bits of something else. All lanes move together: a column is a few operations on arrays, which numba
+compiles where it is installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.jit import compiled
+from mapweave.hybridmap.landmark_tables import TOTAL_BITS
+
+TOTAL = 1 << TOTAL_BITS
+Ints = Annotated[NDArray[np.int64], 1]
+Small = Annotated[NDArray[np.uint16], 2]
+Bytes = Annotated[NDArray[np.uint8], 2]
+Lanes = Ints | slice
+EVERY = slice(None)
+CUT_OFF = "landmarks: cut off"
+
+
+def log2(numbers: Ints) -> Ints:
+    """Whole part of the binary logarithm of numbers from 1."""
+    return np.frexp(numbers)[1].astype(np.int64) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """Frequencies of one column's symbols.
+
+    Attributes:
+        frequencies: (S,) int64, with sum 2^12.
+    """
+
+    frequencies: Ints
+
+    @cached_property
+    def starts(self) -> Ints:
+        """(S,) sum of the frequencies before each symbol."""
+        return np.cumsum(self.frequencies) - self.frequencies
+
+    @cached_property
+    def symbols(self) -> Ints:
+        """(4096,) symbol of each slot."""
+        return np.repeat(np.arange(len(self.frequencies)), self.frequencies)
+
+    @cached_property
+    def widths(self) -> Ints:
+        """(4096,) frequency of each slot's symbol."""
+        return self.frequencies[self.symbols]
+
+    @cached_property
+    def places(self) -> Ints:
+        """(4096,) number of each slot among those of its symbol."""
+        return np.arange(TOTAL) - self.starts[self.symbols]
+
+
+class Columns(NamedTuple):
+    """Columns that are read one after the other, by the slot of a state; see Column.
+
+    They are small, because all of them are needed for each landmark.
+
+    Attributes:
+        symbols: (K, 4096).
+        widths: (K, 4096).
+        places: (K, 4096).
+        missing: (K, 4096) bits that a state lacks at least after a symbol has been taken out of it.
+    """
+
+    symbols: Small
+    widths: Small
+    places: Small
+    missing: Small
+
+    @staticmethod
+    def of(columns: Sequence[Column]) -> Columns:
+        """Some columns, in the order of reading."""
+        symbols, widths, places = (
+            np.stack([getattr(column, name) for column in columns]).astype(np.uint16)
+            for name in ("symbols", "widths", "places")
+        )
+        missing = np.maximum(TOTAL_BITS - 1 - log2(widths.astype(np.int64)), 0)
+        return Columns(symbols, widths, places, missing.astype(np.uint16))
+
+
+@compiled
+def pop_columns(
+    columns: Columns, windows: Ints, at: int, end: int, size: int, states: Ints, symbols: Bytes
+) -> int:
+    """Take one symbol out of each lane for each of K columns.
+
+    Args:
+        columns: to read.
+        windows: of the bits, see BitReader.
+        at: bit from which on it reads.
+        end: bits that there are.
+        size: m, of the lanes.
+        states: (N,) of the lanes, changed.
+        symbols: (K, N) is filled.
+
+    Returns:
+        The bit behind what it has read; beyond the end if there were not enough.
+    """
+    full = 1 << size
+    for k in range(len(symbols)):
+        slots = states & (TOTAL - 1)
+        symbols[k] = columns.symbols[k][slots]
+        left = columns.widths[k][slots] * (states >> TOTAL_BITS) + columns.places[k][slots]
+        bits = columns.missing[k][slots].astype(np.int64)
+        bits += (left << bits) < full
+        ends = np.cumsum(bits) + at
+        if len(ends):
+            at = ends[-1]
+        if at > end:
+            break
+        begins = ends - bits
+        states[:] = (left << bits) | (windows[begins >> 3] >> (40 - bits - (begins & 7)) & ((1 << bits) - 1))
+    return at
+
+
+@dataclass(eq=False)
+class LaneWriter:
+    """Lanes into which symbols go. What is pushed last is read first.
+
+    Attributes:
+        states: (N,) int64 in [2^m, 2^(m+1)).
+        size: m, 12 to 32.
+    """
+
+    states: Ints
+    size: int
+    _bits: list[tuple[Ints, Ints]] = field(default_factory=list)
+
+    def push(self, symbols: Ints, column: Column, lanes: Lanes = EVERY) -> None:
+        """One symbol of a column for each lane; none may be of frequency 0."""
+        self._push(lanes, column.frequencies[symbols], column.starts[symbols])
+
+    def push_plain(self, numbers: Ints, widths: Ints, lanes: Lanes = EVERY) -> None:
+        """A number of 0 to 12 bits for each lane, all alike likely."""
+        left = TOTAL_BITS - widths
+        self._push(lanes, 1 << left, numbers << left)
+
+    def _push(self, lanes: Lanes, frequencies: Ints, starts: Ints) -> None:
+        states = self.states[lanes]
+        out = TOTAL_BITS - log2(frequencies)
+        out -= (states >> out) < (frequencies << (self.size - TOTAL_BITS))
+        self._bits.append((states & ((1 << out) - 1), out))
+        whole, rest = np.divmod(states >> out, frequencies)
+        self.states[lanes] = (whole << TOTAL_BITS) + starts + rest
+
+    def finish(self) -> tuple[Ints, Ints]:
+        """Numbers and their widths in bits in the order of reading: last states, then the rest."""
+        widths = np.full(len(self.states), self.size)
+        parts = [(self.states - (1 << self.size), widths), *reversed(self._bits)]
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+
+class LaneReader:
+    """Lanes from which symbols come."""
+
+    def __init__(self, bits: BitReader, count: int, size: int) -> None:
+        """Read the last states of so many lanes of m bits."""
+        self._bits, self._size = bits, size
+        self.states = bits.read(np.full(count, size, np.int64)) + (1 << size)
+
+    def pop(self, columns: Columns, lanes: Lanes = EVERY) -> Bytes:
+        """(K, N) one symbol of each lane for each of K columns.
+
+        Raises:
+            InvalidMessage: there are not enough bits.
+        """
+        bits, states = self._bits, self.states[lanes]
+        symbols = np.empty((len(columns.symbols), len(states)), np.uint8)
+        bits.at = pop_columns(columns, bits.windows, bits.at, bits.length, self._size, states, symbols)
+        if bits.at > bits.length:
+            raise InvalidMessage(CUT_OFF)
+        self.states[lanes] = states
+        return symbols
+
+    def pop_plain(self, widths: Ints, lanes: Lanes = EVERY) -> Ints:
+        """A number of 0 to 12 bits of each lane."""
+        states, left = self.states[lanes], TOTAL_BITS - widths
+        slots = states & (TOTAL - 1)
+        numbers = slots >> left
+        states = ((states >> TOTAL_BITS) << left) + slots - (numbers << left)
+        missing = self._size - log2(states)
+        self.states[lanes] = (states << missing) | self._bits.read(missing)
+        return numbers
+
+
+class BitReader:
+    """Numbers of so many bits each, first bit first.
+
+    Attributes:
+        windows: (N + 1,) int64, 40 bits from each byte on.
+        length: bits that there are.
+        at: the bit from which on it reads.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        """Take the bytes."""
+        self.at = 0
+        padded = np.frombuffer(data + bytes(5), np.uint8).astype(np.int64)
+        self.windows = np.zeros(len(data) + 1, np.int64)
+        for k in range(5):
+            self.windows |= padded[k : len(data) + 1 + k] << 8 * (4 - k)
+        self.length = 8 * len(data)
+
+    def read(self, widths: Ints) -> Ints:
+        """Numbers of 0 to 32 bits.
+
+        Raises:
+            InvalidMessage: there are not that many.
+        """
+        ends = np.cumsum(widths) + self.at
+        if len(ends) and ends[-1] > self.length:
+            raise InvalidMessage(CUT_OFF)
+        begins = ends - widths
+        numbers: Ints = self.windows[begins >> 3] >> (40 - widths - (begins & 7)) & ((1 << widths) - 1)
+        if len(ends):
+            self.at = int(ends[-1])
+        return numbers
+
+    def end(self) -> None:
+        """Nothing but the filling of the last byte may be left.
+
+        Raises:
+            InvalidMessage: there is more, or it is not zero.
+        """
+        left = self.length - self.at
+        if left >= 8 or self.read(np.array([left])).any():
+            raise InvalidMessage("landmarks: more than there should be")
+
+
+def pack_bits(numbers: Ints, widths: Ints) -> bytes:
+    """Numbers of 0 to 32 bits each, first bit first, filled with zeros to whole bytes."""
+    ends = np.cumsum(widths)
+    begins = ends - widths
+    length = -(-int(ends[-1]) // 8) if len(ends) else 0
+    # Each number lies in five bytes from the one where it begins; what shares a byte is added up.
+    moved, first = numbers << (40 - widths - (begins & 7)), begins >> 3
+    packed = np.zeros(length + 5)
+    for k in range(5):
+        packed += np.bincount(first + k, moved >> 8 * (4 - k) & 255, length + 5)
+    return packed[:length].astype(np.uint8).tobytes()
