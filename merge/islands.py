@@ -42,8 +42,7 @@ class Islands:
         self._settings = settings or MergeSettings()
         self._exact = exact
         self._memory = DecisionCache()
-        self._merged: dict[frozenset[MapId], MergedMap] = {}
-        self._standing: dict[frozenset[MapId], StandingDecisions] = {}
+        self._known: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         self._abroad: dict[MapId, tuple[HybridMap, frozenset[MapId]]] = {}
         self._rulings = ManualConstraints()
 
@@ -68,21 +67,18 @@ class Islands:
         """
         for ruling in {*rulings.in_force} ^ {*self._rulings.in_force}:
             touched = touched | {end.map if isinstance(end, NodeId) else end for end in ruling.ends}
-        self._rulings = rulings
-        islands = self._ties(maps, verdicts)
-        before, self._merged = self._merged, {}
-        standing, self._standing = self._standing, {}
+        islands = self._ties(maps, verdicts, rulings)
+        known: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         for island in islands:
-            merged = before.get(island)
-            if merged is None or island & touched:
-                inside = {one: maps[one] for one in sorted(island)}
-                earlier = [standing[one] for one in sorted(standing, key=min) if one & island]
-                merged, stands = self._decided(inside, verdicts.among(island), rulings, earlier)
-            else:
-                stands = standing[island]
-            self._merged[island], self._standing[island] = merged, stands
+            if island in self._known and not island & touched:
+                known[island] = self._known[island]
+                continue
+            inside = {one: maps[one] for one in sorted(island)}
+            earlier = [self._known[one][1] for one in sorted(self._known, key=min) if one & island]
+            known[island] = self._decided(inside, verdicts.among(island), rulings, earlier)
+        self._known, self._rulings = known, rulings
         island_of = {one: island for island in islands for one in island}
-        return _together(list(self._merged.values()), maps, verdicts.across(island_of), rulings)
+        return _together([merged for merged, _ in known.values()], maps, verdicts.across(island_of), rulings)
 
     def _decided(
         self,
@@ -101,11 +97,13 @@ class Islands:
             merged, stands = decide(*everything)
         return undone.completed(merged), stands
 
-    def _ties(self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts) -> list[frozenset[MapId]]:
+    def _ties(
+        self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts, rulings: ManualConstraints
+    ) -> list[frozenset[MapId]]:
         """Islands: maps that links or drives tie together."""
         ties: nx.Graph = nx.Graph()
         ties.add_nodes_from(maps)
-        ties.add_edges_from(verdicts.ties(self._rulings))
+        ties.add_edges_from(verdicts.ties(rulings))
         for map_id, one in maps.items():
             known = self._abroad.get(map_id)
             if known is None or known[0] is not one:

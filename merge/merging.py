@@ -117,16 +117,10 @@ def decide(
     refutation = Refutation(maps, fragments, s.exclusion, memory)
     open_ = [link for pair, link in weighed.items() if pair not in refuted]
     groups = memory.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
-    earlier = {refutation.key_of(weighed[pair]) for pair in refuted}
     # Each round refutes a link at least, so there is a last one.
     while True:
         solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
-        impossible = refutation.impossible(
-            solved,
-            kept,
-            earlier | {key for key, group in groups.items() if group.refuted},
-            None if before is None else solver.changed,
-        )
+        impossible = refutation.impossible(solved, kept, None if before is None else solver.changed)
         if not impossible:
             break
         for key, reason in impossible.items():

@@ -13,8 +13,7 @@ class Collision:
         first: agent; the one that would have seen the other.
         second: another one.
         clock: that says so.
-        moments: how many moments they would have been too near, or seen each other; 0 if what their views
-            should show of each other's maps was enough, after another story was refuted.
+        moments: how many moments they would have been too near, or seen each other.
         nearest: how near they would have been, m.
         time: when that was, s.
         evidence: natural logarithm of the odds against the merge.
@@ -35,11 +34,6 @@ class Collision:
     @property
     def reason(self) -> str:
         """In words."""
-        if not self.moments:
-            return (
-                f"other links between their maps were refuted, and {self.blank} views of {self.first} and "
-                f"{self.second} show nothing of what the other one mapped there"
-            )
         views = f"; {self.blank} views of theirs show nothing of what the other one mapped there"
         views = views if self.blank else ""
         if self.where:

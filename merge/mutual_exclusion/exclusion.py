@@ -83,25 +83,6 @@ def clash_of(
     return replace(clash, blank=int(views.show_nothing(s.absence).sum()))
 
 
-def evidence_in_all(
-    graph: PoseGraph, first: BodyTrajectory, second: BodyTrajectory, settings: ExclusionSettings | None = None
-) -> float:
-    """Natural logarithm of the odds against a merge, by bodies and sight, with the poses as they are.
-
-    Args:
-        graph: the merged component that holds the nodes of both.
-        first: of one robot.
-        second: of another one.
-        settings: when they contradict each other.
-
-    Returns:
-        Of all moments that both are known to be somewhere; below 0 if they speak for the merge.
-    """
-    s = settings or ExclusionSettings()
-    met = _met(graph, first, second, s)
-    return 0.0 if met is None else float(met.meeting.added(met.clear, met.odds, np.ones(1), s)[1][-1])
-
-
 @dataclass(frozen=True, eq=False)
 class _Met:
     """Two robots that came near each other, with their poses as they are.

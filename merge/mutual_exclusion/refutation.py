@@ -13,7 +13,6 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
 from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
-from mapweave.merge.mutual_exclusion.suspicion import suspicion
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -68,7 +67,6 @@ class Refutation:
         self,
         solved: Sequence[PoseGraph],
         kept: Sequence[Link],
-        refuted: Collection[Key] = (),
         changed: Collection[NodeId] | None = None,
     ) -> dict[Key, str]:
         """Groups that must fall, with reasons.
@@ -80,10 +78,9 @@ class Refutation:
         Args:
             solved: the components.
             kept: the links that made them.
-            refuted: between which fragments other links have been refuted.
             changed: fragments whose robots may clash with others since it was looked at last; None: all.
         """
-        clashes = dict(self._clashes(solved, refuted, changed))
+        clashes = dict(self._clashes(solved, changed))
         if not clashes:
             return {}
         weights: dict[Key, int] = {}
@@ -98,10 +95,7 @@ class Refutation:
         return {weakest: f"{clash.reason}, and these are the weakest links that join the two"}
 
     def _clashes(
-        self,
-        solved: Sequence[PoseGraph],
-        refuted: Collection[Key] = (),
-        changed: Collection[NodeId] | None = None,
+        self, solved: Sequence[PoseGraph], changed: Collection[NodeId] | None = None
     ) -> Iterator[tuple[Key, Collision]]:
         """Pairs of fragments in one component that clash, by whichever clock says so most clearly."""
         for graph in solved:
@@ -114,8 +108,6 @@ class Refutation:
                 if first == second or (changed is not None and not {first, second} & set(changed)):
                     continue
                 clash = clash_of(graph, one, two, self._exclusion)
-                if clash is None and (min(first, second), max(first, second)) in refuted:
-                    clash = suspicion(graph, one, two, self._exclusion)
                 if clash is not None:
                     found.setdefault((first, second), []).append(clash)
             for key, clashes in found.items():

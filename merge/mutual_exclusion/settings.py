@@ -17,9 +17,6 @@ class ExclusionSettings:
         least_apart: centres of two robots are never nearer than this, m, unless both tell their radii: with
             a camera and two driven wheels few are narrower.
         doubt: chance at most that a true merge is refused, ever.
-        doubt_again: likewise of a merge by what is left after other links between the same two maps were
-            refuted. Their places are known to look alike then: see
-            `mapweave.merge.mutual_exclusion.suspicion`.
         least_witnesses: independent moments (see `window`) that must make the merge half as likely each.
         sigmas: the poses of the two are first moved apart by as many standard deviations, since what is
             wrong with them is wrong at all moments alike.
@@ -34,7 +31,6 @@ class ExclusionSettings:
 
     least_apart: float = 0.2
     doubt: float = 1e-3
-    doubt_again: float = 0.05
     least_witnesses: int = 3
     sigmas: float = 2.0
     step: float = 0.5
