@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import networkx as nx
@@ -30,7 +31,6 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
-from mapweave.merge.outlier_rejection.max_clique import independent_links
 from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, loop_distances2
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
@@ -66,6 +66,8 @@ SIGMAS, MARGIN = 3.0, 0.2
 AROUND = 0.03
 """Two landmarks are in the same direction if they are so near to each other, rad."""
 
+UNSOLVABLE = (ArithmeticError, RuntimeError, ValueError)
+"""What solvers raise for a map whose numbers they cannot take. Nothing is found out about it then."""
 MapPair = tuple[MapId, MapId]
 """Two maps, the smaller id first."""
 
@@ -124,7 +126,9 @@ class WrongGeometrySearch:
             The maps that are wrong, by id.
         """
         for pair in stale:
-            self._tie(pair, maps, links(pair))
+            self._ties.pop(pair, None)
+            with suppress(*UNSOLVABLE):
+                self._tie(pair, maps, links(pair))
         changed = [set(pair) for pair in stale]
         self._checked = {
             (one, others): found
@@ -145,7 +149,9 @@ class WrongGeometrySearch:
             if len(agreeing) < 2:
                 continue
             if (one, agreeing) not in self._checked:
-                self._checked[one, agreeing] = self._is_wrong(one, agreeing, maps)
+                self._checked[one, agreeing] = False
+                with suppress(*UNSOLVABLE):
+                    self._checked[one, agreeing] = self._is_wrong(one, agreeing, maps)
             if self._checked[one, agreeing]:
                 out[one] = WrongGeometry(one, agreeing)
         return out
@@ -157,7 +163,6 @@ class WrongGeometrySearch:
 
     def _tie(self, pair: MapPair, maps: Mapping[MapId, HybridMap], links: Sequence[Link]) -> None:
         """Sort the links between two maps."""
-        self._ties.pop(pair, None)
         first, second = (self._main(one, maps[one]) if one in maps else None for one in pair)
         if first is None or second is None or first is second:
             return
@@ -248,9 +253,6 @@ def all_refuted(
         return False
     sets = link_sets(links, placed, fixed, s)
     sets = [one for one in sets if len(one) >= LEAST_SHARE * len(sets[0])]
-    sets = [one for one in sets if independent_links(one, s.least_links) >= s.least_links]
-    if not sets:
-        return False
     own: dict[NodeId, list[Link]] = {}
     for link in links:
         own.setdefault(link.a, []).append(link)

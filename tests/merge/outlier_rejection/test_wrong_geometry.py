@@ -1,0 +1,114 @@
+"""Lines of sight, and which of several maps they refute."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.outlier_rejection import wrong_geometry
+from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
+from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, looked_through
+from mapweave.merge.pose_graph.links import Link
+
+CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25)
+STEP = 0.3
+LINK = np.diag([0.02, 0.02, 0.01]) ** 2
+
+
+def facing_a_wall(map_id: MapId, number: int, distance: float, at: Pose2) -> Node:
+    """A view of a wall straight ahead: 120 landmarks anywhere on it, depths known to 1 %."""
+    rng = np.random.default_rng([ord(map_id.agent), number])
+    pixels = rng.uniform([4, 4], [316, 236], (120, 2)).astype(np.float32)
+    depths = np.full(len(pixels), distance, np.float32)
+    codes = quantise(np.zeros((len(pixels), 32)))
+    marks = Landmarks(pixels, codes, depths, 0.01 * depths)
+    return Node(NodeId(*map_id, number), number, PoseGaussian(at, np.zeros((3, 3))), CAMERA, marks)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "first", "second"),
+    [
+        # How far the second robot is said to stand ahead of the first; both see a wall 3 m away.
+        (0.0, False, False),
+        (0.3, False, False),  # Within three sigmas and 0.2 m.
+        (1.5, True, False),  # The first one's wall is 1.5 m before the second, which sees nothing there.
+        (-1.5, False, True),
+    ],
+)
+def test_a_wall_before_another_one_is_looked_through(ahead: float, first: bool, second: bool) -> None:
+    one, other = (facing_a_wall(MapId("a", 1), k, 3.0, Pose2()) for k in (1, 2))
+    there = Pose2(ahead, 0.0, 0.0)
+    for node, view, moved, expected in ((one, other, there.inverse(), first), (other, one, there, second)):
+        inside, through = looked_through(node, view, moved, 0.01, 0.001)
+        assert inside >= 20
+        assert through > 0.1 * inside if expected else through == 0
+
+
+def corridor(agent: str, scale: float = 1.0, gap: float = 0.0, count: int = 18) -> HybridMap:
+    """A robot that backs away from a wall, by steps that it measures, and once moves without noticing."""
+    map_id, out, at = MapId(agent, 1), HybridMap(), 0.0
+    for k in range(count):
+        true = 1.5 + STEP * k + (gap if k >= 6 else 0.0)
+        out.apply(NodePut(facing_a_wall(map_id, k, true, Pose2(-at, 0.0, 0.0))))
+        if k:
+            step = PoseGaussian.from_sigmas(Pose2(-STEP * scale, 0.0, 0.0), 0.01, 0.005)
+            ends = NodeId(*map_id, k - 1), NodeId(*map_id, k)
+            out.apply(EdgePut(Edge(NodeId(*map_id, 100 + k), *ends, step, EdgeKind.MAPPED)))
+        at += STEP * scale
+    return out
+
+
+def links_of(one: HybridMap, other: HybridMap) -> list[Link]:
+    """True links between all views whose distances from the wall are alike."""
+    out = []
+    for a in one.nodes.values():
+        for b in other.nodes.values():
+            between = float(a.landmarks.depths[0] - b.landmarks.depths[0])
+            if abs(between) < 0.8:
+                evidence = {"inliers": 30.0, "share": 0.8}
+                out.append(Link(a.id, b.id, PoseGaussian(Pose2(between, 0.0, 0.0), LINK), evidence=evidence))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("scale", "gap", "expected"), [(1.0, 0.0, False), (1.0, 2.0, True), (2.0, 0.0, True)]
+)
+def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expected: bool) -> None:
+    maps = {MapId(agent, 1): corridor(agent) for agent in "ab"}
+    maps[MapId("c", 1)] = corridor("c", scale, gap, 12)
+    ids = sorted(maps)
+    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    finder = WrongGeometrySearch(ConsistencySettings(), 25.0)
+    wrong = finder.wrong(maps, links.__getitem__, links.keys())
+    assert (set(wrong) == {ids[2]}) is expected
+    if expected:
+        assert wrong[ids[2]].reason == "map c.1 contradicts a.1 and b.1, which agree: its geometry is wrong"
+        # Nobody can say which of two is wrong; nor is anybody heard whose map is retired.
+        assert not finder.wrong(maps, links.__getitem__, (), [ids[0]])
+        assert finder.wrong(maps, links.__getitem__, ()).keys() == wrong.keys()
+
+
+def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = {MapId(agent, 1): corridor(agent) for agent in "abd"}
+    maps[MapId("c", 1)] = corridor("c", 1.0, 2.0, 12)
+    ids = sorted(maps)
+    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    real = wrong_geometry.link_sets
+
+    def fails(links: Sequence[Link], *rest: Any) -> list[list[Link]]:
+        if {links[0].a.map, links[0].b.map} == {ids[0], ids[3]}:
+            raise np.linalg.LinAlgError("singular")
+        return real(links, *rest)
+
+    monkeypatch.setattr(wrong_geometry, "link_sets", fails)
+    found = WrongGeometrySearch(ConsistencySettings(), 25.0).wrong(maps, links.__getitem__, links.keys())
+    assert found.keys() == {ids[2]}
