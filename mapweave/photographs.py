@@ -66,7 +66,7 @@ def map_of_photographs(
         raise InvalidValue(f"spacing {spacing:g}: give the metres between photographs")
     sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
     features = [sift.extract(read_grey(image, camera)) for image in images]
-    views = [one.view(camera) for one in features]
+    views = [extracted.view(camera) for extracted in features]
     structure = reconstruct(views, spacing)
     levels = [_level(structure, k) for k in range(len(views))]
     changes: list[ChangeBody] = []

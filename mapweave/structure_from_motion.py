@@ -112,9 +112,9 @@ def reconstruct(views: Sequence[View], spacing: float) -> Structure:
     # What two photographs show of one wall has two explanations (Longuet-Higgins 1986); only the right one
     # goes with the others.
     whole = [_grown(views, start, relations, spacing) for start in starts[:BEGINNINGS]]
-    best = max(whole, key=lambda one: int((_misses(views, one) < GATE_PX).sum()))
-    found = np.isfinite(best.points[:, 0])
-    return replace(best, points=best.points[found], features=best.features[:, found])
+    best = max(whole, key=lambda structure: int((_misses(views, structure) < GATE_PX).sum()))
+    determined = np.isfinite(best.points[:, 0])
+    return replace(best, points=best.points[determined], features=best.features[:, determined])
 
 
 def _grown(
@@ -155,14 +155,14 @@ def _extended(
     """One camera more beside those that are placed: by the points that it shows, or as far on as the last."""
     placed = np.flatnonzero(structure.placed)
     low, high = int(placed[0]), int(placed[-1])
-    known = (structure.features >= 0) & np.isfinite(structure.points[:, 0])
+    visible = (structure.features >= 0) & np.isfinite(structure.points[:, 0])
     inner = [k for k in range(low, high) if k not in placed]
     k = max(
         inner or [k for k in (low - 1, high + 1) if 0 <= k < len(views)],
-        key=lambda one: int(known[one].sum()),
+        key=lambda camera: int(visible[camera].sum()),
     )
     rotations, centres = structure.rotations.copy(), structure.centres.copy()
-    seen, camera = np.flatnonzero(known[k]), views[k].camera
+    seen, camera = np.flatnonzero(visible[k]), views[k].camera
     pixels = views[k].pixels[structure.features[k, seen]].astype(np.float64)
     cv2.setRNGSeed(0)
     fits, inside = False, None
@@ -240,8 +240,8 @@ def _tracks(views: Sequence[View], matches: dict[tuple[int, int], NDArray[np.int
     owner = np.repeat(np.arange(len(views)), np.diff(starts))
     roots = np.array([root(k) for k in range(len(parent))])
     columns = []
-    for one in np.unique(roots):
-        members = np.flatnonzero(roots == one)
+    for track in np.unique(roots):
+        members = np.flatnonzero(roots == track)
         if len(members) >= 2 and len(np.unique(owner[members])) == len(members):
             column = np.full(len(views), -1, np.int64)
             column[owner[members]] = members - starts[owner[members]]
@@ -322,8 +322,8 @@ def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust
             way = (k - before) * spacing
             step = gtsam.noiseModel.Isotropic.Sigma(1, STEP_SHARE * way)
             graph.add(gtsam.RangeFactorPose3(pose(before), pose(k), way, step))
-    known = np.flatnonzero(np.isfinite(structure.points[:, 0])).tolist()
-    for n in known:
+    determined = np.flatnonzero(np.isfinite(structure.points[:, 0])).tolist()
+    for n in determined:
         values.insert(point(n), structure.points[n])
         for k in np.flatnonzero(structure.placed & (structure.features[:, n] >= 0)).tolist():
             pixels = views[k].pixels[structure.features[k, n]].astype(np.float64)
@@ -337,6 +337,6 @@ def _bundled(views: Sequence[View], structure: Structure, spacing: float, robust
             solved.atPose3(pose(k)).rotation().matrix(),
             solved.atPose3(pose(k)).translation(),
         )
-    for n in known:
+    for n in determined:
         points[n] = solved.atPoint3(point(n))
     return replace(structure, rotations=rotations, centres=centres, points=points)

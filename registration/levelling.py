@@ -51,15 +51,15 @@ class Levelled:
     node_from_robot: PoseGaussian
 
 
-def level(node: Node, view: View, found: Recognition) -> Levelled:
+def level(node: Node, view: View, recognition: Recognition) -> Levelled:
     """Bring a photograph to level.
 
     Args:
         node: the photograph.
         view: the image's features.
-        found: that the view shows the node, by landmarks that have a depth.
+        recognition: of the node in the view, by landmarks that have a depth.
     """
-    seen = found.pairs[node.landmarks.has_depth[found.pairs[:, 0]]]
+    seen = recognition.pairs[node.landmarks.has_depth[recognition.pairs[:, 0]]]
     landmarks, pixels = node.landmarks.take(seen[:, 0]), view.pixels[seen[:, 1]].astype(np.float64)
 
     def expected(state: Array, longer: float) -> Array:
@@ -68,13 +68,13 @@ def level(node: Node, view: View, found: Recognition) -> Levelled:
         points[:, :2] = Pose2.from_vector(state[:3]).inverse().apply(points[:, :2])
         return view.camera.project(points)
 
-    own = found.node_from_robot.mean
+    own = recognition.node_from_robot.mean
     # What is seen of one wall is seen almost the same from its other side; the truth explains it better.
     points = landmarks.points_in_robot(node.camera)[:, :2]
     starts = [own.vector, mirrored(own, points).vector]
     fits = [fit for start in starts if (fit := _fit(start, pixels, expected)) is not None]
     if not fits:
-        return Levelled(node, found.node_from_robot)
+        return Levelled(node, recognition.node_from_robot)
     best = min(fits, key=lambda fit: fit.cost)
     mean, turn = Pose2.from_vector(best.state[:3]), np.eye(3)
     turn[:2, :2] = mean.rotation.T
@@ -144,12 +144,12 @@ def _tilted(landmarks: Landmarks, camera: Camera, tilt: Array) -> Array:
 def _levelled(landmarks: Landmarks, camera: Camera, tilt: Array) -> Landmarks:
     """Landmarks as a level camera sees them; those without a depth stay where they are."""
     points = _tilted(landmarks, camera, tilt)
-    pixels, known = camera.project(points), landmarks.has_depth
-    known = known & np.isfinite(pixels).all(axis=1)
-    depths = np.where(known, points[:, 0] - camera.mount_forward, landmarks.depths)
+    pixels = camera.project(points)
+    ahead: NDArray[np.bool_] = np.asarray(np.isfinite(pixels).all(axis=1))
+    depths = np.where(ahead, points[:, 0] - camera.mount_forward, landmarks.depths)
     return replace(
         landmarks,
-        pixels=np.where(known[:, None], pixels, landmarks.pixels).astype(np.float32),
+        pixels=np.where(ahead[:, None], pixels, landmarks.pixels).astype(np.float32),
         depths=depths.astype(np.float32),
         depth_sigmas=(landmarks.depth_sigmas * (depths / landmarks.depths)).astype(np.float32),
     )

@@ -109,7 +109,8 @@ class NodeDetector:
                 node, closer = one.node, look_closer(one.node, view, found, s.recognition.pose)
                 if node.landmarks.scale_share:
                     levelled = level(node, view, found)
-                    node, closer = levelled.node, levelled.node_from_robot
+                    if self._plausible(levelled.node_from_robot.mean, one):
+                        node, closer = levelled.node, levelled.node_from_robot
                 found = replace(found, node_from_robot=closer)
                 return one.leg, NodeLocalizer(
                     self._description, self._lens, node, image, features, found, s.localizer

@@ -151,13 +151,13 @@ class Relocalizer:
 
     def _without_scale(self, answer: RelocalizeAnswer) -> RelocalizeAnswer:
         """The answer, with what it cannot tell by photographs: how far away from them the view was taken."""
-        nodes = [self._node_of(one.node) for one in answer.candidates]
-        known = [node is None or not node.landmarks.scale_share for node in nodes]
+        nodes = [self._node_of(candidate.node) for candidate in answer.candidates]
+        measured = [node is None or not node.landmarks.scale_share for node in nodes]
         candidates = tuple(
-            replace(one, distance_known=measured)
-            for one, measured in zip(answer.candidates, known, strict=True)
+            replace(candidate, distance_known=known)
+            for candidate, known in zip(answer.candidates, measured, strict=True)
         )
-        place = answer.certainty is Certainty.FOUND and not known[0]
+        place = answer.certainty is Certainty.FOUND and not measured[0]
         return replace(
             answer, certainty=Certainty.PLACE if place else answer.certainty, candidates=candidates
         )

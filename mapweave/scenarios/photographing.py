@@ -35,8 +35,8 @@ def photograph(stage: Stage, fleet: Fleet, action: Photograph) -> dict[NodeId, P
     folder = stage.out / "photographs"
     folder.mkdir(parents=True, exist_ok=True)
     images = [folder / f"{number:03}.png" for number in range(1, len(taken) + 1)]
-    for path, one in zip(images, taken, strict=True):
-        if not cv2.imwrite(str(path), one.image):
+    for path, shot in zip(images, taken, strict=True):
+        if not cv2.imwrite(str(path), shot.image):
             raise InvalidFile(f"{path}: cannot be written")
     map_id = MapId(action.name, FIRST_EPOCH)
     changes = map_of_photographs(
@@ -47,7 +47,7 @@ def photograph(stage: Stage, fleet: Fleet, action: Photograph) -> dict[NodeId, P
         raise NotConnected("the map server did not take the map of photographs")
     nodes = (NodeId(action.name, FIRST_EPOCH, number) for number in range(1, len(taken) + 1))
     back = Pose2(-camera.intrinsics.mount_forward)
-    return {node: one.world_from_camera @ back for node, one in zip(nodes, taken, strict=True)}
+    return {node: shot.world_from_camera @ back for node, shot in zip(nodes, taken, strict=True)}
 
 
 def beside(first: Pose2, seed: int) -> Pose2:
