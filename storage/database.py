@@ -77,12 +77,11 @@ class Database:
         except sqlite3.Error as error:
             if "locked" in str(error):
                 raise InvalidFile(f"{self.path}: {self.what} is in use by another process") from None
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF in (
-                sqlite3.SQLITE_CORRUPT,
-                sqlite3.SQLITE_NOTADB,
-            ):
+            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            if code == sqlite3.SQLITE_CORRUPT:
                 raise self._damaged(str(error)) from None
-            raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error})") from None
+            advice = self._advice if code == sqlite3.SQLITE_NOTADB else ""
+            raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error}){advice}") from None
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
