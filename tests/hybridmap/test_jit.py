@@ -43,7 +43,7 @@ if sys.argv[1] == "without":
     sys.modules["numba"] = None
 import numpy as np
 import some_kernels
-from hybridmap import jit
+from mapweave.hybridmap import jit
 assert "numba" not in sys.modules or sys.argv[1] == "without", "imported too early"
 jit.load()
 kernel = some_kernels.lengths
