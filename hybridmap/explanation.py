@@ -27,6 +27,11 @@ class Standing(StrEnum):
     """Other pairs look more alike; the numbers come from a comparison that was made for the explanation."""
 
 
+DOUBLES = "doubles"
+"""Name among a link's evidence: of its inliers, landmarks that are found at other places too; absent if none
+is known (see mapweave.merge.outlier_rejection.distinctness)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Witness:
     """Another link between the same two pieces of map.

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from mapweave.hybridmap.explanation import (
+    DOUBLES,
     Hop,
     MapsExplanation,
     NearMiss,
@@ -20,7 +21,6 @@ from mapweave.hybridmap.explanation import (
 )
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.pose import Array, PoseGaussian
-from mapweave.merge.pose_graph.links import DOUBLES
 
 MOST_WITNESSES = 12
 """Lines of other links; `--json` has all."""

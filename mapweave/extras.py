@@ -8,14 +8,12 @@ from importlib.util import find_spec
 from mapweave.hybridmap.errors import MapweaveError
 
 MODULES = {
-    "server": ("faiss", "gtsam", "numba", "scipy"),
+    "server": ("faiss", "gtsam", "numba", "python_multipart", "scipy", "starlette", "uvicorn"),
     "sim": ("pybullet",),
     "eval": ("evo",),
     "viz": ("matplotlib",),
 }
 """What each extra installs, by the names that are imported. No command needs `fast` or `gym`."""
-TRIAL = ("server", "sim", "eval", "viz")
-"""What a scenario with a whole fleet needs, its report included."""
 TRIAL = ("server", "sim", "eval", "viz")
 """What a scenario with a whole fleet needs, its report included."""
 

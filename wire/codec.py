@@ -23,7 +23,6 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, Node
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks
-from mapweave.wire.landmarks_v1 import unpack_landmarks_v1
 from mapweave.wire.packing import MAX_NUMBER, MAX_STAMP_NS, Reader, pack
 from mapweave.wire.pose_codec import MAX_MEASURED, pack_camera, pack_pose, unpack_camera, unpack_pose
 from mapweave.wire.range_codec import MAX_RANGE_BYTES, pack_ranges, unpack_ranges
@@ -189,9 +188,6 @@ def _read_node(reader: Reader, element: NodeId) -> Node:
 
 
 def _read_landmarks(reader: Reader, camera: Camera) -> Landmarks:
-    # Logs and map files of the first version have "l" instead.
-    if reader.has("l") and not reader.has("m"):
-        return unpack_landmarks_v1(reader.binary("l", MAX_BODY_BYTES), camera)
     return unpack_landmarks(reader.binary("m", MAX_BODY_BYTES), camera)
 
 

@@ -24,7 +24,6 @@ from mapweave.hybridmap.query import (
 )
 from mapweave.wire.codec import EDGE_KINDS, KINDS_OF_EDGE, MAX_BODY_BYTES, decode_body, encode_body
 from mapweave.wire.landmark_codec import MAX_LANDMARKS, MAX_LANDMARKS_BYTES, pack_features, unpack_features
-from mapweave.wire.landmarks_v1 import unpack_features_v1
 from mapweave.wire.packing import MAX_NUMBER, Reader, pack
 from mapweave.wire.pose_codec import MAX_POSITION, pack_camera, pack_pose, unpack_camera, unpack_pose
 
@@ -91,11 +90,7 @@ def decode_view(data: bytes) -> View:
     """Decode a view; raises InvalidMessage."""
     reader = Reader(data, "view", MAX_VIEW_BYTES)
     camera = unpack_camera(reader.binary("c", MAX_VIEW_BYTES))
-    # Robots of the first version send "f" instead.
-    if reader.has("f") and not reader.has("m"):
-        pixels, codes = unpack_features_v1(reader.binary("f", MAX_VIEW_BYTES), camera)
-    else:
-        pixels, codes = unpack_features(reader.binary("m", MAX_VIEW_BYTES), camera)
+    pixels, codes = unpack_features(reader.binary("m", MAX_VIEW_BYTES), camera)
     return View(pixels, codes, camera)
 
 

@@ -11,7 +11,7 @@ For each server: `p50_ms` and `p95_ms` from asking to a found, ambiguous or unkn
 the questions; `answers_per_s`; `wait_p95_ms` from a robot's first asking about a view to its answer, pauses
 included; `route_p95_ms`; `right_share` of the answers (within 0.25 m and 5 degrees); `lost`, questions that
 nobody answered or refused. Side by side: the desk as it is by default, and a server that answers everybody
-in turn (`workers = 0`, as it did before there was a desk).
+in turn (one worker, nobody refused).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ ROOM_NODES = 20
 """Nodes a room, one robot each."""
 PATIENCE = 10.0
 """Longest wait for an answer, s."""
-RIVALS = {"desk": "", "in_turn": "[desk]\nworkers = 0\n"}
+RIVALS = {"desk": "", "in_turn": "[desk]\nworkers = 1\nin_time = 1000.0\n"}
 """Settings of the servers."""
 
 

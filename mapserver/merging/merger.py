@@ -255,11 +255,11 @@ class Merger:
                 # Copies: a merged map stays as it was when later changes come. What did not change is not
                 # copied: all that a merge remembers of a map it remembers of this very copy.
                 self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+            self._isolation.changed(self._changed)
             try:
                 self._find_wrong_geometry()
             except Exception:  # a defect with one map must not hold up the merge
                 log.exception("maps with wrong geometry could not be looked for")
-            self._isolation.changed(self._changed)
             maps = [one for one in self._kept if one not in self._isolation]
             try:
                 merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
@@ -291,8 +291,8 @@ class Merger:
     def _find_wrong_geometry(self) -> None:
         """Maps that contradict others that agree are merged with nobody."""
         self._stale |= self._verdicts.at(self._changed)
-        before, retired = self._wrong, self._rulings.retired
-        self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, retired.keys())
+        before, left_out = self._wrong, {*self._rulings.retired, *self._isolation.reasons}
+        self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, left_out)
         self._stale = set()
         if before.keys() - self._wrong.keys():
             self.alike.forget()

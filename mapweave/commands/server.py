@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Who looks in the morning wants to know when two maps came apart.
     logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
-    logging.getLogger("mapserver").setLevel(logging.INFO)
+    logging.getLogger("mapweave.mapserver").setLevel(logging.INFO)
     settings = settings_of(arguments)
     merge = merge_settings(settings, arguments.settings)
     network = network_of(arguments, settings)

@@ -192,7 +192,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
 
     # Whom time waits for, and whose agent is gone.
     logging.basicConfig(format="%(message)s")
-    logging.getLogger("sim").setLevel(logging.INFO)
+    logging.getLogger("mapweave.sim").setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     scenario = load_scenario(scenario_path(arguments.scenario), arguments.overrides)

@@ -24,12 +24,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.explanation import DOUBLES
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.pose_graph.fragments import Fragment
-from mapweave.merge.pose_graph.links import DOUBLES, Link, link_of
+from mapweave.merge.pose_graph.links import Link, link_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 

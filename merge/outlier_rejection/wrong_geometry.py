@@ -127,6 +127,8 @@ class WrongGeometrySearch:
         """
         for pair in stale:
             self._ties.pop(pair, None)
+            if not set(pair).isdisjoint(left_out):
+                continue
             with suppress(*UNSOLVABLE):
                 self._tie(pair, maps, links(pair))
         changed = [set(pair) for pair in stale]

@@ -10,15 +10,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.explanation import DOUBLES
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.pose_graph.factors import Measurement
 
 MERGE_AUTHOR = "merge"
 """Stands for the agent in the ids of edges that the merge makes."""
-DOUBLES = "doubles"
-"""Name among a link's evidence: of its inliers, landmarks that are found at other places too; absent if none
-is known (see mapweave.merge.outlier_rejection.distinctness)."""
 LEAST_DISTINCT = 10
 """A link with doubles and fewer other landmarks tells no place: a recognition needs as many at all."""
 AGAINST = 2

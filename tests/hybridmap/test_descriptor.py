@@ -8,7 +8,6 @@ import pytest
 import skimage.data
 
 from mapweave.hybridmap.descriptor import ZERO, decode, encode, project, quantise, root_sift, rounding_noise
-from mapweave.hybridmap.descriptor_v1 import _tables_v1, renew, restore_v1
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, landmark_tables
 from mapweave.registration.matching import match, match_vectors
@@ -110,27 +109,3 @@ def test_codes_keep_right_matches_of_real_photographs() -> None:
     code = right_ones(match(encode(sift[0]), encode(sift[1])))
     assert full > 80
     assert code >= 0.95 * full
-
-
-def test_even_coordinates_of_old_codes_lie_in_the_low_half_of_the_byte() -> None:
-    codes = np.zeros((1, 16), np.uint8)
-    codes[0, 3] = 0x5A
-    levels = _tables_v1()[2]
-    assert restore_v1(codes)[0, 6] == levels[6, 0xA]
-    assert restore_v1(codes)[0, 7] == levels[7, 0x5]
-
-
-def test_old_codes_match_with_those_of_today() -> None:
-    """A map of the first version is still recognised: nearly as many right matches as between new codes."""
-    left, right, _ = skimage.data.stereo_motorcycle()
-    (_, one), (_, two) = real_sift(grey(left), 300), real_sift(grey(right), 300)
-    mean, basis, levels = _tables_v1()
-    projected = (root_sift(one) - mean) @ basis
-    # As the first version encoded.
-    symbols = np.abs(projected[:, :, None] - levels).argmin(axis=2).astype(np.uint8)
-    old = symbols[:, 0::2] | symbols[:, 1::2] << np.uint8(4)
-    today = {tuple(pair) for pair in match(encode(one), encode(two)).tolist()}
-    renewed = {tuple(pair) for pair in match(renew(old), encode(two)).tolist()}
-    assert len(today) > 60
-    assert len(today & renewed) >= 0.85 * len(today)
-    assert len(renewed) <= 1.1 * len(today)

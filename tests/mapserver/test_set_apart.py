@@ -28,6 +28,7 @@ from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.verification_cache import VerificationCache
+from mapweave.mapserver.schedule import LiveSchedule
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.outlier_rejection import decision_cache
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -361,7 +362,7 @@ def test_3000_random_legal_contents_change_nothing_for_sound_robots(beside: Besi
 
 def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
     """It puts one of its nodes 200 times a second."""
-    upkeep = MergeWorker(1.0)
+    upkeep = MergeWorker(LiveSchedule(), 1.0)
     upkeep.start()
     stop = threading.Event()
     logs = {one: [decode_change(message) for message in log] for one, log in sound_logs().items()}
@@ -388,7 +389,7 @@ def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
 
 
 def test_of_the_puts_of_one_node_that_wait_the_last_counts() -> None:
-    upkeep = MergeWorker(1.0)
+    upkeep = MergeWorker(LiveSchedule(), 1.0)
     nodes = [replace(node(1), stamp_ns=k) for k in range(50)]
     for k, one in enumerate(nodes):
         upkeep.take(Change(BAD, k + 1, 0, NodePut(one)))

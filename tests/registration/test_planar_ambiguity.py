@@ -29,7 +29,7 @@ def poster(rng: np.random.Generator, size: float, depth: float) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("pose", [Pose2(0.2, 1.0, -0.4), Pose2(-1.0, -0.7, 0.1), Pose2(1.0, 0.0, 0.3)])
+@pytest.mark.parametrize("pose_vector", [Pose2(0.2, 1.0, -0.4), Pose2(-1.0, -0.7, 0.1), Pose2(1.0, 0.0, 0.3)])
 def test_twice_mirrored_is_where_it_was(pose_vector):
     points = np.array([[3.0, -1.0], [3.1, 0.2], [3.3, 1.5]])
     there = mirrored(pose_vector, points)

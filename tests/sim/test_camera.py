@@ -81,7 +81,8 @@ def test_corners_are_seen_where_the_lens_model_says(name: str, stand) -> None:
     off = np.linalg.norm(found - expected[inside], axis=1)
     assert off.max() < 0.3
     assert np.abs((found - expected[inside]).mean(axis=0)).max() < 0.05
-    ideal = Lens(RobotSetup("r0", camera=setup).describe()).undistort(found)
+    body = RobotSetup("r0", camera=setup).describe()
+    ideal = Lens(body.camera, body.distortion).undistort(found)
     assert np.linalg.norm(ideal - camera.project(corners[inside]), axis=1).max() < 0.5
 
 

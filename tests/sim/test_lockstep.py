@@ -78,7 +78,7 @@ def test_those_who_never_come_are_given_up(caplog: pytest.LogCaptureFixture) -> 
 
 
 def test_those_who_wait_for_the_beginning_are_told_for_whom(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "sim")
+    caplog.set_level(logging.INFO, "mapweave.sim")
     table = Table(["a", "b", "c"])
     table.ask("b", 1, now=5.0)
     for now in (5.1, 9.0, 12.0):

@@ -6,11 +6,9 @@ import math
 import struct
 import zlib
 from contextlib import nullcontext
-from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
-import msgpack
 import numpy as np
 import pytest
 import skimage.data
@@ -26,10 +24,8 @@ from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.ranges import Ranges
-from mapweave.registration.recognition import Recognition, examine_nodes
 from mapweave.registration.selection import SelectionSettings, choose
-from mapweave.storage.map_file import read_map_file
-from mapweave.wire.codec import decode_body, encode_body, encode_change
+from mapweave.wire.codec import encode_change
 from mapweave.wire.landmark_codec import (
     MAX_LANDMARKS,
     MAX_LANDMARKS_BYTES,
@@ -298,34 +294,3 @@ def test_codes_that_are_none_are_refused(some: SimpleNamespace) -> None:
     for codes in (wrong, one.codes.astype(np.int64)):
         with pytest.raises(InvalidValue, match="uint8 below 64"):
             pack_landmarks(Landmarks(one.pixels, codes, one.depths, one.depth_sigmas), CAMERA)
-
-
-def test_a_map_file_of_the_first_version_opens() -> None:
-    """Two nodes as the first version wrote them, which it recognised as one place, 31 landmarks agreeing."""
-    changes = read_map_file(Path(__file__).parent / "first_version.mapweave").changes
-    one, two = (change.node for change in changes if isinstance(change, NodePut))
-    assert (len(one.landmarks), len(two.landmarks)) == (65, 88)
-    assert one.landmarks.pixels[0] == pytest.approx([204.03125, 63.140625], abs=0)
-    assert two.landmarks.pixels.sum(axis=0) == pytest.approx([14129.281, 6078.2188], rel=1e-6)
-    assert one.landmarks.depths.sum() == pytest.approx(189.45918)
-    found = examine_nodes(one, two, None, np.random.default_rng(0))
-    assert isinstance(found, Recognition)
-    assert found.inliers >= 28
-    assert found.node_from_robot.mean.vector == pytest.approx([-0.153, 0.258, 0.094], abs=0.02)
-    again = encode_body(NodePut(one))
-    assert encode_body(decode_body(again)) == again
-
-
-@pytest.mark.parametrize(
-    ("old", "reason"),
-    [
-        (b"\0" * 22, "22 bytes are no 0..2000 of the first version"),
-        (b"\0" * 23 * 2001, "46023 bytes are no"),
-        (b"\0" * 20 + b"\1\0" + b"\0", "depth and sigma"),
-    ],
-)
-def test_what_is_wrong_with_old_landmarks_is_said(some: SimpleNamespace, old: bytes, reason: str) -> None:
-    fields = msgpack.unpackb(encode_body(NodePut(some.node(3))))
-    del fields["m"]
-    with pytest.raises(InvalidMessage, match=reason):
-        decode_body(msgpack.packb({**fields, "l": old}))

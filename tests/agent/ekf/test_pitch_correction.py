@@ -90,7 +90,7 @@ def test_a_filter_lives_through_nods(shape: str, monkeypatch: pytest.MonkeyPatch
         errors["nods"].append(error(run, filter_))
         failures["nods"] += bad
         with monkeypatch.context() as patch:
-            patch.setattr(mapping_filter, "evident_nod", lambda *_: None)
+            patch.setattr(mapping_filter, "pitch_offset", lambda *_: None)
             filter_, bad = mapped(shaken)
         errors["unaware"].append(error(run, filter_))
         failures["unaware"] += bad
@@ -102,6 +102,6 @@ def test_a_filter_lives_through_nods(shape: str, monkeypatch: pytest.MonkeyPatch
 def test_where_nothing_nods_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = [draw_run(np.random.default_rng(seed), "arc", 120) for seed in range(6)]
     with_nods = [mapped(run)[0].pose.mean.vector for run in runs]
-    monkeypatch.setattr(mapping_filter, "evident_nod", lambda *_: None)
+    monkeypatch.setattr(mapping_filter, "pitch_offset", lambda *_: None)
     without = [mapped(run)[0].pose.mean.vector for run in runs]
     np.testing.assert_array_equal(with_nods, without)

@@ -13,8 +13,8 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
-from mapweave.merge.incremental.islands import Islands
-from mapweave.merge.incremental.verdicts import Verdicts
+from mapweave.merge.islands import Islands
+from mapweave.merge.pose_graph.verdicts import Verdicts
 from mapweave.wire.messages import decode_relocalize_answer, encode_relocalize_answer
 from synthetic.world import Sensing, World, room, take_node, take_view
 from tests.hand_held import photograph

@@ -78,7 +78,8 @@ def trails(
     for k, walk in enumerate((a, b)):
         nodes = [
             Node(NodeId(agents[k], k, i), round(time * 1e9), PoseGaussian(Pose2(), np.zeros((3, 3))), CAMERA,
-                 Landmarks.empty(), clocks[k], radii[k], Ranges(), walk.wake(i) if wakes else TrajectorySegment())
+                 Landmarks.empty(), clocks[k], radii[k], Ranges(),
+                 walk.wake(i) if wakes else TrajectorySegment())
             for i, time in enumerate(walk.times)
         ]  # fmt: skip
         found += trajectories_of(nodes)

@@ -213,7 +213,8 @@ def test_looking_at_a_thousand_nodes_takes_no_time(wake: int, most: float) -> No
         nodes = [
             Node(NodeId(agent, 1, k), round(1e9 * (4 * k + rng.uniform(0, 2))), pose, CAMERA,
                  Landmarks.empty(), "net", RADIUS, Ranges(bearings, lengths[k], 3.16),
-                 TrajectorySegment(0.3 + 0.3 * np.arange(wake), np.zeros((wake, 3)), np.tile(lengths[k], (wake, 1))))
+                 TrajectorySegment(
+                     0.3 + 0.3 * np.arange(wake), np.zeros((wake, 3)), np.tile(lengths[k], (wake, 1))))
             for k in range(250)
         ]  # fmt: skip
         ids += [node.id for node in nodes]

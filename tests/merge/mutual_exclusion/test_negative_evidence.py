@@ -92,7 +92,7 @@ def test_it_tips_the_scales_and_never_decides_alone() -> None:
     assert found is not None and found.blank == 12
     assert "12 views of theirs show nothing of what the other one mapped there" in found.reason
     assert clash_of(*meeting(Room(), Room(), looks=3)) is None
-    deaf = ExclusionSettings(negative_evidence=NegativeEvidenceSettings(most=1.0))
+    deaf = ExclusionSettings(absence=NegativeEvidenceSettings(most=1.0))
     assert clash_of(*meeting(Room(), twin, looks=3), deaf) is None
     assert clash_of(*meeting(Room(), Room((0, 1, 2, 3)))) is None
     # Four looks are enough by themselves, and nothing is said of views.
