@@ -77,7 +77,7 @@ def landmark_tables() -> LandmarkTables:
     Raises:
         InvalidFile: they are damaged, or of another version.
     """
-    with resources.files("hybridmap").joinpath(FILE).open("rb") as file, np.load(file) as stored:
+    with resources.files("mapweave.hybridmap").joinpath(FILE).open("rb") as file, np.load(file) as stored:
         if int(stored["version"]) != VERSION:
             raise InvalidFile(f"landmark tables: version {int(stored['version'])}, expected {VERSION}")
 

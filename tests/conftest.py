@@ -7,6 +7,8 @@ import sys
 
 # numpy reads it when it is imported, and cv2 imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# FAISS searches with all cores otherwise, which costs more than it gains where each core has a worker.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import pytest
