@@ -69,7 +69,11 @@ class PoseGaussians:
         """(N,) squared Mahalanobis distances of the identity from the means, 3 degrees of freedom."""
         off = inverse_poses(self.means)
         off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        solved = np.linalg.solve(self.covariances, off[:, :, None])[:, :, 0]
+        try:
+            solved = np.linalg.solve(self.covariances, off[:, :, None])[:, :, 0]
+        except np.linalg.LinAlgError:
+            # Rounding beside a huge variance may leave a covariance singular.
+            solved = (np.linalg.pinv(self.covariances, hermitian=True) @ off[:, :, None])[:, :, 0]
         out: Array = (off * solved).sum(axis=1)
         return out
 
