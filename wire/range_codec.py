@@ -58,8 +58,15 @@ def pack_bearings(bearings: Array) -> bytes:
 
 
 def unpack_bearings(data: bytes) -> Array:
-    """(K,) rad, of 2 K bytes."""
-    out: Array = np.frombuffer(data, "<i2").astype(np.float64) * BEARING_STEP
+    """(K,) rad, of 2 K bytes.
+
+    Raises:
+        InvalidMessage: one lies beyond half a turn: it would not encode to the same bytes again.
+    """
+    steps = np.frombuffer(data, "<i2").astype(np.float64)
+    if (np.abs(steps) > MOST_STEPS).any():
+        raise InvalidMessage("a bearing lies beyond half a turn")
+    out: Array = steps * BEARING_STEP
     return out
 
 

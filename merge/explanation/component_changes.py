@@ -63,9 +63,9 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
     part_of = {one: part for part in before for one in part}
     wholes = []
     for whole in joined_maps(after):
-        known = {part & whole for part in {part_of[one] for one in whole if one in part_of}}
-        news = [frozenset([one]) for one in sorted(whole) if one not in part_of]
-        wholes.append([*sorted(known, key=lambda p: (-len(p), min(p))), *news])
+        parts = {part_of.get(one, frozenset([one])) & whole for one in whole}
+        # The largest first, then by name: who was heard of first is a matter of the network.
+        wholes.append(sorted(parts, key=lambda part: (-len(part), min(part))))
     seat = {one: (k, n) for k, parts in enumerate(wholes) for n, part in enumerate(parts) for one in part}
     ties: dict[tuple[int, int], Counter[int]] = {}
     for link in after.links:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
@@ -19,6 +19,7 @@ TWO = Ranges(np.array([0.0, 1.0]), np.array([2.0, 0.5]), 2.0)
 
 
 @given(st.binary(max_size=80), st.sampled_from([TWO, Ranges()]))
+@example(bytes(6) + struct.pack("<h", 31488) + bytes(2), TWO)  # a heading beyond half a turn
 def test_any_bytes_are_a_wake_or_refused_and_encode_to_themselves(data, ranges):
     try:
         wake = unpack_trajectory(data, ranges)

@@ -287,6 +287,7 @@ def test_a_merge_that_loses_its_support_says_so() -> None:
     assert partings(parts, before.links, before) == () == joinings(parts, before)
     (joined,) = [one for one in joinings(joined_maps(alone), before) if "a.1 and b.1" in one]
     assert joined == f"a.1 and b.1 are one map now, by {len(between(before))} links"
+    assert joined in joinings([frozenset([B])], before)  # whichever of the two was heard of first
     merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
     for links in (before.links, None):
         (words,) = partings(parts, links, merger.merged())
