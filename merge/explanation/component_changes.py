@@ -63,9 +63,9 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
     part_of = {one: part for part in before for one in part}
     wholes = []
     for whole in joined_maps(after):
-        parts = {part_of.get(one, frozenset([one])) & whole for one in whole}
+        groups = {part_of.get(one, frozenset([one])) & whole for one in whole}
         # The largest first, then by name: who was heard of first is a matter of the network.
-        wholes.append(sorted(parts, key=lambda part: (-len(part), min(part))))
+        wholes.append(sorted(groups, key=lambda part: (-len(part), min(part))))
     seat = {one: (k, n) for k, parts in enumerate(wholes) for n, part in enumerate(parts) for one in part}
     ties: dict[tuple[int, int], Counter[int]] = {}
     for link in after.links:
