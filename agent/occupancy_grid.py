@@ -13,6 +13,13 @@ from numpy.typing import NDArray
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.pose import Array, Pose2
 
+OCCUPANCY_GRID_HIT = 0.9
+"""Log-odds that a cell gains when a ranger ends in it."""
+MISS = 0.35
+"""Log-odds that it loses when a ranger passes through."""
+MOST = 3.0
+"""Log-odds are kept within plus and minus this, so that a thing that moved away is forgotten."""
+
 
 @dataclass(frozen=True)
 class OccupancyGridSettings:
@@ -22,17 +29,11 @@ class OccupancyGridSettings:
         cell: side of a cell, m.
         side: side of the whole grid, m; its middle is where the map began.
         clearance: kept between the footprint's edge and anything seen, m.
-        hit: log-odds that a cell gains when a ranger ends in it.
-        miss: log-odds that it loses when a ranger passes through.
-        most: log-odds are kept within plus and minus this, so that a thing that moved away is forgotten.
     """
 
     cell: float = 0.1
     side: float = 48.0
     clearance: float = 0.10
-    hit: float = 0.9
-    miss: float = 0.35
-    most: float = 3.0
 
 
 RAYS = 48
@@ -93,12 +94,12 @@ class OccupancyGrid:
         free = np.unique(self.cells(points[along]), axis=0)
         hits = proximity < self._description.ranger_reach - 0.05
         ended = np.unique(self.cells(here + directions[hits] * ends[hits, None]), axis=0)
-        self._odds[free[:, 0], free[:, 1]] -= s.miss
-        self._odds[ended[:, 0], ended[:, 1]] += s.hit + s.miss
+        self._odds[free[:, 0], free[:, 1]] -= MISS
+        self._odds[ended[:, 0], ended[:, 1]] += OCCUPANCY_GRID_HIT + MISS
         # Where the robot stands there is nothing.
         own = self.cells(here + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
-        self._odds[own[:, 0], own[:, 1]] = -s.most
-        np.clip(self._odds, -s.most, s.most, out=self._odds)
+        self._odds[own[:, 0], own[:, 1]] = -MOST
+        np.clip(self._odds, -MOST, MOST, out=self._odds)
 
     def room(self) -> Array:
         """For each cell the distance to the nearest thing seen, m."""

@@ -20,26 +20,24 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Node
 from mapweave.hybridmap.pose import Array, Pose2
 
+FARTHEST = 2.5
+"""M, between two nodes."""
+WIDEST = math.radians(45.0)
+"""Rad, between their headings."""
+LEAST = 7
+"""Common landmarks that stay in view: as many as a look for the next node asks for; the servo itself holds
+on to four."""
+STOPS = 9
+"""Poses on the way at which is counted."""
+
+
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
 """Edges that say that two nodes show the same, and not that anybody drove from one to the other."""
 
 
 @dataclass(frozen=True)
 class ReachabilitySettings:
-    """What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`.
-
-    Attributes:
-        farthest: m, between two nodes.
-        widest: rad, between their headings.
-        least: common landmarks that stay in view: as many as a look for the next node asks for; the servo
-            itself holds on to four.
-        stops: poses on the way at which is counted.
-    """
-
-    farthest: float = 2.5
-    widest: float = math.radians(45.0)
-    least: int = 7
-    stops: int = 9
+    """What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,18 +68,18 @@ def reachability_of(
     """
     if edge.kind not in RECOGNISED:
         return Reachability(True, -1, f"{edge.kind} by a robot: it can be driven")
-    s = settings or ReachabilitySettings()
+    settings or ReachabilitySettings()
     between = edge.a_from_b.mean
-    count = int(least_in_view(left(edge.shared, a, b), a, b, between, s.stops))
+    count = int(least_in_view(left(edge.shared, a, b), a, b, between, STOPS))
     distance, turn = between.distance(Pose2()), abs(between.heading)
     lacks = []
-    if count < s.least:
+    if count < LEAST:
         common = "landmark stays" if count == 1 else "landmarks stay"
         lacks.append(f"only {count} {common} in view" if count else "no landmark stays in view")
-    if distance > s.farthest:
-        lacks.append(f"{distance:.1f} m are more than the {s.farthest:g} m that the servo manages")
-    if turn > s.widest:
-        most = math.degrees(s.widest)
+    if distance > FARTHEST:
+        lacks.append(f"{distance:.1f} m are more than the {FARTHEST:g} m that the servo manages")
+    if turn > WIDEST:
+        most = math.degrees(WIDEST)
         lacks.append(f"{math.degrees(turn):.0f} degrees are more than the {most:.0f} that the servo manages")
     if lacks:
         return Reachability(False, count, f"ties poses, not driven: {'; '.join(lacks)}")

@@ -23,21 +23,22 @@ from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
+DISTANCE = 0.05
+"""A node that lies less far from where its agent was told that it lies is not told anew, m."""
+TURN = math.radians(1.0)
+"""And is turned by less, rad."""
+
 
 @dataclass(frozen=True)
 class PoseBroadcastSettings:
     """What is worth telling, and how often.
 
     Attributes:
-        distance: a node that lies less far from where its agent was told that it lies is not told anew, m;
-        turn: and is turned by less, rad.
         every: s between two news of one agent, at least.
         beat: s after which it is told the number of the last news again, so that lost ones are missed.
         most: nodes in one message.
     """
 
-    distance: float = 0.05
-    turn: float = math.radians(1.0)
     every: float = 2.0
     beat: float = 15.0
     most: int = 2048
@@ -136,14 +137,14 @@ class PoseBroadcast:
 
     def _moved(self, graphs: Iterable[PoseGraph]) -> Iterator[tuple[NodeId, MergedPose]]:
         """Nodes that lie noticeably elsewhere than where their agents were told that they lie."""
-        s, nobody = self._settings, _Told()
+        _s, nobody = self._settings, _Told()
         for graph in graphs:
             for node, (x, y, heading) in zip(graph.nodes, graph.means.tolist(), strict=True):
                 before = self._told.get(node.agent, nobody).places.get(node)
                 if before is not None and before.frame == graph.anchor:
                     pose = before.merged_from_node
-                    near = math.hypot(x - pose.x, y - pose.y) <= s.distance
-                    if near and abs(wrap_angle(heading - pose.heading)) <= s.turn:
+                    near = math.hypot(x - pose.x, y - pose.y) <= DISTANCE
+                    if near and abs(wrap_angle(heading - pose.heading)) <= TURN:
                         continue
                 yield node, MergedPose(graph.anchor, Pose2(x, y, heading))
 

@@ -13,7 +13,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.route import Route, edge_cost
 from mapweave.mapserver.roadmap import IMPLIED
-from mapweave.mapserver.routes import Router
+from mapweave.mapserver.routes import WARY_COST, Router
 from mapweave.merge.explanation.component_changes import joined_maps
 from mapweave.merge.explanation.map_explanation import explain_maps
 from mapweave.merge.explanation.own_edges import reach_words
@@ -72,9 +72,7 @@ def explain_route(
         return _apart(merged, start, goal, missing)
     if start == goal:
         return RouteExplanation(start, goal, True, "start and goal are one node")
-    known = _Hindrances(
-        frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), router.settings.wary_cost
-    )
+    known = _Hindrances(frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), WARY_COST)
     found, why_not = Route((), (), 0.0, ""), ""
     poses: Mapping[NodeId, Pose2] = {}
     for poses in router.choices(start, goal):
@@ -114,7 +112,7 @@ def _hops(router: Router, way: Route, poses: Mapping[NodeId, Pose2], known: _Hin
     edges = router.roads.union.edges
     for (a, b), edge_id in zip(pairwise(way.nodes), way.edges, strict=True):
         edge, words = edges[edge_id], known.words(frozenset((a, b)))
-        more = router.settings.wary_cost if words else 0.0
+        more = WARY_COST if words else 0.0
         told = _hop(router, edge, a, b, poses, more)
         yield told if not words else replace(told, words=f"{told.words}; {words}")
 

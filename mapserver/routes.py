@@ -20,6 +20,20 @@ from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.roadmap import Roadmap
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
+NEAR = 0.5
+"""Nodes nearer than this to each other count as joined, whatever they show, m: less than what two robots
+keep apart on the two sides of a wall."""
+ENTRY_REACH = 1.5
+"""A robot may enter the map at nodes nearer than this, m."""
+ENTRY_COST = 3.0
+"""What a metre from the robot to its first node costs: nobody has driven it yet."""
+ON_EDGE = 0.25
+"""A robot this near to an edge that was driven stands on it, m: along it a metre costs a metre, so that it
+need not turn back to the edge's beginning."""
+WARY_COST = 4.0
+"""What it costs to try again where another robot did not get through, m."""
+
+
 ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""
 
@@ -30,21 +44,9 @@ class RouterSettings:
 
     Attributes:
         route: what a way costs.
-        near: nodes nearer than this to each other count as joined, whatever they show, m: less than what two
-            robots keep apart on the two sides of a wall.
-        entry_reach: a robot may enter the map at nodes nearer than this, m.
-        entry_cost: what a metre from the robot to its first node costs: nobody has driven it yet.
-        on_edge: a robot this near to an edge that was driven stands on it, m: along it a metre costs a metre,
-            so that it need not turn back to the edge's beginning.
-        wary_cost: what it costs to try again where another robot did not get through, m.
     """
 
     route: RouteSettings = field(default_factory=RouteSettings)
-    near: float = 0.5
-    entry_reach: float = 1.5
-    entry_cost: float = 3.0
-    on_edge: float = 0.25
-    wary_cost: float = 4.0
 
 
 class Router:
@@ -74,7 +76,7 @@ class Router:
         """What routes may use; made when it is asked for first."""
         with self._turn:
             if self._made is None:
-                self._made = Roadmap(self.merged, self.settings.near, self._reaches)
+                self._made = Roadmap(self.merged, NEAR, self._reaches)
             return self._made
 
     def route(
@@ -184,22 +186,21 @@ class Router:
         """Nodes where the route may begin with what it costs to get there, cheapest first."""
         if start_from_robot is None:
             return [(start, 0.0)]
-        s = self.settings
         here = poses[start] @ start_from_robot
         component = self.merged.component_of(start)
         barred = {frozenset(pair) for pair in blocked}
         members = self.merged.components[component or 0]
         near = sorted((here.distance(poses[n]), n) for n in members if n in poses)
         entries = [
-            (node, s.entry_cost * distance - self._saved(here, node, distance, barred))
+            (node, ENTRY_COST * distance - self._saved(here, node, distance, barred))
             for distance, node in near
-            if (distance <= s.entry_reach or node == start) and frozenset((start, node)) not in barred
+            if (distance <= ENTRY_REACH or node == start) and frozenset((start, node)) not in barred
         ]
         return sorted(entries, key=lambda entry: entry[1])[:ENTRIES]
 
     def _saved(self, here: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
         """By how much it is cheaper to get to a node for a robot that stands on an edge to it, m."""
-        s, roads = self.settings, self.roads
+        _s, roads = self.settings, self.roads
         target = roads.poses[node]
         goal = np.array([target.x, target.y])
         at = np.array([here.x, here.y])
@@ -212,14 +213,14 @@ class Router:
             along = np.array([roads.poses[other].x, roads.poses[other].y]) - goal
             share = float(np.clip((at - goal) @ along / max(along @ along, 1e-9), 0.0, 1.0))
             off = float(np.linalg.norm(at - goal - share * along))
-            if off <= s.on_edge and share < 1.0:
-                saved = max(saved, (s.entry_cost - 1.0) * (distance - off))
+            if off <= ON_EDGE and share < 1.0:
+                saved = max(saved, (ENTRY_COST - 1.0) * (distance - off))
         return saved
 
     def _penalties(self, wary: Collection[tuple[NodeId, NodeId]]) -> Mapping[EdgeId, float]:
         if not wary:
             return {}
-        pairs, cost = {frozenset(pair) for pair in wary}, self.settings.wary_cost
+        pairs, cost = {frozenset(pair) for pair in wary}, WARY_COST
         return {
             edge.id: cost for edge in self.roads.union.edges.values() if frozenset((edge.a, edge.b)) in pairs
         }

@@ -34,6 +34,12 @@ from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
 
+STATUS_EVERY = 0.5
+"""Seconds between two status messages."""
+MERGE_SHARE = 0.4
+"""At most this share of the time is spent making the merged map anew."""
+
+
 log = logging.getLogger(__name__)
 
 
@@ -42,14 +48,10 @@ class ServerSettings:
     """How the server shares its time.
 
     Attributes:
-        status_every: seconds between two status messages.
-        merge_share: at most this share of the time is spent making the merged map anew.
         desk: how questions that take long are shared out.
         merge: how maps are merged.
     """
 
-    status_every: float = 0.5
-    merge_share: float = 0.4
     desk: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
 
@@ -90,9 +92,7 @@ class MapServer:
         self._keeper = PlaceIndexKeeper(self._store, path)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._chronicle = MapHistory(self._store, clock=clock.time_ns)
-        self._upkeep = MergeWorker(
-            clock, s.merge_share, self._keeper.index, s.merge, findings, self._chronicle
-        )
+        self._upkeep = MergeWorker(clock, MERGE_SHARE, self._keeper.index, s.merge, findings, self._chronicle)
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
         self._desk = AdmissionControl(s.desk, clock.monotonic, clock.executor(s.desk.workers))
@@ -113,7 +113,7 @@ class MapServer:
             lambda: self._blockages.known(clock.monotonic()), lambda: self._chronicle.happenings,
         )  # fmt: skip
         self._herald = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
-        clock.every(self._settings.status_every, self._tell)
+        clock.every(STATUS_EVERY, self._tell)
         clock.every(EVERY, self._keeper.look)
         return self
 

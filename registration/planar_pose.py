@@ -21,6 +21,16 @@ from mapweave.registration.planar_ambiguity import mirrored
 from mapweave.registration.projection import Stack
 from mapweave.registration.sightings import Sightings
 
+HYPOTHESES = 100
+"""Poses tried from three bearings, and as many from two points with depth."""
+FINALISTS = 2
+"""Best hypotheses that are refined."""
+PLANAR_POSE_ROUNDS = 8
+"""Of Gauss-Newton at most."""
+APART = 0.3
+"""Two poses nearer to each other than this are the same, m."""
+
+
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
 
 PREVIEW = 20
@@ -32,24 +42,16 @@ class PlanarPoseSettings:
     """How a pose is found.
 
     Attributes:
-        hypotheses: poses tried from three bearings, and as many from two points with depth.
-        finalists: best hypotheses that are refined.
-        rounds: of Gauss-Newton at most.
         pixel_sigma: standard deviation of a matched pixel, px. A SIFT feature found again at another scale
             is off by about one pixel.
         scale_sigma: share by which all points of one frame may be too near or too far together; they come
             from one drive with one set of wheels, so their errors are not independent.
         least_inliers: fewer give no pose.
-        apart: two poses nearer to each other than this are the same, m.
     """
 
-    hypotheses: int = 100
-    finalists: int = 2
-    rounds: int = 8
     pixel_sigma: float = 1.0
     scale_sigma: float = 0.01
     least_inliers: int = 4
-    apart: float = 0.3
 
 
 def solve_planar_pose(
@@ -110,7 +112,7 @@ def solve_sightings(
     total = sum(len(part) for part in parts)
     if total < settings.least_inliers:
         return None
-    counts = [-(-settings.hypotheses * len(part) // total) for part in parts]
+    counts = [-(-HYPOTHESES * len(part) // total) for part in parts]
     poses = np.concatenate([hypotheses(part, n, rng) for part, n in zip(parts, counts, strict=True)])
     if prior is not None:
         poses = np.concatenate([prior.mean.vector[None], poses])
@@ -121,13 +123,13 @@ def solve_sightings(
         # Most hypotheses are wrong, which a part of the sightings shows as well as all of them.
         few = [part.take(slice(None, None, total // PREVIEW)) for part in parts]
         poses = poses[np.argsort(-_scores(few, poses), kind="stable")[: max(len(poses) // 5, 10)]]
-    finalists = np.argsort(-_scores(parts, poses), kind="stable")[: settings.finalists]
+    finalists = np.argsort(-_scores(parts, poses), kind="stable")[:FINALISTS]
     improved = [improve(stack, Pose2.from_vector(poses[k]), prior, rounds=2) for k in finalists]
     kept = [one[0] for one in improved if one is not None]
     if not kept:
         return None
     best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
-    fix = refine(stack, best, settings.scale_sigma, prior, rounds=settings.rounds)
+    fix = refine(stack, best, settings.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return _weighed(fix, parts, stack, settings, prior)
@@ -145,13 +147,13 @@ def _weighed(
     if int(seen.sum()) < s.least_inliers:
         return fix
     mean = fix.node_from_robot.mean
-    other = improve(stack, mirrored(mean, stack.points[seen, :2]), prior, rounds=s.rounds)
-    if other is None or other[0].distance(mean) < s.apart:
+    other = improve(stack, mirrored(mean, stack.points[seen, :2]), prior, rounds=PLANAR_POSE_ROUNDS)
+    if other is None or other[0].distance(mean) < APART:
         return fix
     ours, theirs = _scores(parts, np.stack([mean.vector, other[0].vector])).tolist()
     if theirs <= ours:
         return replace(fix, rival=max(theirs, 0.0) / ours if ours > 0.0 else 1.0)
-    better = refine(stack, other[0], s.scale_sigma, prior, rounds=s.rounds)
+    better = refine(stack, other[0], s.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
         return replace(fix, rival=1.0)
     return replace(better, rival=max(ours, 0.0) / theirs)

@@ -16,6 +16,16 @@ from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import View
 from mapweave.vision.lens import Lens
 
+CONTRAST = 0.02
+"""SIFT's contrast threshold; lower finds more and weaker features."""
+CELLS = 4
+"""The image is cut into cells x cells; each may give at most `crowding` times its even share."""
+CROWDING = 2.5
+"""See cells."""
+BORDER_PX = 6.0
+"""Features nearer to the image's border are left out, they cannot be tracked."""
+
+
 TEXTURE_BLOCK_PX = 11
 """Side of the square in which texture is measured, about that of a tracked patch."""
 
@@ -26,10 +36,6 @@ class SiftSettings:
 
     Attributes:
         most: features kept of one image.
-        contrast: SIFT's contrast threshold; lower finds more and weaker features.
-        cells: the image is cut into cells x cells; each may give at most `crowding` times its even share.
-        crowding: see cells.
-        border_px: features nearer to the image's border are left out, they cannot be tracked.
         least_texture: the image's mean squared gradient around a feature, in its weakest direction,
             (grey/px)^2. On an edge it is that of noise alone: such a feature slides along the edge when it
             is tracked (aperture problem), unnoticed by a forward-backward check.
@@ -37,10 +43,6 @@ class SiftSettings:
     """
 
     most: int = 150
-    contrast: float = 0.02
-    cells: int = 4
-    crowding: float = 2.5
-    border_px: float = 6.0
     least_texture: float = 1.5
     least_roundness: float = 0.04
 
@@ -78,9 +80,7 @@ class Sift:
         self._lens = lens
         self._settings = settings or SiftSettings()
         # More are asked for than kept, so that the spread has something to choose from.
-        self._detector = cv2.SIFT.create(
-            nfeatures=2 * self._settings.most, contrastThreshold=self._settings.contrast
-        )
+        self._detector = cv2.SIFT.create(nfeatures=2 * self._settings.most, contrastThreshold=CONTRAST)
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Find the features of a grey image (H, W)."""
@@ -117,16 +117,16 @@ class Sift:
     def _spread(self, keypoints: list[cv2.KeyPoint], width: int, height: int) -> list[cv2.KeyPoint]:
         """Strongest first, one a place (SIFT repeats a place for each orientation), no cell crowded."""
         s = self._settings
-        quota = int(np.ceil(s.crowding * s.most / s.cells**2))
+        quota = int(np.ceil(CROWDING * s.most / CELLS**2))
         taken: dict[tuple[int, int], int] = {}
         places: set[tuple[int, int]] = set()
         kept: list[cv2.KeyPoint] = []
         for k in sorted(keypoints, key=lambda k: (-k.response, k.pt)):
             x, y = k.pt
-            if not (s.border_px <= x < width - s.border_px and s.border_px <= y < height - s.border_px):
+            if not (BORDER_PX <= x < width - BORDER_PX and BORDER_PX <= y < height - BORDER_PX):
                 continue
             place = (round(x), round(y))
-            cell = (int(x * s.cells / width), int(y * s.cells / height))
+            cell = (int(x * CELLS / width), int(y * CELLS / height))
             if place in places or taken.get(cell, 0) >= quota:
                 continue
             places.add(place)

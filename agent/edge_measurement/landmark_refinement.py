@@ -13,6 +13,10 @@ from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import snap
 
+DOUBT = 3.3
+"""A depth that is off from the mapped one by more than this many sigma of that is no better one: what was
+followed may be something else."""
+
 
 @dataclass(frozen=True)
 class LandmarkRefinementSettings:
@@ -22,14 +26,11 @@ class LandmarkRefinementSettings:
         share: a landmark is known better if its depth's sigma has fallen below this share of what it was.
         least: a node is told anew if so many of its landmarks are known better: it costs some 3 kB.
         floor: what a depth is never better than: m, and share of the depth; as when it was mapped.
-        doubt: a depth that is off from the mapped one by more than this many sigma of that is no better one:
-            what was followed may be something else.
     """
 
     share: float = 0.7
     least: int = 5
     floor: tuple[float, float] = (0.01, 0.015)
-    doubt: float = 3.3
 
 
 class LandmarkRefinement:
@@ -81,7 +82,7 @@ def refined(
     sober = np.hypot(sigmas, s.floor[0] + s.floor[1] * depths)
     with np.errstate(invalid="ignore"):
         better = sober < s.share * mapped.depth_sigmas
-        better &= np.abs(depths - mapped.depths) < s.doubt * mapped.depth_sigmas
+        better &= np.abs(depths - mapped.depths) < DOUBT * mapped.depth_sigmas
     if np.count_nonzero(better) < s.least:
         return None
     new = [np.where(better, one, old).astype(np.float32) for one, old in

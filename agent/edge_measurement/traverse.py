@@ -16,6 +16,19 @@ from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
+SETTLED = 3
+"""Images through which a node's landmarks must have been followed: fewer than lie between two looks for the
+next node."""
+TRAVERSE_GAP = 0.5
+"""What may lie between the landmarks of two nodes, as `Fix.blind` counts it, m."""
+REACH = 0.45
+"""This near to a node the robot has passed it, m. It is twice the distance within which the follower takes
+a node for passed."""
+DETOUR = 1.3
+"""Nor is one on a way longer than the straight line by more than this factor, and `reach` at either end:
+something stands in between."""
+
+
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
 
@@ -24,24 +37,13 @@ class TraverseSettings:
     """When a drive from node to node is a measurement.
 
     Attributes:
-        settled: images through which a node's landmarks must have been followed: fewer than lie between
-            two looks for the next node.
-        gap: what may lie between the landmarks of two nodes, as `Fix.blind` counts it, m.
-        reach: this near to a node the robot has passed it, m. It is twice the distance within which the
-            follower takes a node for passed.
         floor: error of a settled pose that its covariance does not tell of, m and rad: tracks err alike
             for a while, and the landmarks of a node were mapped by the same wheels.
         widest: a traverse known no better than this is not worth telling, m.
-        detour: nor is one on a way longer than the straight line by more than this factor, and `reach` at
-            either end: something stands in between.
     """
 
-    settled: int = 3
-    gap: float = 0.5
-    reach: float = 0.45
     floor: tuple[float, float] = (0.005, 0.005)
     widest: float = 0.1
-    detour: float = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +104,13 @@ class TraverseRecorder:
         self._node_from_robot, self._gap = self._node_from_robot @ step, self._gap + blind
         self._way += abs(observation.odometry.forward)
         if not self._settled(fix):
-            if self._gap > self._settings.gap:
+            if self._gap > TRAVERSE_GAP:
                 self._forget()
             return None
         assert fix.localizer is not None, "landmarks are in sight"
         self._stand(fix.node, self._sober(fix.node_from_robot), len(fix.localizer.visible))
         mean = self._node_from_robot.mean
-        return self._arrive() if mean.distance(Pose2()) <= self._settings.reach else None
+        return self._arrive() if mean.distance(Pose2()) <= REACH else None
 
     def _settled(self, fix: Fix) -> bool:
         """Whether landmarks that the node has with their depths have been in sight for a while."""
@@ -116,7 +118,7 @@ class TraverseRecorder:
         known = localizer is not None and localizer is self._watched
         self._images = self._images + 1 if known else 0
         self._watched = localizer
-        return known and self._images >= self._settings.settled
+        return known and self._images >= SETTLED
 
     def _stand(self, node: NodeId, node_from_robot: PoseGaussian, in_sight: int) -> None:
         """Know the robot by a node; where that is another one, this is a hand-over."""
@@ -139,7 +141,7 @@ class TraverseRecorder:
             return None
         s = self._settings
         widest = float(np.sqrt(np.linalg.eigvalsh(between.covariance[:2, :2])[-1]))
-        straight = s.detour * between.mean.distance(Pose2()) + 2.0 * s.reach
+        straight = DETOUR * between.mean.distance(Pose2()) + 2.0 * REACH
         return Traverse(start, self._node, between, fewest) if widest < s.widest and way < straight else None
 
     def _sober(self, pose: PoseGaussian) -> PoseGaussian:

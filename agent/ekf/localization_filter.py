@@ -22,6 +22,38 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose
 
+PIXEL_SIGMA = 0.7
+"""Standard deviation of a tracked pixel, px."""
+GATE_PROBABILITY = 0.999
+"""Share of true measurements that each gate lets pass."""
+ITERATIONS = 4
+"""Linearisations of one update at most; a second is made only if the first did not hold."""
+LINEAR_PX = 0.1
+"""A pixel whose second-order part stays below this is linear, px."""
+LOOSE_HEADING = 0.15
+"""A heading less certain than this is first fixed by static least squares, rad."""
+LOST_POSITION = 1.0
+"""Uncertainty of a position that was refuted, m (the paper's 1 m)."""
+LOST_HEADING = 1.0
+"""Uncertainty of a heading that was refuted, rad (the paper's 1 rad)."""
+LEAST_FIXED = 4
+"""Landmarks that a static fix needs (paper, section 6)."""
+LEAST_REFOUND = 6
+"""Landmarks that a static fix needs to replace a pose that was refuted."""
+LEAST_AGREEING = 3
+"""Fewer accepted landmarks than this are no good update."""
+LEAST_AGREEING_SHARE = 0.35
+"""Nor is a smaller share of those seen."""
+PATIENCE = 3
+"""So many bad updates in a row make the filter unhealthy."""
+WIDEST_SIGMA = 0.5
+"""So does a position less certain than this, m."""
+WIDEST_SLOPE = 4.0
+"""Landmarks further aside of the node than this |a| cannot be anchored at it."""
+NEAREST = 0.05
+"""Nor can those nearer to the node's optical centre, m."""
+
+
 __all__ = ["LocalizationFilter", "LocalizationSettings", "NodeLandmarks"]
 
 
@@ -97,7 +129,7 @@ class LocalizationFilter:
             ids: (N,) what is seen; ids that the filter does not hold are ignored.
             pixels: (N, 2) px, undistorted; rows with NaN are ignored.
         """
-        s, mount = self.settings, self._camera.mount_forward
+        _s, mount = self.settings, self._camera.mount_forward
         slots, rows = self._slots(ids)
         seen = np.isfinite(pixels[rows]).all(axis=1)
         slots, rows = slots[seen], rows[seen]
@@ -111,24 +143,24 @@ class LocalizationFilter:
         if not len(slots):
             return self._judge(UpdateReport.blind(ids, "no landmark of the node is in view"))
         slopes = (pixels[rows] - self._centre) / self._focal
-        variances, linear = (s.pixel_sigma / self._focal) ** 2, s.linear_px / self._camera.fx
-        gate = pixel_gate(s.gate_probability)
-        measurement = Measurement(slots, slopes, variances, gate, s.iterations, linear)
+        variances, linear = (PIXEL_SIGMA / self._focal) ** 2, LINEAR_PX / self._camera.fx
+        gate = pixel_gate(GATE_PROBABILITY)
+        measurement = Measurement(slots, slopes, variances, gate, ITERATIONS, linear)
         fit = iterated_update(self._state, start, measurement, mount)
         if fit is None:
             return self._judge(UpdateReport.blind(ids, "the pose is too uncertain to be corrected"))
         accepted = np.zeros(len(ids), np.bool_)
         # A few that agree among many that do not may as well be the wrong ones.
-        if fit.accepted.mean() >= s.least_agreeing_share:
+        if fit.accepted.mean() >= LEAST_AGREEING_SHARE:
             self._state = fit.state
             accepted[rows[fit.accepted]] = True
         innovations_px = np.full((len(ids), 2), np.nan)
         innovations_px[rows] = fit.innovations * self._focal
         kept = int(fit.accepted.sum())
         health, reason = Health.GOOD, ""
-        if kept < s.least_agreeing_share * len(slots):
+        if kept < LEAST_AGREEING_SHARE * len(slots):
             health, reason = Health.DISAGREEMENT, f"{kept} of {len(slots)} landmarks agree"
-        elif kept < s.least_agreeing:
+        elif kept < LEAST_AGREEING:
             health, reason = Health.FEW, f"{kept} of {len(slots)} landmarks agree"
         return self._judge(UpdateReport(ids, accepted, innovations_px, fit.mean_nis, health, reason))
 
@@ -185,10 +217,10 @@ class LocalizationFilter:
     @property
     def reason(self) -> str:
         """Why it may not, in words; empty if healthy."""
-        if self._bad >= self.settings.patience:
+        if self._bad >= PATIENCE:
             return self._bad_reason
         sigma = math.sqrt(float(np.linalg.eigvalsh(self._state.covariance[:2, :2])[-1]))
-        return f"position known to {sigma:.1f} m only" if sigma > self.settings.widest_sigma else ""
+        return f"position known to {sigma:.1f} m only" if sigma > WIDEST_SIGMA else ""
 
     def predict_pixels(self, ids: Ids | None = None) -> Array:
         """(N, 2) px where landmarks are expected now; NaN if behind the camera or not held."""
@@ -217,11 +249,11 @@ class LocalizationFilter:
         The fix is a point of linearisation only, so that no pixel is used twice. A refuted pose loses
         its certainty; the landmarks keep theirs.
         """
-        s, state = self.settings, self._state
-        refuted = self._bad >= s.patience
-        if not (refuted or state.covariance[2, 2] > s.loose_heading**2):
+        _s, state = self.settings, self._state
+        refuted = self._bad >= PATIENCE
+        if not (refuted or state.covariance[2, 2] > LOOSE_HEADING**2):
             return state.pose_vector
-        least = s.least_refound if refuted else s.least_fixed
+        least = LEAST_REFOUND if refuted else LEAST_FIXED
         points, covariances = state.points(self._camera)
         fix = solve_planar_pose(
             points[slots],
@@ -229,7 +261,7 @@ class LocalizationFilter:
             self._camera,
             rng=self._rng,
             point_covariances=covariances[slots],
-            settings=PlanarPoseSettings(pixel_sigma=s.pixel_sigma, least_inliers=least),
+            settings=PlanarPoseSettings(pixel_sigma=PIXEL_SIGMA, least_inliers=least),
         )
         if fix is None:
             return state.pose_vector
@@ -237,7 +269,7 @@ class LocalizationFilter:
         if refuted:
             p = state.covariance.copy()
             p[:3, :] = p[:, :3] = 0.0
-            p[[0, 1, 2], [0, 1, 2]] = s.lost_position**2, s.lost_position**2, s.lost_heading**2
+            p[[0, 1, 2], [0, 1, 2]] = LOST_POSITION**2, LOST_POSITION**2, LOST_HEADING**2
             self._state = replace(state, pose_vector=start.copy(), covariance=p)
         # The same turn of the circle as the prior's heading.
         start[2] += 2 * math.pi * round((self._state.pose_vector[2] - start[2]) / (2 * math.pi))
@@ -263,8 +295,8 @@ class LocalizationFilter:
         return fit
 
     def _anchorable(self, rays: Array) -> NDArray[np.bool_]:
-        near = rays[:, 2] * self.settings.nearest > 1.0
-        aside = ~(np.abs(rays[:, 0]) <= self.settings.widest_slope)
+        near = rays[:, 2] * NEAREST > 1.0
+        aside = ~(np.abs(rays[:, 0]) <= WIDEST_SLOPE)
         return np.asarray((rays[:, 2] > 0) & ~near & ~aside, np.bool_)
 
     def _keep(self, mask: NDArray[np.bool_]) -> None:

@@ -61,39 +61,9 @@ class LocalizationSettings:
     """How the localization filter believes, gates and judges itself.
 
     Attributes:
-        pixel_sigma: standard deviation of a tracked pixel, px.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
         side_slip: standard deviation of the slip aside of a step, as a share of the wheels' way.
-        gate_probability: share of true measurements that each gate lets pass.
-        iterations: linearisations of one update at most; a second is made only if the first did not hold.
-        linear_px: a pixel whose second-order part stays below this is linear, px.
-        loose_heading: a heading less certain than this is first fixed by static least squares, rad.
-        lost_position: uncertainty of a position that was refuted, m (the paper's 1 m).
-        lost_heading: uncertainty of a heading that was refuted, rad (the paper's 1 rad).
-        least_fixed: landmarks that a static fix needs (paper, section 6).
-        least_refound: landmarks that a static fix needs to replace a pose that was refuted.
-        least_agreeing: fewer accepted landmarks than this are no good update.
-        least_agreeing_share: nor is a smaller share of those seen.
-        patience: so many bad updates in a row make the filter unhealthy.
-        widest_sigma: so does a position less certain than this, m.
-        widest_slope: landmarks further aside of the node than this |a| cannot be anchored at it.
-        nearest: nor can those nearer to the node's optical centre, m.
     """
 
-    pixel_sigma: float = 0.7
     wheel_floor: float = 1e-5
     side_slip: float = 0.0
-    gate_probability: float = 0.999
-    iterations: int = 4
-    linear_px: float = 0.1
-    loose_heading: float = 0.15
-    lost_position: float = 1.0
-    lost_heading: float = 1.0
-    least_fixed: int = 4
-    least_refound: int = 6
-    least_agreeing: int = 3
-    least_agreeing_share: float = 0.35
-    patience: int = 3
-    widest_sigma: float = 0.5
-    widest_slope: float = 4.0
-    nearest: float = 0.05

@@ -14,6 +14,23 @@ from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.image_drive import ImageDrive, ImageDriveSettings
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
+DRIVE = 0.6
+"""How far it drives back and forth to map a view, m."""
+LEAST_DRIVE = 0.2
+"""With less room than this the view is mapped as well as it can be while turning."""
+LEAST_FEATURES = 10
+"""A view with fewer features is not worth a drive."""
+LEFT = 4
+"""The turn ends when at most this many of the view's features are left (paper: four)."""
+LEAST_TURN = 0.45
+"""But not before this angle, rad."""
+MOST_TURN = 1.0
+"""Nor after this, rad."""
+TRAVEL_STEP = 0.8
+"""A new node at least this often on the way, m."""
+PATIENCE = 4.0
+"""Seconds without getting on before a way is given up."""
+
 
 class ExplorationBehaviours:
     """What an exploring robot can do, one generator a move: each `yield` is a command for one tick.
@@ -48,16 +65,15 @@ class ExplorationBehaviours:
 
     def map_view(self) -> Iterator[Command]:
         """Drive back and forth with the view's features in sight until their depths have converged."""
-        s = self._settings
-        if self._mapper.anchor_features < s.least_features:
+        if self._mapper.anchor_features < LEAST_FEATURES:
             self.detail = f"only {self._mapper.anchor_features} features in view: turning on"
             return
         ahead = self.room(0.0)
         behind = self.room(math.pi)
-        reach = min(s.drive, ahead)
-        if reach < s.least_drive:
-            reach = -min(s.drive, behind)
-        if abs(reach) < s.least_drive:
+        reach = min(DRIVE, ahead)
+        if reach < LEAST_DRIVE:
+            reach = -min(DRIVE, behind)
+        if abs(reach) < LEAST_DRIVE:
             self.detail = f"no room to drive: {ahead:.2f} m ahead, {behind:.2f} m behind"
             return
         self.phase = Phase.DRIVING
@@ -89,10 +105,10 @@ class ExplorationBehaviours:
         s = self._settings
         self.phase, self.detail = phase, ""
         start = self._mapper.map_from_robot.mean.heading
-        for _ in self._ticks(s.most_turn / s.turn_rate / self._description.tick + 40):
+        for _ in self._ticks(MOST_TURN / s.turn_rate / self._description.tick + 40):
             turned = abs(wrap_angle(self._mapper.map_from_robot.mean.heading - start))
             left = self._mapper.anchored
-            if turned >= s.most_turn or (turned >= s.least_turn and left <= s.left):
+            if turned >= MOST_TURN or (turned >= LEAST_TURN and left <= LEFT):
                 break
             self.detail = f"{left} features of the view left"
             yield Command(0.0, side * s.turn_rate)
@@ -128,7 +144,7 @@ class ExplorationBehaviours:
             error = self._bearing_to(corner)
             if abs(error) < 0.05:
                 return
-            if self._mapper.anchored <= s.left and abs(self._mapper.anchor_from_robot.heading) > s.least_turn:
+            if self._mapper.anchored <= LEFT and abs(self._mapper.anchor_from_robot.heading) > LEAST_TURN:
                 yield Command()
                 yield Command()
                 self.finish()
@@ -138,7 +154,7 @@ class ExplorationBehaviours:
     def drive_to(self, corner: Array) -> Generator[Command, None, bool]:
         """Returns whether the corner was reached."""
         s = self._settings
-        if abs(self._mapper.anchor_from_robot.heading) > 0.2 or self._mapper.anchored <= s.left:
+        if abs(self._mapper.anchor_from_robot.heading) > 0.2 or self._mapper.anchored <= LEFT:
             yield Command()
             self.finish()
         best, since_best = math.inf, 0.0
@@ -150,11 +166,11 @@ class ExplorationBehaviours:
             if distance < best - 0.02:
                 best, since_best = distance, 0.0
             since_best += self._description.tick
-            if since_best > s.patience or (self.room(0.0) <= 0.0 and since_best > 1.0):
+            if since_best > PATIENCE or (self.room(0.0) <= 0.0 and since_best > 1.0):
                 return False
             gone = self._mapper.anchor_from_robot
             way = math.hypot(gone.x, gone.y)
-            if way > s.travel_step or (way > 0.3 and self._mapper.anchored < 2 * s.left):
+            if way > TRAVEL_STEP or (way > 0.3 and self._mapper.anchored < 2 * LEFT):
                 yield Command()
                 self.finish()
             self.detail = f"{distance:.1f} m to the next corner"
@@ -180,7 +196,7 @@ class ExplorationBehaviours:
 
     def room(self, direction: float) -> float:
         """How far the footprint may move in a direction (rad, 0 ahead), m, by the rangers."""
-        return clearance(self._description, self._now.proximity, direction, self._settings.drive)
+        return clearance(self._description, self._now.proximity, direction, DRIVE)
 
     def _ticks(self, most: float) -> range:
         """A bound on the length of a behaviour: nothing may last forever."""

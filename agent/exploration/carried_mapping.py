@@ -8,6 +8,13 @@ from dataclasses import dataclass
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation
 
+LEAVING = 0.45
+"""Or the share of the view's features still tracked below which they are leaving the view."""
+LEAST_TRACKED = 16
+"""Or this few of them."""
+LEAST_TURN = 0.35
+"""Or after turning by this, rad."""
+
 
 @dataclass(frozen=True)
 class CarriedMappingSettings:
@@ -15,17 +22,11 @@ class CarriedMappingSettings:
 
     Attributes:
         converged: the share of landmarks that must have converged.
-        leaving: or the share of the view's features still tracked below which they are leaving the view.
-        least_tracked: or this few of them.
         depth_step: converged landmarks make a node only after moving this share of their median depth.
-        least_turn: or after turning by this, rad.
     """
 
     converged: float = 0.7
-    leaving: float = 0.45
-    least_tracked: int = 16
     depth_step: float = 0.25
-    least_turn: float = 0.35
 
 
 class CarriedMapping:
@@ -50,10 +51,10 @@ class CarriedMapping:
         moved = mapper.anchor_from_robot
         way = math.hypot(moved.x, moved.y)
         left = mapper.anchored
-        leaving = left < max(s.leaving * mapper.anchor_features, s.least_tracked)
-        far = way > s.depth_step * mapper.typical_depth or abs(moved.heading) > s.least_turn
+        leaving = left < max(LEAVING * mapper.anchor_features, LEAST_TRACKED)
+        far = way > s.depth_step * mapper.typical_depth or abs(moved.heading) > LEAST_TURN
         self.detail = f"{left} of {mapper.anchor_features} features left after {way:.1f} m"
-        if mapper.anchor_features < s.least_tracked:
+        if mapper.anchor_features < LEAST_TRACKED:
             self.detail = f"only {mapper.anchor_features} features in view"
         moving = way > 0.02 * mapper.typical_depth or abs(moved.heading) > 0.1
         if (leaving and moving) or (far and mapper.converged_share >= s.converged):

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapweave.agent.exploration.behaviours import ExplorationBehaviours
 from mapweave.agent.exploration.fleet_coverage import FleetCoverage
-from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.exploration.settings import REACH, SPACING, ExplorerSettings, Phase
 from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_around, views_of
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Question
@@ -17,6 +17,11 @@ from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Array
+
+KNOWN_REACH = 0.7
+"""Nodes within this of a place show it, m."""
+KNOWN = 0.75
+"""A place around which nodes look into this share of all directions is not mapped again."""
 
 
 class Explorer:
@@ -45,7 +50,7 @@ class Explorer:
         self._floor = floor
         self._settings = settings or ExplorerSettings()
         self._moves = ExplorationBehaviours(description, mapper, self._settings)
-        self._hearsay = FleetCoverage(map_id, self._settings.reach + self._settings.spacing)
+        self._hearsay = FleetCoverage(map_id, REACH + SPACING)
         self._rng = np.random.default_rng(seed)
         self._side = self._either_side()
         self._avoid: list[Array] = []
@@ -86,10 +91,7 @@ class Explorer:
         yield from self._moves.begin()
         self._ask()
         while True:
-            if (
-                seen_around(self._views, self._moves.position, self._settings.known_reach)
-                >= self._settings.known
-            ):
+            if seen_around(self._views, self._moves.position, KNOWN_REACH) >= KNOWN:
                 yield from self._scan()
             else:
                 yield from self._look_around()
@@ -131,7 +133,7 @@ class Explorer:
         """Corners of the way to the next place; empty if there is none."""
         s = self._settings
         been = np.array(self.places + self._avoid)
-        theirs = self._hearsay.places(self._views, s.known_reach, s.known)
+        theirs = self._hearsay.places(self._views, KNOWN_REACH, KNOWN)
         return next_viewpoint(self._floor, self._moves.position, been, theirs, s)
 
     @property

@@ -7,10 +7,20 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.exploration.settings import ExplorerSettings
+from mapweave.agent.exploration.settings import REACH, SPACING, ExplorerSettings
 from mapweave.agent.occupancy_grid import DistanceField, OccupancyGrid
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.pose import Array
+
+SIGHT = 1.6
+"""What lies around a place, and what others know around theirs, is judged within this radius, m."""
+VIEW = 3.0
+"""A look around shows floor up to this far, m."""
+LOOK_TIME = 60.0
+"""About what a look around takes, s."""
+LEAST_AREA = 1.0
+"""New floor that is worth one, m^2."""
+
 
 DIRECTIONS = 36
 """In how many directions of a circle it is asked whether a node looks there."""
@@ -57,12 +67,12 @@ def next_viewpoint(
         others: (M, 2) m, in map: where others have looked around.
         settings: of the exploration.
     """
-    ways = floor.ways(position, settings.reach)
+    ways = floor.ways(position, REACH)
     for choose in (_new_floor, _closer_look):
         for told in (others, others[:0]) if len(others) else (others,):
             taken = np.concatenate([been, told])
             away = np.linalg.norm(ways.positions[:, None] - taken[None], axis=2).min(axis=1)
-            free = np.flatnonzero(away >= settings.spacing)
+            free = np.flatnonzero(away >= SPACING)
             path = choose(floor, ways, free, told, settings) if len(free) else []
             if path:
                 return path
@@ -84,9 +94,9 @@ def _new_floor(
     squares = np.floor(ways.positions[free] / GRAIN).astype(np.int64)
     _, one_each = np.unique(squares, axis=0, return_index=True)
     tried = free[one_each]
-    areas = floor.unknown_in_sight(ways.positions[tried], told, settings.sight, settings.view)
-    rates = areas / (settings.look_time + ways.lengths[tried] / settings.travel_speed)
-    rates[areas < settings.least_area] = -math.inf
+    areas = floor.unknown_in_sight(ways.positions[tried], told, SIGHT, VIEW)
+    rates = areas / (LOOK_TIME + ways.lengths[tried] / settings.travel_speed)
+    rates[areas < LEAST_AREA] = -math.inf
     best = int(rates.argmax())
     return ways.path(ways.cells[tried[best]]) if np.isfinite(rates[best]) else []
 
@@ -95,7 +105,7 @@ def _closer_look(
     floor: OccupancyGrid, ways: DistanceField, free: NDArray[np.intp], told: Array, settings: ExplorerSettings
 ) -> list[Array]:
     """The way to where most around is unknown, in sight or not; the arguments are those of `_new_floor`."""
-    unknown = floor.unknown_around(settings.sight, told)[ways.cells[free, 0], ways.cells[free, 1]]
+    unknown = floor.unknown_around(SIGHT, told)[ways.cells[free, 0], ways.cells[free, 1]]
     worth = unknown - 0.04 * ways.lengths[free]
     worth[unknown < 0.02] = -math.inf
     best = int(worth.argmax())

@@ -19,6 +19,22 @@ from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Sift
 
+SURE = (0.06, 0.03)
+"""Standard deviations up to which a recognition is believed, m and rad."""
+LENIENCY = 1.0
+"""And after each whole turn in vain this many times `sure` more."""
+LOOKS = 1
+"""Recognitions that must agree, 1 or 2; 2 counts the own map's alone."""
+TURNS = (1, 1)
+"""Whole turns at the first place, and at each further one; one where anything is recognised."""
+PLACES = 0
+"""How many places it looks around at; 0 for no end."""
+CARRIED_PAUSE = 0.5
+"""Seconds between two looks of a robot that somebody else moves."""
+CARRIED_LOOKS = 120
+"""How often such a robot looks in vain before it counts as lost."""
+
+
 STILL = 0.2
 """Seconds that the robot stands still before a look."""
 LOOK_TURN = 0.5
@@ -98,7 +114,7 @@ class GlobalLocalization:
             believed: `map_from_robot` in the own map by the wheels, if the robot has only just lost sight of
                 everything: then it looks first where nodes nearby have looked.
         """
-        s, motion = self._settings, self._motion
+        _s, motion = self._settings, self._motion
         self.detail, self._ambiguous = "looking", ""
         for heading in self._familiar(believed):
             yield from motion.turn(wrap_angle(heading - motion.odom_from_robot.heading), TURN_RATE)
@@ -109,15 +125,15 @@ class GlobalLocalization:
         place, begin = 1, motion.turned
         while True:
             self._looks, self._views, self._hint = 0, 0, None
-            found = yield from self._look_around(s.turns[0] if place == 1 else s.turns[1], begin)
+            found = yield from self._look_around(TURNS[0] if place == 1 else TURNS[1], begin)
             if found is not None:
                 return found
             if self._views < LEAST_VIEWS * self._looks:
                 # With a covered lens, or in the dark, there is nothing to be learnt from going elsewhere.
                 continue
-            last = place == s.places
+            last = place == PLACES
             moved = False if last else (yield from self._move())
-            if last or not (moved or s.places == 0):
+            if last or not (moved or PLACES == 0):
                 break
             place += 1
         self._give_up(f"at {place} place{'s' if place > 1 else ''}")
@@ -125,13 +141,12 @@ class GlobalLocalization:
 
     def wait(self) -> Search:
         """Look while somebody else moves the robot; None after `carried_looks` views in vain."""
-        s = self._settings
-        while self._views < s.carried_looks:
+        while self._views < CARRIED_LOOKS:
             found = yield from self.look()
             if found is not None:
                 return found
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
-            yield from self._motion.stand(s.carried_pause)
+            yield from self._motion.stand(CARRIED_PAUSE)
         self._give_up(f"in {self._views} images")
         return None
 
@@ -155,7 +170,7 @@ class GlobalLocalization:
         own = self._own.candidates(view, image, features)
         self._take_hint(own)
         self._ambiguous = own.ambiguous or self._ambiguous
-        if self._settings.looks > 1:
+        if LOOKS > 1:
             return self._second_of_two(own)
         told = None if self._fleet is None else (yield from self._fleet.candidates(view))
         return self._single(own, told, leniency)
@@ -164,7 +179,7 @@ class GlobalLocalization:
 
     def _single(self, own: Candidates, told: Candidates | None, leniency: float) -> Candidate | None:
         """The place that one view shows, by the own map and by the fleet's, which must not contradict it."""
-        sure = self._settings.sure
+        sure = SURE
         self.detail = own.reason if told is None else told.reason
         if told is not None and told.ambiguous:
             self._ambiguous = told.ambiguous
@@ -192,8 +207,8 @@ class GlobalLocalization:
             self.detail = own.ambiguous or own.reason
             return None
         best = own.places[0]
-        exact = exact_enough(best.node_from_robot, s.sure)
-        if not exact_enough(best.node_from_robot, s.sure, VAGUE):
+        exact = exact_enough(best.node_from_robot, SURE)
+        if not exact_enough(best.node_from_robot, SURE, VAGUE):
             self.detail = f"node {best.node} is in view, but too far off"
             return None
         self.detail = f"{own.reason}; another view must, too"
@@ -228,7 +243,7 @@ class GlobalLocalization:
         for _ in range(math.ceil(turns * math.tau / LOOK_TURN)):
             yield from motion.stand(STILL)
             in_vain = (motion.turned - begin) / math.tau
-            found = yield from self.look(1.0 + self._settings.leniency * in_vain)
+            found = yield from self.look(1.0 + LENIENCY * in_vain)
             if found is not None:
                 return found
             if motion.turned - start >= (turns if self._hint is None else 1) * math.tau:

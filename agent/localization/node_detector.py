@@ -19,6 +19,13 @@ from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
+PLAUSIBLE = 0.3
+"""A recognition this far from where the robot believes to be is not believed, m."""
+PLAUSIBLE_TURN = 0.25
+"""Likewise, rad."""
+MORE = 1.3
+"""What is tracked already is given up for a fresh look that finds this many times as many landmarks."""
+
 
 @dataclass(frozen=True)
 class NodeDetectorSettings:
@@ -28,10 +35,6 @@ class NodeDetectorSettings:
         localizer: tracking and filtering of its landmarks from then on.
         recognition: when it counts as recognised. Less is asked than of a lost robot, because the pose
             must also be the expected one.
-        plausible: a recognition this far from where the robot believes to be is not believed, m.
-        plausible_turn: likewise, rad.
-        more: what is tracked already is given up for a fresh look that finds this many times as many
-            landmarks.
     """
 
     localizer: NodeLocalizerSettings = field(default_factory=NodeLocalizerSettings)
@@ -40,9 +43,6 @@ class NodeDetectorSettings:
             least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0
         )
     )
-    plausible: float = 0.3
-    plausible_turn: float = 0.25
-    more: float = 1.3
 
 
 class Expected(NamedTuple):
@@ -105,7 +105,7 @@ class NodeDetector:
             found = recognise(one.node, view, s.recognition, self._rng)
             if found is None or not self._plausible(found.node_from_robot.mean, one):
                 continue
-            if found.inliers > s.more * one.tracked:
+            if found.inliers > MORE * one.tracked:
                 node, closer = one.node, look_closer(one.node, view, found, s.recognition.pose)
                 if node.landmarks.scale_share:
                     levelled = level(node, view, found)
@@ -119,9 +119,9 @@ class NodeDetector:
 
     def _plausible(self, found: Pose2, expected: Expected) -> bool:
         """Whether the robot may be there, by what it believes."""
-        s, believed = self._settings, expected.node_from_robot
+        _s, believed = self._settings, expected.node_from_robot
         turned = abs(wrap_angle(found.heading - believed.heading))
         return (
-            found.distance(believed) <= s.plausible * expected.doubt
-            and turned <= s.plausible_turn * expected.doubt
+            found.distance(believed) <= PLAUSIBLE * expected.doubt
+            and turned <= PLAUSIBLE_TURN * expected.doubt
         )

@@ -17,6 +17,11 @@ from mapweave.registration.recognition import Recognition
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
 
+LEAST = 4
+"""Landmarks that must be tracked (paper, section 6: n >= 4)."""
+STRIKES = 3
+"""A track that the filter refuses this often in a row is given up."""
+
 
 @dataclass(frozen=True)
 class NodeLocalizerSettings:
@@ -25,14 +30,10 @@ class NodeLocalizerSettings:
     Attributes:
         tracker: tracks of the node's landmarks.
         filter: the localization EKF.
-        least: landmarks that must be tracked (paper, section 6: n >= 4).
-        strikes: a track that the filter refuses this often in a row is given up.
     """
 
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     filter: LocalizationSettings = field(default_factory=LocalizationSettings)
-    least: int = 4
-    strikes: int = 3
 
 
 class NodeLocalizer:
@@ -56,7 +57,7 @@ class NodeLocalizer:
         self.node = node
         self._settings = s = settings or NodeLocalizerSettings()
         self._description = description
-        self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, s.strikes)
+        self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, STRIKES)
         self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
         self._teaches = True
         self._filter = self._filter_at(recognition.node_from_robot, self._tracks.ids)
@@ -79,7 +80,7 @@ class NodeLocalizer:
     @property
     def in_sight(self) -> bool:
         """Whether enough landmarks are tracked and the filter trusts itself."""
-        return len(self._tracks.ids) >= self._settings.least and self._filter.healthy
+        return len(self._tracks.ids) >= LEAST and self._filter.healthy
 
     def restart(self, pose: PoseGaussian) -> None:
         """Believe a pose that is known better than by what was tracked so far.

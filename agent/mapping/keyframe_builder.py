@@ -25,6 +25,36 @@ from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.registration.recognition import Recognition, register
 from mapweave.registration.selection import SelectionSettings, choose, worth
 
+MOST_LANDMARKS = 150
+"""Landmarks that a node keeps."""
+LEAST_LANDMARKS = 6
+"""A view with fewer becomes no node."""
+DEPTH_SHARE = 0.25
+"""A landmark is kept if its depth's sigma is below this share of the depth."""
+DEPTH_FLOOR = (0.01, 0.015)
+"""What a depth is never better than: m, and share of the depth."""
+MOST_CHI2 = 4.0
+"""A triangulated track fits if its mean squared residual is below this; 1 is expected."""
+EDGE_FLOOR = (0.002, 0.004)
+"""What an edge's pose is never better than, m and rad: tracks err alike for a while, which the filter, for
+which pixels err independently, does not know."""
+EDGE_SHARE = (0.005, 0.01)
+"""Likewise as a share of the way and of the turn: wheels are never quite round."""
+LOOP_REACH = 1.2
+"""Nodes of the own map nearer than this are tried for a loop closure, m."""
+LOOP_TURN = 0.7
+"""And turned by less than this, rad."""
+LOOP_TRIES = 4
+"""At most this many, nearest first."""
+LOOP_SIGMA = 0.12
+"""A loop closure known no better than this is left to the server, m."""
+LOOP_GATE = 25.0
+"""Chi-square with 3 degrees of freedom by which a loop closure may miss what the robot has measured on its
+way from the one node to the other: places may look alike."""
+LOOP_FLOOR = (0.05, 0.03)
+"""Error of that way that its covariance does not tell of, m and rad."""
+
+
 TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
 
@@ -34,38 +64,10 @@ class KeyframeBuilderSettings:
     """How nodes and edges are made.
 
     Attributes:
-        most_landmarks: landmarks that a node keeps.
         selection: what a node may cost on the wire, and which landmarks it keeps if they cost more.
-        least_landmarks: a view with fewer becomes no node.
-        depth_share: a landmark is kept if its depth's sigma is below this share of the depth.
-        depth_floor: what a depth is never better than: m, and share of the depth.
-        most_chi2: a triangulated track fits if its mean squared residual is below this; 1 is expected.
-        edge_floor: what an edge's pose is never better than, m and rad: tracks err alike for a while,
-            which the filter, for which pixels err independently, does not know.
-        edge_share: likewise as a share of the way and of the turn: wheels are never quite round.
-        loop_reach: nodes of the own map nearer than this are tried for a loop closure, m.
-        loop_turn: and turned by less than this, rad.
-        loop_tries: at most this many, nearest first.
-        loop_sigma: a loop closure known no better than this is left to the server, m.
-        loop_gate: chi-square with 3 degrees of freedom by which a loop closure may miss what the robot has
-            measured on its way from the one node to the other: places may look alike.
-        loop_floor: error of that way that its covariance does not tell of, m and rad.
     """
 
-    most_landmarks: int = 150
     selection: SelectionSettings = field(default_factory=SelectionSettings)
-    least_landmarks: int = 6
-    depth_share: float = 0.25
-    depth_floor: tuple[float, float] = (0.01, 0.015)
-    most_chi2: float = 4.0
-    edge_floor: tuple[float, float] = (0.002, 0.004)
-    edge_share: tuple[float, float] = (0.005, 0.01)
-    loop_reach: float = 1.2
-    loop_turn: float = 0.7
-    loop_tries: int = 4
-    loop_sigma: float = 0.12
-    loop_gate: float = 25.0
-    loop_floor: tuple[float, float] = (0.05, 0.03)
 
 
 class KeyframeBuilder:
@@ -191,7 +193,7 @@ class KeyframeBuilder:
         self, view: View, tracking: Tracking, wayside: TrajectoryRecorder | None = None
     ) -> AnchoredKeyframe | None:
         landmarks, tracks = self._landmarks(view, tracking)
-        if len(landmarks) < self._settings.least_landmarks:
+        if len(landmarks) < LEAST_LANDMARKS:
             return None
         pose = self.map_from_anchor @ view.anchor_from_view
         d = self._description
@@ -207,7 +209,7 @@ class KeyframeBuilder:
         poses, pixels = tracking.history.sightings(view.tracks)
         if len(poses) >= 2 and len(view.tracks):
             solved = triangulate(poses, pixels, camera, reference=view.anchor_from_view.mean.vector)
-            fits = solved.chi2 < s.most_chi2
+            fits = solved.chi2 < MOST_CHI2
             depths[fits], sigmas[fits] = solved.depths[fits], solved.depth_sigmas[fits]
         view_from_robot = view.anchor_from_view.mean.inverse() @ tracking.pose.mean
         known = tracking.landmarks()
@@ -217,20 +219,20 @@ class KeyframeBuilder:
             axis = view_from_robot.rotation[0]
             spread = np.einsum("i,nij,j->n", axis, known.covariances_in_robot[row][:, :2, :2], axis)
             # What the filter has followed for a moment only is known better by all its sightings.
-            sure = (ahead > 0.05) & (np.sqrt(np.maximum(spread, 0.0)) < s.depth_share * ahead)
+            sure = (ahead > 0.05) & (np.sqrt(np.maximum(spread, 0.0)) < DEPTH_SHARE * ahead)
             depths[seat[sure]] = ahead[sure]
             sigmas[seat[sure]] = np.sqrt(np.maximum(spread[sure], 1e-12))
         with np.errstate(invalid="ignore"):
-            good = np.flatnonzero((depths > 0.05) & (sigmas < s.depth_share * depths))
+            good = np.flatnonzero((depths > 0.05) & (sigmas < DEPTH_SHARE * depths))
         # Tracks err alike for a while, which neither filter nor triangulation knows.
-        sigmas = np.hypot(sigmas, s.depth_floor[0] + s.depth_floor[1] * depths)
+        sigmas = np.hypot(sigmas, DEPTH_FLOOR[0] + DEPTH_FLOOR[1] * depths)
         landmarks = Landmarks(
             view.features.pixels[good].astype(np.float32), view.features.codes[good],
             depths[good].astype(np.float32), sigmas[good].astype(np.float32),
         )  # fmt: skip
         seen = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
         likely = worth(seen, good / max(len(view.tracks), 1))
-        kept = choose(landmarks, likely, camera, s.selection)[: s.most_landmarks]
+        kept = choose(landmarks, likely, camera, s.selection)[:MOST_LANDMARKS]
         # Rounded now, the robot works with the same numbers as everybody who gets the node.
         landmarks, order = settle(landmarks.take(kept), camera)
         return landmarks, view.tracks[good[kept[order]]]
@@ -257,26 +259,25 @@ class KeyframeBuilder:
 
     def _sober(self, moved: PoseGaussian) -> PoseGaussian:
         """A pose of the filter with the uncertainty that the filter cannot know."""
-        s = self._settings
         way, turn = float(np.hypot(moved.mean.x, moved.mean.y)), abs(moved.mean.heading)
-        position = s.edge_floor[0] + s.edge_share[0] * way
-        heading = s.edge_floor[1] + s.edge_share[1] * turn
+        position = EDGE_FLOOR[0] + EDGE_SHARE[0] * way
+        heading = EDGE_FLOOR[1] + EDGE_SHARE[1] * turn
         more = np.diag([position**2, position**2, heading**2])
         return PoseGaussian(moved.mean, moved.covariance + more)
 
     def _close_loops(self, node: Node) -> list[Edge]:
         """Recognise places of the own map (paper, section 5): each gives a new edge."""
-        s, near = self._settings, []
+        _s, near = self._settings, []
         for other in self.map.nodes.values():
             between = other.map_from_robot.mean.inverse() @ node.map_from_robot.mean
             reach = float(np.hypot(between.x, between.y))
             joined = self._last is not None and other.id == self._last.node.id and not self._last.evidence
-            if not joined and reach < s.loop_reach and abs(between.heading) < s.loop_turn:
+            if not joined and reach < LOOP_REACH and abs(between.heading) < LOOP_TURN:
                 near.append((reach, other))
         edges: list[Edge] = []
-        for _, other in sorted(near, key=lambda pair: pair[0])[: s.loop_tries]:
+        for _, other in sorted(near, key=lambda pair: pair[0])[:LOOP_TRIES]:
             found = register(other, node, None, self._rng)
-            if found is None or found.evidence["sigma_xy"] >= s.loop_sigma:
+            if found is None or found.evidence["sigma_xy"] >= LOOP_SIGMA:
                 continue
             if self._credible(other, node, found.node_from_robot):
                 pose, pairs, evidence = found.node_from_robot, found.pairs, found.evidence
@@ -295,6 +296,6 @@ class KeyframeBuilder:
         grown = later.map_from_robot.covariance - ad @ earlier.map_from_robot.covariance @ ad.T
         values, vectors = np.linalg.eigh(0.5 * (grown + grown.T))
         grown = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        xy, heading = self._settings.loop_floor
+        xy, heading = LOOP_FLOOR
         spread = grown + found.covariance + np.diag([xy**2, xy**2, heading**2])
-        return PoseGaussian(found.mean, spread).mahalanobis2(way) < self._settings.loop_gate
+        return PoseGaussian(found.mean, spread).mahalanobis2(way) < LOOP_GATE

@@ -21,6 +21,32 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
+LEAST = 8
+"""Points that should be in the image; with fewer nothing is said."""
+SHARE = 0.45
+"""If fewer of them than this share are found, it shows something else."""
+BORDER_PX = 12.0
+"""Points expected nearer to the border may well have left."""
+ASTRAY_PX = 20.0
+"""A point found further than this from where it is expected is another one."""
+LEAST_TEXTURE = 8.0
+"""Mean squared gradient around a corner in its weakest direction, (grey/px)^2."""
+LEAST_CORNERS = 6
+"""An image with fewer corners shows nothing."""
+MOST_CLIPPED = 0.5
+"""And so does one of which a larger share is black or white."""
+KIDNAP_DETECTOR_FEW = 30
+"""With fewer points than this in the image, all of it is compared besides."""
+COARSE = 8
+"""Side of the squares, px, over which images are averaged to be compared by and large."""
+ALIKE = 0.95
+"""They are the same if they then correlate by more than this."""
+LEAST_SPREAD = 8.0
+"""And vary by more than this, grey levels: all blank walls are alike."""
+SAME_LIGHT = 10.0
+"""And are equally bright on average, to within this, grey levels."""
+
+
 PATCH_PX = 11
 """Side of the square in which texture is measured, about that of a tracked patch."""
 
@@ -48,35 +74,7 @@ class FrameOverlap(Enum):
 
 @dataclass(frozen=True)
 class KidnapDetectorSettings:
-    """When an image does not continue another.
-
-    Attributes:
-        least: points that should be in the image; with fewer nothing is said.
-        share: if fewer of them than this share are found, it shows something else.
-        border_px: points expected nearer to the border may well have left.
-        astray_px: a point found further than this from where it is expected is another one.
-        least_texture: mean squared gradient around a corner in its weakest direction, (grey/px)^2.
-        least_corners: an image with fewer corners shows nothing,
-        most_clipped: and so does one of which a larger share is black or white.
-        few: with fewer points than this in the image, all of it is compared besides.
-        coarse: side of the squares, px, over which images are averaged to be compared by and large.
-        alike: they are the same if they then correlate by more than this,
-        least_spread: and vary by more than this, grey levels: all blank walls are alike;
-        same_light: and are equally bright on average, to within this, grey levels.
-    """
-
-    least: int = 8
-    share: float = 0.45
-    border_px: float = 12.0
-    astray_px: float = 20.0
-    least_texture: float = 8.0
-    least_corners: int = 6
-    most_clipped: float = 0.5
-    few: int = 30
-    coarse: int = 8
-    alike: float = 0.95
-    least_spread: float = 8.0
-    same_light: float = 10.0
+    """When an image does not continue another."""
 
 
 class KidnapDetector:
@@ -118,46 +116,43 @@ class KidnapDetector:
         if same is not False:
             return FrameOverlap.SAME
         # A dozen tracks on smooth shapes can all be lost at once; then the whole image has its say.
-        inside = int(self._camera.contains(expected, self._settings.border_px).sum())
-        few = self._settings.least <= inside < self._settings.few
+        inside = int(self._camera.contains(expected, BORDER_PX).sum())
+        few = LEAST <= inside < KIDNAP_DETECTOR_FEW
         if few and self._alike(before, now, turn):
             return FrameOverlap.SAME
         clipped = float(((now <= BLACK) | (now >= WHITE)).mean())
-        blank = (
-            clipped > self._settings.most_clipped or len(self._corners(now)) < self._settings.least_corners
-        )
+        blank = clipped > MOST_CLIPPED or len(self._corners(now)) < LEAST_CORNERS
         return FrameOverlap.BLANK if blank else FrameOverlap.STRANGE
 
     def _same(self, expected: Array, found: Array) -> bool | None:
         """Whether enough points are near where they should be; None if too few should be in the image."""
-        s = self._settings
-        inside = self._camera.contains(expected, s.border_px)
-        if inside.sum() < s.least:
+        inside = self._camera.contains(expected, BORDER_PX)
+        if inside.sum() < LEAST:
             return None
-        near = np.linalg.norm(found[inside] - expected[inside], axis=1) <= s.astray_px
-        return bool(near.mean() >= s.share)
+        near = np.linalg.norm(found[inside] - expected[inside], axis=1) <= ASTRAY_PX
+        return bool(near.mean() >= SHARE)
 
     def _alike(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool:
         """Whether the images are the same by and large, where smooth shapes leave little to be tracked."""
-        s, (height, width) = self._settings, before.shape
+        _s, (height, width) = self._settings, before.shape
         aside = round(self._camera.fx * math.tan(turn))
         if abs(aside) > width // 2:
             return False
         # A turn to the left moves all to the right.
         first = before[:, max(-aside, 0) : width - max(aside, 0)]
         second = now[:, max(aside, 0) : width - max(-aside, 0)]
-        size = (first.shape[1] // s.coarse, height // s.coarse)
+        size = (first.shape[1] // COARSE, height // COARSE)
         one = cv2.resize(first, size, interpolation=cv2.INTER_AREA).astype(np.float64)
         two = cv2.resize(second, size, interpolation=cv2.INTER_AREA).astype(np.float64)
-        if abs(float(one.mean() - two.mean())) > s.same_light:
+        if abs(float(one.mean() - two.mean())) > SAME_LIGHT:
             return False
         one, two = one - one.mean(), two - two.mean()
         spread = float(one.std() * two.std())
-        return spread > s.least_spread**2 and float((one * two).mean()) > s.alike * spread
+        return spread > LEAST_SPREAD**2 and float((one * two).mean()) > ALIKE * spread
 
     def _corners_agree(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool | None:
         corners = self._corners(before)
-        if len(corners) < self._settings.least:
+        if len(corners) < LEAST:
             return None
         tracker = Tracker(self._lens, self._tracker)
         tracker.track(before)
@@ -176,7 +171,7 @@ class KidnapDetector:
         cells = cropped.transpose(0, 2, 1, 3).reshape(GRID[0] * GRID[1], rows * columns)
         best, cell = cells.argmax(axis=1), np.arange(len(cells))
         # OpenCV sums (2 * gradient / block)^2 over the block: four times the mean.
-        strong = cells[cell, best] / 4.0 >= self._settings.least_texture
+        strong = cells[cell, best] / 4.0 >= LEAST_TEXTURE
         x = cell % GRID[1] * columns + best % columns
         y = cell // GRID[1] * rows + best // columns
         corners: Array = np.stack([x, y], axis=1)[strong].astype(np.float64)

@@ -25,6 +25,10 @@ from mapweave.registration.recognition import Recognition
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features, Sift, SiftSettings
 
+DEPTHS_PER_HEIGHT = 8.0
+"""Assumed depth of an unknown feature before there is any node, as a multiple of the camera's height (the
+paper's "assumed common height")."""
+
 
 @dataclass(frozen=True)
 class MapperSettings:
@@ -35,15 +39,12 @@ class MapperSettings:
         tracking: of landmarks between views.
         cartographer: nodes and edges.
         wayside: what is kept of the way between nodes.
-        depths_per_height: assumed depth of an unknown feature before there is any node, as a multiple of
-            the camera's height (the paper's "assumed common height").
     """
 
     sift: SiftSettings = field(default_factory=SiftSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     cartographer: KeyframeBuilderSettings = field(default_factory=KeyframeBuilderSettings)
     wayside: TrajectoryRecorderSettings = field(default_factory=TrajectoryRecorderSettings)
-    depths_per_height: float = 8.0
 
 
 class Mapper:
@@ -66,7 +67,7 @@ class Mapper:
     ) -> None:
         """Start an empty map where the robot stands, or take up one that was begun; see Cartographer."""
         settings = settings or MapperSettings()
-        self.typical_depth = settings.depths_per_height * max(description.camera.mount_height, 0.05)
+        self.typical_depth = DEPTHS_PER_HEIGHT * max(description.camera.mount_height, 0.05)
         self._description = description
         self._settings = settings
         self._lens = Lens(description.camera, description.distortion)

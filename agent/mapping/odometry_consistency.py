@@ -13,18 +13,15 @@ from dataclasses import dataclass
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
+APART = (0.15, 0.15)
+"""M and rad that they may be apart after any way ..."""
+SHARE = 0.1
+"""... and, besides, as a share of the way and of the turns: no wheel is quite round."""
+
 
 @dataclass(frozen=True)
 class OdometryConsistencySettings:
-    """When wheels and image contradict each other.
-
-    Attributes:
-        apart: m and rad that they may be apart after any way ...
-        share: ... and, besides, as a share of the way and of the turns: no wheel is quite round.
-    """
-
-    apart: tuple[float, float] = (0.15, 0.15)
-    share: float = 0.1
+    """When wheels and image contradict each other."""
 
 
 class OdometryConsistency:
@@ -48,7 +45,6 @@ class OdometryConsistency:
 
     def with_filter(self, anchor_from_robot: Pose2) -> bool:
         """Whether the filter's pose and the wheels' are further apart than wheels and image can be."""
-        s = self._settings
         turned = abs(wrap_angle(anchor_from_robot.heading - self._reckoned.heading))
         far = math.hypot(anchor_from_robot.x - self._reckoned.x, anchor_from_robot.y - self._reckoned.y)
-        return far > s.apart[0] + s.share * self._way or turned > s.apart[1] + s.share * self._turned
+        return far > APART[0] + SHARE * self._way or turned > APART[1] + SHARE * self._turned

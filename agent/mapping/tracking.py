@@ -22,12 +22,34 @@ from mapweave.agent.mapping.view import View, associate, even_choice
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.vision.occluded_tracks import OccludedTracks
 from mapweave.agent.vision.rejection_counter import RejectionCounter
-from mapweave.agent.vision.template import Templates
+from mapweave.agent.vision.template import HALF_PX, Templates
 from mapweave.agent.vision.track_quality import TrackQuality
-from mapweave.agent.vision.tracker import Tracker
+from mapweave.agent.vision.tracker import BORDER_PX, Tracker
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
+
+MOST_FILTERED = 54
+"""Landmarks in the EKF, hidden ones and those that came in their stead included."""
+LEAST_FILTERED = 5
+"""With fewer landmarks in view the wheels are trusted alone."""
+ASSOCIATE_PX = 1.5
+"""A feature this near to a track is the same point."""
+STRIKES = 3
+"""A track that the filter refuses this often in a row is given up."""
+PRIOR_SPREAD = 0.6
+"""Sigma of a new landmark's inverse depth, as a share of the expected one ..."""
+PRIOR_NEAR = 0.45
+"""... but no less than this over the camera's height: a landmark may always be about as near as the floor.
+A robot before a bare wall would else take its nearness for a slip of the wheels."""
+DOUBT = 2.0
+"""Sigmas of triangulated depths are taken for so many times what they say."""
+MOST_CHI2 = 4.0
+"""And depths of tracks whose mean squared residual is above this, not at all; 1 is expected."""
+DROPPED = 3
+"""Images that may be missing, one after the other, before the robot should wait for the next."""
+STALE = (0.4, 0.5)
+"""M and rad; once the wheels have moved this much, nothing can be said of an image before."""
 
 
 class LostTracks(NamedTuple):
@@ -74,7 +96,7 @@ class Tracking:
         self._believed: NDArray[np.uint8] | None = None
         self._since_believed = Pose2()
         self._misses_px: Array = np.zeros((0, 2))
-        self._strikes = RejectionCounter(settings.strikes)
+        self._strikes = RejectionCounter(STRIKES)
         self._unused: int | None = None
         self._expected_depth = 1.0
         self._next_track = 1
@@ -116,7 +138,7 @@ class Tracking:
     @property
     def doubtful(self) -> bool:
         """Whether the last image was not believed, or the last images were missing."""
-        return bool(self.strange or self.blank) or self.missing > self._settings.dropped
+        return bool(self.strange or self.blank) or self.missing > DROPPED
 
     @property
     def disputed(self) -> bool:
@@ -164,7 +186,7 @@ class Tracking:
 
     def take(self, observation: Observation, features: Features, anchor_from_view: PoseGaussian) -> View:
         """Make a view of an image that was just tracked, and tell which of its features are tracks."""
-        tracks = associate(features, self._tracker.ids, self._tracker.raw, self._settings.associate_px)
+        tracks = associate(features, self._tracker.ids, self._tracker.raw, ASSOCIATE_PX)
         return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity)
 
     def follow(self, view: View, expected_depth: float) -> None:
@@ -206,7 +228,7 @@ class Tracking:
     def _follow(self, image: NDArray[np.uint8]) -> LostTracks | None:
         """Follow the tracks into an image; None if it is not believed: then they stay where they were."""
         ids, templates = self._tracker.ids, self._tracker.templates
-        believed, moved, (way, turn) = self._believed, self._since_believed, self._settings.stale
+        believed, moved, (way, turn) = self._believed, self._since_believed, STALE
         if believed is None or np.hypot(moved.x, moved.y) > way or abs(moved.heading) > turn:
             self._tracker.track(image, self._expected())
         else:
@@ -234,7 +256,7 @@ class Tracking:
         if len(self._hidden.ids):
             expected = self._filter.predict_pixels(self._hidden.ids)
             # What has left the view, or is leaving it, is not hidden.
-            margin = self._settings.tracker.border_px + self._settings.hidden.template.half_px
+            margin = BORDER_PX + HALF_PX
             far_in = np.array([self._camera.width, self._camera.height]) - margin
             inside: NDArray[np.bool_] = np.asarray(((expected >= margin) & (expected < far_in)).all(axis=1))
             self._hidden.keep(inside)
@@ -277,7 +299,7 @@ class Tracking:
     def _fill(self, first: int = 0) -> None:
         """Give the filter an even choice of the tracks that it does not hold, from a first one on."""
         s, held = self._settings, len(self._filter.ids)
-        room = min(s.filtered - held + len(self._hidden.ids), s.most_filtered - held)
+        room = min(s.filtered - held + len(self._hidden.ids), MOST_FILTERED - held)
         inside = np.isin(self._tracker.ids, self._filter.ids)
         candidates = ~inside & (self._tracker.ids >= first)
         if room <= 0 or not candidates.any():
@@ -295,13 +317,13 @@ class Tracking:
         """
         s = self._settings
         inverse_depths = np.full(len(ids), 1.0 / self._expected_depth)
-        nearest = s.prior_near / max(self._camera.mount_height, 0.05)
-        sigmas = np.maximum(s.prior_spread * inverse_depths, nearest)
+        nearest = PRIOR_NEAR / max(self._camera.mount_height, 0.05)
+        sigmas = np.maximum(PRIOR_SPREAD * inverse_depths, nearest)
         poses, pixels = self.history.sightings(ids)
         if len(poses) >= 2:
             solved = triangulate(poses, pixels, self._camera, s.filter.pixel_sigma, self.pose.mean.vector)
-            better = s.doubt * np.sqrt(solved.ray_covariances[:, 2, 2])
-            fits = (solved.chi2 < s.most_chi2) & (better < sigmas)
+            better = DOUBT * np.sqrt(solved.ray_covariances[:, 2, 2])
+            fits = (solved.chi2 < MOST_CHI2) & (better < sigmas)
             inverse_depths[fits], sigmas[fits] = solved.rays[fits, 2], better[fits]
         return inverse_depths, sigmas
 
@@ -347,4 +369,4 @@ class Tracking:
         """
         s = self._settings
         spread = float(np.ptp(pixels[:, 0])) if len(pixels) else 0.0
-        return len(pixels) >= s.least_filtered and spread >= s.least_spread * self._camera.width
+        return len(pixels) >= LEAST_FILTERED and spread >= s.least_spread * self._camera.width

@@ -14,6 +14,15 @@ from mapweave.agent.servo.dynamic_window import DynamicWindow, DynamicWindowSett
 from mapweave.agent.servo.proximity import ranger_points
 from mapweave.hybridmap.pose import Array, Pose2
 
+REPLAN_EVERY = 5
+"""Ticks between two plans."""
+LEAST = 0.065
+"""Room beside the footprint that a way needs, m."""
+WISHED = 0.2
+"""Room above which more is worth nothing, m."""
+AHEAD = 0.6
+"""The point of the way that it steers to is at most this far, m."""
+
 
 @dataclass(frozen=True)
 class LocalPlannerSettings:
@@ -22,24 +31,14 @@ class LocalPlannerSettings:
     Attributes:
         speed: m/s.
         turn_rate: rad/s.
-        replan_every: ticks between two plans.
         floor: what it remembers, around where it is.
-        least: room beside the footprint that a way needs, m.
-        wished: room above which more is worth nothing, m.
-        ahead: the point of the way that it steers to is at most this far, m.
         arcs: how it steers.
-        tight: something nearer than this counts as what is in the way, m.
     """
 
     speed: float = 0.26
     turn_rate: float = 0.6
-    replan_every: int = 5
     floor: OccupancyGridSettings = field(default_factory=lambda: OccupancyGridSettings(cell=0.05, side=6.4))
-    least: float = 0.065
-    wished: float = 0.20
-    ahead: float = 0.6
     arcs: DynamicWindowSettings = field(default_factory=DynamicWindowSettings)
-    tight: float = 0.07
 
 
 class LocalPlanner:
@@ -83,7 +82,7 @@ class LocalPlanner:
         start = np.array([here.x, here.y])
         goal = here.apply(np.array([robot_from_target.x, robot_from_target.y]))
         if self._tick >= self._replan_at:
-            self._replan_at = self._tick + s.replan_every
+            self._replan_at = self._tick + REPLAN_EVERY
             self._way = self._plan(start, goal)
         ahead = here.inverse().apply(self._steered_to(start, goal))
         speed = min(s.speed, 0.8 * float(np.hypot(*ahead)))
@@ -92,7 +91,7 @@ class LocalPlanner:
     def _plan(self, start: Array, goal: Array) -> Array:
         """(N, 2) m in odom, points of the way around; none if the straight way is free."""
         s, room = self._settings, self._floor.room()
-        least, wished = (self._description.radius + extra for extra in (s.least, s.wished))
+        least, wished = (self._description.radius + extra for extra in (LEAST, WISHED))
         # The robot stands in the middle of the grid; what lies beyond its border nobody has seen.
         goal = start + (goal - start) * min(1.0, 0.5 * s.floor.side / max(np.abs(goal - start).max(), 1e-9))
         count = int(np.hypot(*(goal - start)) / (0.5 * s.floor.cell)) + 2
@@ -114,7 +113,7 @@ class LocalPlanner:
         chosen = 0
         for k in range(1, len(offsets)):
             length = math.hypot(*offsets[k])
-            if length > s.ahead:
+            if length > AHEAD:
                 break
             aside = offsets[:k] @ np.array([-offsets[k, 1], offsets[k, 0]]) / max(length, 1e-9)
             if np.abs(aside).max() > s.floor.cell:

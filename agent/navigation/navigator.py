@@ -23,7 +23,7 @@ from mapweave.agent.navigation.blocked_edges import BlockedEdges, BlockedEdgeSet
 from mapweave.agent.navigation.local_planner import LocalPlanner, LocalPlannerSettings
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.navigation.route_follower import RouteFollower, RouteProgress
-from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.agent.navigation.route_follower_settings import NEAR, RouteFollowerSettings
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Node, NodeId
@@ -31,6 +31,16 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
+
+TIGHT = 0.07
+"""Something nearer than this counts as what is in the way, m."""
+ANSWER_PATIENCE = 100
+"""Ticks that an answer may take before the question counts as lost."""
+PAUSE = 2.0
+"""Seconds that it waits before what is in its way, and before it asks again for a route."""
+TRUSTED = 1.0
+"""After a block it still knows where it is if it has driven less than this blindly, m."""
+
 
 HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
 NOTHING_NEAR = "it gets no further, though nothing is near"
@@ -48,9 +58,6 @@ class NavigatorSettings:
         blocks: how long it remembers where it could not get through.
         surveyor: what it measures on its way.
         refinement: what it learns of landmarks.
-        answer_patience: ticks that an answer may take before the question counts as lost.
-        pause: seconds that it waits before what is in its way, and before it asks again for a route.
-        trusted: after a block it still knows where it is if it has driven less than this blindly, m.
         further: where it looks in vain on its way, it drives on by wheels and looks again after this, m: they
             are off by a few percent, and to turn back to what it knows, and about again, takes longer.
         looks: so often in a row; then it is lost.
@@ -63,9 +70,6 @@ class NavigatorSettings:
     blocks: BlockedEdgeSettings = field(default_factory=BlockedEdgeSettings)
     surveyor: TraverseSettings = field(default_factory=TraverseSettings)
     refinement: LandmarkRefinementSettings = field(default_factory=LandmarkRefinementSettings)
-    answer_patience: int = 100
-    pause: float = 2.0
-    trusted: float = 1.0
     further: float = 1.0
     looks: int = 2
 
@@ -120,7 +124,7 @@ class Navigator:
         self._settings = s = settings or NavigatorSettings()
         self._rng = np.random.default_rng(seed)
         self._detour = LocalPlanner(description, s.detour)
-        self._motion = MotionPrimitives(description, s.answer_patience)
+        self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
         self._localization = GlobalLocalization(
             description, sift, self._motion, OwnMap(own_map, self._rng), FleetMap(self._motion),
             s.localization,
@@ -216,7 +220,7 @@ class Navigator:
         self.stage = Stage.WAITING
         if not self._blocks.at(self._motion.now):
             self.fix = None
-        yield from self._motion.stand(self._settings.pause)
+        yield from self._motion.stand(PAUSE)
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
         """Follow a route until it is driven, or blocked, or the robot does not know where it is."""
@@ -263,8 +267,8 @@ class Navigator:
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
         self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way() or NOTHING_NEAR}"
-        yield from self._motion.stand(self._settings.pause)
-        if self.fix is not None and not self.fix.in_sight and self.fix.blind > self._settings.trusted:
+        yield from self._motion.stand(PAUSE)
+        if self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED:
             self.fix, self._believed = None, self._on_own_map(self.fix)
 
     def _make_sure(self) -> Behaviour:
@@ -296,11 +300,11 @@ class Navigator:
         bearings = self._description.ranger_bearings
         if len(ranges) == len(bearings) and len(bearings):
             nearest = int(np.argmin(ranges))
-            if ranges[nearest] < 2.0 * self._settings.detour.tight:
+            if ranges[nearest] < 2.0 * TIGHT:
                 side = math.degrees(math.remainder(bearings[nearest], math.tau))
                 return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
         return ""
 
     def _only_parking(self, follower: RouteFollower) -> bool:
         """Whether the robot is about at the route's last node, with nothing in its way."""
-        return follower.to_goal <= self._settings.follower.near and not self._in_the_way()
+        return follower.to_goal <= NEAR and not self._in_the_way()

@@ -13,7 +13,7 @@ from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.progress_monitor import ProgressMonitor
-from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
+from mapweave.agent.navigation.route_follower_settings import NEAR, RouteFollowerSettings
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.odometry_drive import OdometryDrive
 from mapweave.agent.servo.proximity import ranger_points
@@ -24,6 +24,30 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from mapweave.hybridmap.query import RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
+
+PASSED = 0.22
+"""An intermediate node is passed within this distance, m."""
+SIGHT_TURN = 0.6
+"""A node's landmarks are looked for when the robot's heading is within this of it, rad."""
+SIGHT_REACH = 1.4
+"""And the robot within this distance of it, m."""
+LOOK_EVERY = 4
+"""Ticks between two looks for the next nodes' landmarks."""
+SKIP = 2
+"""Nodes further along the route that are looked for as well."""
+GOAL_LOOKS = 4
+"""Fresh looks at the goal, averaged, that decide whether the robot stands there."""
+HIDDEN = 2.0
+"""Seconds at the goal without its landmarks in sight, or recognised, after which it is not there, s."""
+PATIENCE = 6.0
+"""Seconds without getting on before an edge counts as blocked."""
+STALLED = 3.0
+"""Seconds that the servo may take without getting nearer; then the robot drives around."""
+STALLED_PARKING = 10.0
+"""Likewise on the way to the goal's pose, which may take a manoeuvre."""
+BARRED = 5.0
+"""How long it drives around then, s."""
+
 
 MOST_LOOKED_FOR = 8
 """Nodes tried in one image: a route may put any number of them into one place."""
@@ -96,7 +120,7 @@ class RouteFollower:
             pose = route[0].previous_from_node.inverse() @ fix.node_from_robot
             self.fix = Fix(route[0].node.id, pose, None, fix.blind)
         # The route may begin at a node that the robot does not stand at: then that is the first to reach.
-        self.leg = min(1 if self._off_reference() < settings.passed else 0, self._last)
+        self.leg = min(1 if self._off_reference() < PASSED else 0, self._last)
         self._tick = 0
         self._progressed = ProgressMonitor()
         self._headway = ProgressMonitor()
@@ -127,7 +151,7 @@ class RouteFollower:
         s = self._settings
         self._tick += 1
         self.fix.follow(observation, self._description)
-        if self._tick % s.look_every == 0:
+        if self._tick % LOOK_EVERY == 0:
             self._look_for(self._ahead(), observation)
         self._pass_nodes()
         target = self._target()
@@ -136,11 +160,11 @@ class RouteFollower:
         self.detail = f"{distance:.2f} m to node {node}, {self._last - self.leg} further"
         parking = self.leg == self._last
         self.progress = RouteProgress.DRIVING
-        if self.fix.blind > s.blind and not (parking and distance < s.near):
+        if self.fix.blind > s.blind and not (parking and distance < NEAR):
             self.progress = RouteProgress.UNSURE
             return Command()
         self._progressed.take(distance, self._description.tick)
-        if self._progressed.stood > (s.parking_patience if parking else s.patience):
+        if self._progressed.stood > (s.parking_patience if parking else PATIENCE):
             self.progress = RouteProgress.BLOCKED
             return Command()
         return self._drive(target, distance, parking, observation)
@@ -167,7 +191,7 @@ class RouteFollower:
                 self._approaching = False
                 return step.command
         self._servoing = -1
-        if not parking or distance > self._settings.near:
+        if not parking or distance > NEAR:
             self._approaching = False
             command = self._detour.toward(target.inverse())
             if self._detour.around:
@@ -178,7 +202,7 @@ class RouteFollower:
             self._approaching = True
         step = self._blind_drive.command(target, obstacles)
         self._hidden = self._hidden + self._description.tick if step.state == "arrived" else 0.0
-        if self._hidden > self._settings.hidden:
+        if self._hidden > HIDDEN:
             self.progress = RouteProgress.UNSURE
         return step.command
 
@@ -190,14 +214,14 @@ class RouteFollower:
 
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
         """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
-        s, tick = self._settings, self._description.tick
+        _s, tick = self._settings, self._description.tick
         self._servo_barred = max(self._servo_barred - tick, 0.0)
         if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
             return False
-        if self._servoing == self.leg and not (parking and distance <= s.near):
+        if self._servoing == self.leg and not (parking and distance <= NEAR):
             self._headway.take(distance, tick)
-            if self._headway.stood > (s.stalled_parking if parking else s.stalled):
-                self._servo_barred = s.barred
+            if self._headway.stood > (STALLED_PARKING if parking else STALLED):
+                self._servo_barred = BARRED
         return self._servo_barred == 0.0
 
     def _confirm(self, state: State, observation: Observation) -> None:
@@ -212,12 +236,12 @@ class RouteFollower:
             self.progress = RouteProgress.ARRIVED
         elif (localizer := self._look_at_goal(observation)) is not None:
             self._looks.append(localizer.pose)
-            if len(self._looks) == self._settings.goal_looks:
+            if len(self._looks) == GOAL_LOOKS:
                 localizer.restart(averaged(self._looks))
                 self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
         else:
             self._hidden += self._description.tick
-            if self._hidden > self._settings.hidden:
+            if self._hidden > HIDDEN:
                 self.progress = RouteProgress.UNSURE
 
     # Nodes ahead
@@ -227,9 +251,9 @@ class RouteFollower:
         before = self.leg
         if self._reference > self.leg:
             self.leg = self._reference
-        if self._reference == self.leg < self._last and self._off_reference() < 2 * self._settings.passed:
+        if self._reference == self.leg < self._last and self._off_reference() < 2 * PASSED:
             self.leg += 1
-        while self.leg < self._last and self.distance(self.leg) < self._settings.passed:
+        while self.leg < self._last and self.distance(self.leg) < PASSED:
             self.leg += 1
         if self.leg != before:
             self._progressed = ProgressMonitor()
@@ -246,18 +270,17 @@ class RouteFollower:
 
     def _ahead(self) -> list[Expected]:
         """Nodes whose landmarks may be in view, furthest first."""
-        s = self._settings
         first = self._reference + 1 if self.fix.in_sight else 0
         wanted: list[Expected] = []
-        for index in range(min(self.leg + s.skip, self._last), first - 1, -1):
+        for index in range(min(self.leg + SKIP, self._last), first - 1, -1):
             if len(wanted) == MOST_LOOKED_FOR:
                 break
             expected = self._expected(index)
             there = expected.node_from_robot
-            if math.hypot(there.x, there.y) < s.sight_reach and abs(wrap_angle(there.heading)) < s.sight_turn:
+            if math.hypot(there.x, there.y) < SIGHT_REACH and abs(wrap_angle(there.heading)) < SIGHT_TURN:
                 wanted.append(expected)
         # At the goal more of its landmarks come into view: a fresh look makes the last millimetres better.
-        if self._reference == self._last and self.fix.in_sight and self._tick % (3 * s.look_every) == 0:
+        if self._reference == self._last and self.fix.in_sight and self._tick % (3 * LOOK_EVERY) == 0:
             tracked = len(self.fix.localizer.visible) if self.fix.localizer is not None else 0
             wanted.append(self._expected(self._last)._replace(tracked=tracked))
         return wanted

@@ -25,6 +25,10 @@ from mapweave.wire.codec import wrap_body
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import MAX_ROWS, Ack, LogAnswer, LogRequest, Mark
 
+SETTLED_BEACONS = 20
+"""Of so many beacons, an older map that is complete sends one; a server that is new learns of it so."""
+
+
 log = logging.getLogger(__name__)
 
 
@@ -34,14 +38,11 @@ class ReplicationSettings:
 
     Attributes:
         beacon_interval: between two beacons of a map of which servers lack something, s.
-        settled_beacons: of so many beacons, an older map that is complete sends one; a server that is new
-            learns of it so.
         answer_bytes: a log answer ends after so many bytes, since a link may be slow.
         retry_interval: after a failed commit (disk full), s.
     """
 
     beacon_interval: float = 0.5
-    settled_beacons: int = 20
     answer_bytes: int = 1 << 20
     retry_interval: float = 1.0
 
@@ -251,7 +252,7 @@ class Replicator:
         return Mark(sequence, self._current.log_id).encode()
 
     def _send_beacons(self) -> None:
-        everyone = self._beacons % self._settings.settled_beacons == 0
+        everyone = self._beacons % SETTLED_BEACONS == 0
         self._beacons += 1
         for one in self._logs.values():
             if everyone or one is self._current or one.unsettled(self._servers):

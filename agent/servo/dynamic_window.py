@@ -14,31 +14,28 @@ import numpy as np
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.pose import Array
 
+HORIZON = 0.8
+"""An arc is driven in thought for this long, s."""
+MARGIN = 0.055
+"""Room that an arc leaves between the footprint and anything seen, m; more than the guard's, or that would
+stop what is chosen here."""
+WISHED = 0.12
+"""Room above which more is worth nothing, m."""
+SPEEDS = (1.0, 0.6, 0.3, 0.0, -0.3)
+"""Shares of the wanted speed that are tried; negative ones drive back."""
+TURNS = (1.0, 0.7, 0.45, 0.25, 0.1)
+"""Shares of the largest rate that are tried, to either side."""
+FACING = 0.25
+"""M/rad, what it is worth to face the way."""
+ROOM = 0.05
+"""M, what it costs to have no room at all beyond the margin."""
+BACKWARD = 0.08
+"""M, what it costs to drive back: the rangers see as well there, the camera does not."""
+
 
 @dataclass(frozen=True)
 class DynamicWindowSettings:
-    """How arcs are chosen.
-
-    Attributes:
-        horizon: an arc is driven in thought for this long, s.
-        margin: room that an arc leaves between the footprint and anything seen, m; more than the guard's, or
-            that would stop what is chosen here.
-        wished: room above which more is worth nothing, m.
-        speeds: shares of the wanted speed that are tried; negative ones drive back.
-        turns: shares of the largest rate that are tried, to either side.
-        facing: m/rad, what it is worth to face the way.
-        room: m, what it costs to have no room at all beyond the margin.
-        backward: m, what it costs to drive back: the rangers see as well there, the camera does not.
-    """
-
-    horizon: float = 0.8
-    margin: float = 0.055
-    wished: float = 0.12
-    speeds: tuple[float, ...] = (1.0, 0.6, 0.3, 0.0, -0.3)
-    turns: tuple[float, ...] = (1.0, 0.7, 0.45, 0.25, 0.1)
-    facing: float = 0.25
-    room: float = 0.05
-    backward: float = 0.08
+    """How arcs are chosen."""
 
 
 class DynamicWindow:
@@ -58,14 +55,13 @@ class DynamicWindow:
             speed: m/s, wanted.
             rate: rad/s, largest.
         """
-        s = self._settings
         error, distance = math.atan2(ahead[1], ahead[0]), float(np.hypot(*ahead))
         # Beside the fan the turn that ends just facing the point.
-        exact = float(np.clip(error / s.horizon, -rate, rate))
-        turns = rate * np.concatenate([s.turns, [0.0], -np.array(s.turns)])
+        exact = float(np.clip(error / HORIZON, -rate, rate))
+        turns = rate * np.concatenate([TURNS, [0.0], -np.array(TURNS)])
         fan_turns = np.append(turns, exact)
         forward, turn = (
-            grid.ravel() for grid in np.meshgrid(speed * np.array(s.speeds), fan_turns, indexing="ij")
+            grid.ravel() for grid in np.meshgrid(speed * np.array(SPEEDS), fan_turns, indexing="ij")
         )
         moving = (np.abs(forward) > 1e-6) | (np.abs(turn) > 0.02 * rate)
         forward, turn = forward[moving], turn[moving]
@@ -73,17 +69,17 @@ class DynamicWindow:
         to_go = ahead - ends[:, :2]
         off = np.abs(_wrapped(np.arctan2(to_go[:, 1], to_go[:, 0]) - ends[:, 2]))
         left = np.hypot(*to_go.T)
-        cost = left + s.facing * np.minimum(1.0, distance / 0.2) * off
-        cost += s.room * np.clip(1.0 - (room - s.margin) / (s.wished - s.margin), 0.0, 1.0)
-        cost += np.where(forward < 0.0, s.backward, 0.0)
+        cost = left + FACING * np.minimum(1.0, distance / 0.2) * off
+        cost += ROOM * np.clip(1.0 - (room - MARGIN) / (WISHED - MARGIN), 0.0, 1.0)
+        cost += np.where(forward < 0.0, BACKWARD, 0.0)
         now = np.hypot(*points.T).min() - self._radius if len(points) else math.inf
-        free = (room >= min(s.margin, now) - 1e-9) | (forward == 0.0)
+        free = (room >= min(MARGIN, now) - 1e-9) | (forward == 0.0)
         best = int(np.where(free, cost, np.inf).argmin())
         return Command(float(forward[best]), float(turn[best]))
 
     def _driven(self, forward: Array, turn: Array, points: Array) -> tuple[Array, Array]:
         """Where arcs end, (A, 3) m, m, rad in robot, and the least room along each, (A,) m."""
-        time = np.linspace(0.0, self._settings.horizon, 9)[1:]
+        time = np.linspace(0.0, HORIZON, 9)[1:]
         angle = turn[:, None] * time
         chord = forward[:, None] * time * np.sinc(0.5 * angle / math.pi)
         x, y = chord * np.cos(0.5 * angle), chord * np.sin(0.5 * angle)

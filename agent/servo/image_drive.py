@@ -12,6 +12,27 @@ from numpy.typing import NDArray
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.servo.leg_controller import clip
 
+ACCELERATION = 0.3
+"""M/s^2, of the speed profile at both ends."""
+CENTRE_GAIN = 0.6
+"""1/s, turns toward the middle of the features."""
+CENTRE_BAND = 0.06
+"""Rad, the middle may be this far off before it matters: the way stays almost straight."""
+HEADING_GAIN = 0.8
+"""1/s, holds the heading of the start."""
+BORDER = 0.06
+"""Rad, features nearer to the border than this are about to be lost."""
+MIN_VISIBLE = 6
+"""The drive turns round before fewer features than this have room to the border."""
+SLOW = 0.35
+"""M, distance of an obstacle from the edge at which the drive slows."""
+STOP = 0.12
+"""M, distance at which it turns round."""
+DEFLECT = 0.15
+"""Rad/s, largest deflection from an obstacle that is near on one side."""
+CONE = 0.9
+"""Rad, rangers within this of the direction of travel matter."""
+
 
 @dataclass(frozen=True, slots=True)
 class ImageDriveSettings:
@@ -19,29 +40,9 @@ class ImageDriveSettings:
 
     Attributes:
         speed: m/s.
-        acceleration: m/s^2, of the speed profile at both ends.
-        centre_gain: 1/s, turns toward the middle of the features.
-        centre_band: rad, the middle may be this far off before it matters: the way stays almost straight.
-        heading_gain: 1/s, holds the heading of the start.
-        border: rad, features nearer to the border than this are about to be lost.
-        min_visible: the drive turns round before fewer features than this have room to the border.
-        slow: m, distance of an obstacle from the edge at which the drive slows.
-        stop: m, distance at which it turns round.
-        deflect: rad/s, largest deflection from an obstacle that is near on one side.
-        cone: rad, rangers within this of the direction of travel matter.
     """
 
     speed: float = 0.2
-    acceleration: float = 0.3
-    centre_gain: float = 0.6
-    centre_band: float = 0.06
-    heading_gain: float = 0.8
-    border: float = 0.06
-    min_visible: int = 6
-    slow: float = 0.35
-    stop: float = 0.12
-    deflect: float = 0.15
-    cone: float = 0.9
 
 
 class ImageDrive:
@@ -75,12 +76,11 @@ class ImageDrive:
         Returns:
             The command, whether the drive is over, and in words what it does or why it turned round.
         """
-        settings = self.settings
         bearings = np.asarray(bearings, dtype=np.float64)
         sense = math.copysign(1.0, self._distance)
         if self._outward:
-            obstacle = self._free(sense, proximity) <= settings.stop
-            few = sense > 0 and self._safe(bearings) < settings.min_visible
+            obstacle = self._free(sense, proximity) <= STOP
+            few = sense > 0 and self._safe(bearings) < MIN_VISIBLE
             if obstacle or few or sense * (self._distance - travelled) <= 0.005:
                 self._outward = False
                 self._turned_at = travelled
@@ -91,7 +91,7 @@ class ImageDrive:
         if not self._outward and sense * travelled <= 0.005:
             return Command(), True, self._reason
         direction = sense if self._outward else -sense
-        if not self._outward and self._free(direction, proximity) <= settings.stop:
+        if not self._outward and self._free(direction, proximity) <= STOP:
             return Command(), True, "ended: an obstacle on the way back"
         forward = direction * self._speed(travelled, self._free(direction, proximity))
         turn = self._turn(direction, heading_error, bearings, proximity)
@@ -102,8 +102,8 @@ class ImageDrive:
         settings = self.settings
         ends = (0.0, self._distance) if self._outward else (self._turned_at, 0.0)
         way = min(abs(travelled - ends[0]), abs(travelled - ends[1]))
-        ramp = math.sqrt(2.0 * settings.acceleration * max(way, 0.0))
-        share = clip(max(free - settings.stop, 0.0) / (settings.slow - settings.stop), 1.0)
+        ramp = math.sqrt(2.0 * ACCELERATION * max(way, 0.0))
+        share = clip(max(free - STOP, 0.0) / (SLOW - STOP), 1.0)
         top = min(settings.speed, self._description.max_forward)
         return max(min(ramp, top), min(0.03, top)) * max(share, 0.15)
 
@@ -111,21 +111,20 @@ class ImageDrive:
         self, direction: float, heading_error: float, bearings: NDArray[Any], proximity: NDArray[Any]
     ) -> float:
         """rad/s: hold the heading; give way to features off the middle, and to obstacles on one side."""
-        settings = self.settings
-        turn = -settings.heading_gain * heading_error
+        turn = -HEADING_GAIN * heading_error
         if len(bearings):
             middle = float(np.median(bearings))
-            aside = max(abs(middle) - settings.centre_band, 0.0)
-            turn += settings.centre_gain * math.copysign(aside, middle)
-            room = self._description.camera.semi_aperture - settings.border
+            aside = max(abs(middle) - CENTRE_BAND, 0.0)
+            turn += CENTRE_GAIN * math.copysign(aside, middle)
+            room = self._description.camera.semi_aperture - BORDER
             out_left, out_right = int((bearings > room).sum()), int((bearings < -room).sum())
-            turn += 0.15 * settings.centre_gain * (out_left - out_right) / len(bearings)
+            turn += 0.15 * CENTRE_GAIN * (out_left - out_right) / len(bearings)
         near = self._near(direction, proximity)
         if len(near):
             distances, offsets = near.T
-            weight = np.clip((settings.slow - distances) / settings.slow, 0.0, 1.0)
+            weight = np.clip((SLOW - distances) / SLOW, 0.0, 1.0)
             # An obstacle ahead on the left pushes to the right; while backing the sides change roles.
-            turn -= direction * settings.deflect * clip(float((weight * np.sign(offsets)).sum()), 1.0)
+            turn -= direction * DEFLECT * clip(float((weight * np.sign(offsets)).sum()), 1.0)
         return clip(turn, 0.5 * self._description.max_turn)
 
     def _near(self, direction: float, proximity: NDArray[Any]) -> NDArray[np.float64]:
@@ -134,7 +133,7 @@ class ImageDrive:
         count = min(len(distances), len(self._rangers))
         behind = 0.0 if direction > 0 else math.pi
         offsets = np.mod(self._rangers[:count] - behind + math.pi, 2.0 * math.pi) - math.pi
-        chosen = (np.abs(offsets) <= self.settings.cone) & np.isfinite(distances[:count])
+        chosen = (np.abs(offsets) <= CONE) & np.isfinite(distances[:count])
         left = offsets * (1.0 if direction > 0 else -1.0)
         return np.column_stack([distances[:count][chosen], left[chosen]])
 
@@ -152,5 +151,5 @@ class ImageDrive:
 
     def _safe(self, bearings: NDArray[Any]) -> int:
         """How many features have room to the border."""
-        room = self._description.camera.semi_aperture - self.settings.border
+        room = self._description.camera.semi_aperture - BORDER
         return int((np.abs(bearings) <= room).sum())

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 from mapweave.agent.observation import Command
 from mapweave.agent.servo.laws import saturate
 from mapweave.agent.servo.plan import Leg
-from mapweave.agent.servo.settings import ServoSettings
+from mapweave.agent.servo.settings import TURN_GAIN, ServoSettings
 from mapweave.hybridmap.pose import Pose2, wrap_angle
+
+FORWARD_GAIN = 1.5
+"""1/s, slows legs toward their end."""
+
 
 _ALIGNED = 0.04
 """rad, a turn on the spot ends here."""
@@ -56,12 +60,12 @@ class LegController:
 
     def command(self, pose: Pose2) -> Command | None:
         """What to do at `goal_from_robot`, or None when the leg is done."""
-        settings, limits = self._settings, self._limits
+        _settings, limits = self._settings, self._limits
         if not self._aimed:
             self._aim(pose)
         error = wrap_angle(self._heading - pose.heading)
         if self.turning and abs(error) > _ALIGNED:
-            return Command(0.0, clip(settings.turn_gain * error, limits.turn))
+            return Command(0.0, clip(TURN_GAIN * error, limits.turn))
         self.turning = False
         self._aimed = True
         left = self.remaining(pose)
@@ -69,15 +73,15 @@ class LegController:
             return None
         if abs(error) > _SLIPPED:
             self.turning = True
-            return Command(0.0, clip(settings.turn_gain * error, limits.turn))
+            return Command(0.0, clip(TURN_GAIN * error, limits.turn))
         dx, dy = pose.x - self.leg.x, pose.y - self.leg.y
         aside = -dx * math.sin(self._heading) + dy * math.cos(self._heading)
         wanted = wrap_angle(
             self._heading - self.leg.direction * math.atan2(aside, _LOOK_AHEAD) - pose.heading
         )
-        forward = self.leg.direction * max(settings.forward_gain * left, 0.01)
+        forward = self.leg.direction * max(FORWARD_GAIN * left, 0.01)
         return Command(
-            *saturate(clip(forward, limits.forward), settings.turn_gain * wanted, limits.forward, limits.turn)
+            *saturate(clip(forward, limits.forward), TURN_GAIN * wanted, limits.forward, limits.turn)
         )
 
     def _aim(self, pose: Pose2) -> None:

@@ -15,30 +15,27 @@ from mapweave.agent.servo.leg_controller import clip
 from mapweave.agent.servo.servo_step import ServoStep, State
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
+POSITION_TOLERANCE = 0.02
+"""M, nearer than this the robot only turns."""
+HEADING_TOLERANCE = 0.02
+"""Rad, of the last turn."""
+FORWARD_GAIN = 1.5
+"""1/s."""
+TURN_GAIN = 2.5
+"""1/s."""
+CLEARANCE = 0.04
+"""M, room between the footprint and obstacle points that stops the drive."""
+BACKWARD = True
+"""Whether it may drive backward when that needs less turning."""
+CRUISE = 0.8
+"""Share of the speed limits that is used."""
+PATIENCE_TICKS = 20
+"""How long an obstacle in the way is waited for before the drive is stuck."""
+
 
 @dataclass(frozen=True, slots=True)
 class OdometryDriveSettings:
-    """Settings of the blind drive.
-
-    Attributes:
-        position_tolerance: m, nearer than this the robot only turns.
-        heading_tolerance: rad, of the last turn.
-        forward_gain: 1/s.
-        turn_gain: 1/s.
-        clearance: m, room between the footprint and obstacle points that stops the drive.
-        backward: whether it may drive backward when that needs less turning.
-        cruise: share of the speed limits that is used.
-        patience_ticks: how long an obstacle in the way is waited for before the drive is stuck.
-    """
-
-    position_tolerance: float = 0.02
-    heading_tolerance: float = 0.02
-    forward_gain: float = 1.5
-    turn_gain: float = 2.5
-    clearance: float = 0.04
-    backward: bool = True
-    cruise: float = 0.8
-    patience_ticks: int = 20
+    """Settings of the blind drive."""
 
 
 class OdometryDrive:
@@ -51,8 +48,8 @@ class OdometryDrive:
         """Prepare for a robot; `start` must come before each drive."""
         self.settings = settings or OdometryDriveSettings()
         self._description = description
-        self._max_forward = max(description.max_forward, 1e-3) * self.settings.cruise
-        self._max_turn = max(description.max_turn, 1e-3) * self.settings.cruise
+        self._max_forward = max(description.max_forward, 1e-3) * CRUISE
+        self._max_turn = max(description.max_turn, 1e-3) * CRUISE
         self.start(Pose2())
 
     def start(self, goal_from_robot: Pose2) -> None:
@@ -61,7 +58,7 @@ class OdometryDrive:
         self._at_goal = False
         toward = math.atan2(-goal_from_robot.y, -goal_from_robot.x)
         self._direction = 1.0
-        if self.settings.backward:
+        if BACKWARD:
             ahead = _turning(goal_from_robot.heading, toward)
             astern = _turning(goal_from_robot.heading, toward + math.pi)
             self._direction = -1.0 if astern < ahead - 1e-6 else 1.0
@@ -74,15 +71,15 @@ class OdometryDrive:
             goal_from_robot: where the robot is now, in the goal's robot frame.
             obstacles: (K, 2) m, in robot, points that the rangers hit now.
         """
-        settings, pose = self.settings, goal_from_robot
+        _settings, pose = self.settings, goal_from_robot
         rho = math.hypot(pose.x, pose.y)
         heading = wrap_angle(pose.heading)
-        reach = settings.position_tolerance * (2.0 if self._at_goal else 1.0)
+        reach = POSITION_TOLERANCE * (2.0 if self._at_goal else 1.0)
         self._at_goal = rho <= reach
         if self._at_goal:
-            if abs(heading) <= settings.heading_tolerance:
+            if abs(heading) <= HEADING_TOLERANCE:
                 return _step(Command(), "arrived", "at the goal")
-            turn = clip(-settings.turn_gain * heading, self._max_turn)
+            turn = clip(-TURN_GAIN * heading, self._max_turn)
             return _step(Command(0.0, turn), "turning", "turning to the goal's heading")
         toward = math.atan2(-self._direction * pose.y, -self._direction * pose.x)
         error = wrap_angle(toward - heading)
@@ -94,18 +91,18 @@ class OdometryDrive:
         if abs(error) > (0.3 if self._aligned else 0.05):
             self._aligned = False
             return _step(
-                Command(0.0, clip(settings.turn_gain * error, self._max_turn)),
+                Command(0.0, clip(TURN_GAIN * error, self._max_turn)),
                 "turning",
                 "turning to drive " + ("forward" if self._direction > 0 else "backward"),
             )
         self._aligned = True
         if self._in_the_way(obstacles, min(rho, 0.25)):
             self._blocked += 1
-            stuck = self._blocked > settings.patience_ticks
+            stuck = self._blocked > PATIENCE_TICKS
             return _step(Command(), "stuck" if stuck else "driving", "an obstacle is in the way")
         self._blocked = 0
-        speed = self._direction * min(max(settings.forward_gain * rho, 0.015), self._max_forward)
-        speeds = saturate(speed, settings.turn_gain * error, self._max_forward, self._max_turn)
+        speed = self._direction * min(max(FORWARD_GAIN * rho, 0.015), self._max_forward)
+        speeds = saturate(speed, TURN_GAIN * error, self._max_forward, self._max_turn)
         return _step(Command(*speeds), "driving", "driving straight to the goal")
 
     def _in_the_way(self, obstacles: NDArray[Any], way: float) -> bool:
@@ -113,7 +110,7 @@ class OdometryDrive:
         points = np.asarray(obstacles, dtype=np.float64).reshape(-1, 2)
         along, aside = self._direction * points[:, 0], points[:, 1]
         beyond = np.maximum(along - way, 0.0)
-        near = np.hypot(beyond, aside) < self._description.radius + self.settings.clearance
+        near = np.hypot(beyond, aside) < self._description.radius + CLEARANCE
         return bool((near & (along > 0.0)).any())
 
 

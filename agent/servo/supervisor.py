@@ -18,9 +18,36 @@ from mapweave.agent.servo.polar import Polar, continued, polar_of
 from mapweave.agent.servo.recovery import Recovery
 from mapweave.agent.servo.rollout import roll_out
 from mapweave.agent.servo.servo_step import ServoStep, State
-from mapweave.agent.servo.settings import ServoSettings
+from mapweave.agent.servo.settings import FIELD_MARGIN, LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN, ServoSettings
 from mapweave.agent.servo.visibility import Visibility
 from mapweave.hybridmap.pose import Pose2, wrap_angle
+
+LAMBDA = 2.0
+"""Gain lambda of the laws; 2 is critically damped."""
+GAIN = 1.5
+"""1/s, how fast time runs in the laws; multiplies both speeds."""
+DEAD_ZONE = 0.004
+"""Rho_D, m: nearer than this only the heading is mended."""
+POSITION_TOLERANCE = 0.0075
+"""M, estimated distance at which the goal counts as reached. A centimetre of true distance less what a pose
+filter may be off."""
+HEADING_TOLERANCE = 0.008
+"""Rad."""
+SETTLE_TICKS = 3
+"""Ticks in a row inside both tolerances before the robot has arrived."""
+CLEARANCE = 0.04
+"""M, room between the footprint and obstacles."""
+LAW_REACH = 0.04
+"""M, nearer than this no law is taken up (one at work goes on): the direction to the goal is noise there,
+and short legs are surer."""
+LAW_BONUS = 0.15
+"""A law is preferred to a plan up to this share of extra cost."""
+LAW_BONUS_M = 0.05
+"""And up to this extra cost, m."""
+HORIZON = 0.15
+"""S, look-ahead of the last check before a command leaves."""
+CRUISE = 1.0
+"""Share of the robot's speed limits that is used."""
 
 
 class Servo:
@@ -41,7 +68,7 @@ class Servo:
         """
         self.settings = settings or ServoSettings()
         self._description = description
-        share = self.settings.cruise
+        share = CRUISE
         self._limits = Limits(
             max(description.max_forward, 1e-3) * share, max(description.max_turn, 1e-3) * share
         )
@@ -105,7 +132,7 @@ class Servo:
         if final is not None:
             return final
         surroundings = self._surroundings(pose)
-        if self._sight.field.slack(pose.vector) < self.settings.least_margin:
+        if self._sight.field.slack(pose.vector) < LEAST_MARGIN:
             self._law = None
             self._drop_plan()
             return self._step(*self._recovery.command(pose, self._sight.field, surroundings), pose)
@@ -131,7 +158,7 @@ class Servo:
 
     def _surroundings(self, pose: Pose2) -> Surroundings:
         """Constraints now; where goal or robot already stand nearer to an obstacle, as near is allowed."""
-        wanted = self._description.radius + self.settings.clearance
+        wanted = self._description.radius + CLEARANCE
         around = Surroundings(self._sight.planning_field, self._memory.points, wanted)
         if len(self._memory.points):
             nearest = float(around.distance(np.array([pose.vector, [0.0, 0.0, 0.0]])).min())
@@ -143,10 +170,10 @@ class Servo:
 
     def _keep_or_drop(self, pose: Pose2, around: Surroundings) -> None:
         """Drop the law or plan at work when its way has become inadmissible; let a law relieve a plan."""
-        hard = 0.5 * self.settings.least_margin
+        hard = 0.5 * LEAST_MARGIN
         if self._law is not None:
             self._polar = continued(pose, self._polar)
-            rollouts = roll_out(self._polar, self.settings.lambda_, self.settings.dead_zone)
+            rollouts = roll_out(self._polar, LAMBDA, DEAD_ZONE)
             way = rollouts.poses[self._law]
             if not (rollouts.parked[self._law] and around.admits(way, hard)):
                 self._law = None
@@ -171,7 +198,7 @@ class Servo:
         if self._wait > 0:
             self._wait -= 1
             return
-        if math.hypot(pose.x, pose.y) < 1e-9 or self._sight.field.count < self.settings.min_visible:
+        if math.hypot(pose.x, pose.y) < 1e-9 or self._sight.field.count < MIN_VISIBLE:
             return
         search = thorough_plan if self._thinking else quick_plan
         plan = search(around, pose, self.settings)
@@ -195,13 +222,13 @@ class Servo:
     def _best_law(self, polar: Polar, around: Surroundings, cost: float) -> int | None:
         """The cheapest law that parks within the constraints for little more than a cost (m)."""
         settings = self.settings
-        if polar.rho < settings.law_reach:
+        if polar.rho < LAW_REACH:
             return None
-        rollouts = roll_out(polar, settings.lambda_, settings.dead_zone)
+        rollouts = roll_out(polar, LAMBDA, DEAD_ZONE)
         costs = rollouts.lengths + settings.price.turn * rollouts.turns + settings.price.leg
         # Each law that had to be given up raises the bar for the next: no endless switching.
-        margin = settings.field_margin * (1.0 + 0.5 * self._broken_laws)
-        limit = cost * (1.0 + settings.law_bonus) + settings.law_bonus_m
+        margin = FIELD_MARGIN * (1.0 + 0.5 * self._broken_laws)
+        limit = cost * (1.0 + LAW_BONUS) + LAW_BONUS_M
         for law in np.argsort(costs, kind="stable").tolist():
             if costs[law] > limit:
                 return None
@@ -220,30 +247,27 @@ class Servo:
 
     def _final_turn(self, pose: Pose2) -> ServoStep | None:
         """Inside the dead zone: mend the heading, then settle."""
-        settings = self.settings
         rho = math.hypot(pose.x, pose.y)
-        self._in_dead_zone = rho <= (
-            settings.position_tolerance if self._in_dead_zone else settings.dead_zone
-        )
+        self._in_dead_zone = rho <= (POSITION_TOLERANCE if self._in_dead_zone else DEAD_ZONE)
         if not self._in_dead_zone:
             self._settled = 0
             return None
         self._law = None
         self._drop_plan()
-        if abs(pose.heading) > settings.heading_tolerance:
+        if abs(pose.heading) > HEADING_TOLERANCE:
             self._settled = 0
-            turn = Command(0.0, clip(-settings.turn_gain * pose.heading, self._limits.turn))
+            turn = Command(0.0, clip(-TURN_GAIN * pose.heading, self._limits.turn))
             return self._step(turn, "turning", "at the goal: turning to its heading", pose)
         self._settled += 1
-        if self._settled < settings.settle_ticks:
+        if self._settled < SETTLE_TICKS:
             return self._step(Command(), "turning", "at the goal: settling", pose)
         return self._step(Command(), "arrived", "at the goal", pose)
 
     def _drive_law(self, pose: Pose2, around: Surroundings) -> ServoStep:
         """Equation (5) with v = rho u, slowed to the limits without a change of curvature."""
         assert self._law is not None
-        polar, gain = self._polar, self.settings.gain
-        u, omega = control(polar.phi, polar.beta, self.settings.lambda_)
+        polar, gain = self._polar, GAIN
+        u, omega = control(polar.phi, polar.beta, LAMBDA)
         speeds = saturate(
             gain * polar.rho * float(u),
             gain * float(omega[self._law]),
@@ -272,7 +296,7 @@ class Servo:
             self._follower = None
         self._drop_plan()
         # A way that has ended within the tolerance is as good as it gets: no further leg for a millimetre.
-        self._in_dead_zone = math.hypot(pose.x, pose.y) <= 0.8 * self.settings.position_tolerance
+        self._in_dead_zone = math.hypot(pose.x, pose.y) <= 0.8 * POSITION_TOLERANCE
         return self._final_turn(pose)
 
     # ---- output
@@ -281,14 +305,14 @@ class Servo:
         self, command: Command, state: State, reason: str, pose: Pose2, around: Surroundings
     ) -> ServoStep:
         """The last check: a command that would break a constraint within the look-ahead does not leave."""
-        if around.admits(arc(pose, command.forward, command.turn, self.settings.horizon), 0.0):
+        if around.admits(arc(pose, command.forward, command.turn, HORIZON), 0.0):
             return self._step(command, state, reason, pose)
         self._law = None
         self._drop_plan()
         return self._step(Command(), state, f"stopped: {reason} would leave what is allowed", pose)
 
     def _step(self, command: Command, state: State, reason: str, pose: Pose2) -> ServoStep:
-        rooms = self._sight.field.rooms(arc(pose, command.forward, command.turn, self.settings.horizon))
+        rooms = self._sight.field.rooms(arc(pose, command.forward, command.turn, HORIZON))
         seen = int((rooms >= 0.0).sum(axis=-1).min())
         law = self._law if state == "driving" else None
         return ServoStep(command, state, law, reason, seen)

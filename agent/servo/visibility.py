@@ -8,9 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.servo.field_of_view import FieldOfView
-from mapweave.agent.servo.settings import ServoSettings
+from mapweave.agent.servo.settings import MIN_VISIBLE, ServoSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
+
+MIN_DEPTH = 0.1
+"""M, nearer landmarks do not count."""
+MOST_LANDMARKS = 24
+"""How many landmarks ways are checked against."""
+MISSED_TICKS = 10
+"""A landmark that should be in view and is not tracked this long is not counted on."""
+
 
 _WELL_INSIDE = 0.1
 """rad, a landmark with this much room should be tracked."""
@@ -58,11 +66,11 @@ class Visibility:
             absent = ~np.asarray(visible, dtype=bool) & (rooms > _WELL_INSIDE)
             self._missed[absent] += 1
             self._missed[np.asarray(visible, dtype=bool)] = 0
-            usable = usable & (self._missed < self._settings.missed_ticks)
+            usable = usable & (self._missed < MISSED_TICKS)
         if changed or not np.array_equal(usable, self._used):
             self._used = usable
             self.field = self._field(points[usable])
-            self.planning_field = self.field.spread(self._settings.most_landmarks)
+            self.planning_field = self.field.spread(MOST_LANDMARKS)
 
     def _field(self, points: NDArray[Any]) -> FieldOfView:
-        return FieldOfView(points, self._camera, self._settings.min_visible, self._settings.min_depth)
+        return FieldOfView(points, self._camera, MIN_VISIBLE, MIN_DEPTH)

@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 from mapweave.agent.vision.template import TemplateMatcher, Templates, TemplateSettings
 from mapweave.hybridmap.pose import Array
 
+IMAGES = 60
+"""A point that has not come back after so many images is given up."""
+
 
 @dataclass(frozen=True, slots=True)
 class OccludedTrackSettings:
     """How long and how hidden points are looked for.
 
     Attributes:
-        images: a point that has not come back after so many images is given up.
         template: how its patch is found again: further from the expected place than that of a point that is
             tracked, and therefore only if it looks more like what it was.
     """
 
-    images: int = 60
     template: TemplateSettings = field(
         default_factory=lambda: TemplateSettings(iterations=6, agree_px=4.0, least_correlation=0.9)
     )
@@ -69,5 +70,5 @@ class OccludedTracks:
         found = inside & match.held
         out = self.ids[found], match.raw[found], match.templates.chosen(found)
         self._waited = self._waited + 1
-        self.keep(~found & (self._waited < self._settings.images))
+        self.keep(~found & (self._waited < IMAGES))
         return out

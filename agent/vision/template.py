@@ -16,6 +16,15 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
 
+HALF_PX = 7
+"""A patch reaches this far from its point in each direction."""
+SIGMA_PX = 4.0
+"""Of the Gaussian by which pixels far from the point count less: they are on another surface, or on a
+slanted one, more often than those near it."""
+MOST_SCALE = 1.7
+"""Once a patch has grown or shrunk by more than this it is cut anew from the present image."""
+
+
 Floats = NDArray[np.float32]
 
 FAINT = 0.5
@@ -30,21 +39,14 @@ class TemplateSettings:
     """How tracks are held to the patches in which they were first seen.
 
     Attributes:
-        half_px: a patch reaches this far from its point in each direction.
-        sigma_px: of the Gaussian by which pixels far from the point count less: they are on another surface,
-            or on a slanted one, more often than those near it.
         iterations: of Gauss and Newton. The guess is a track and good to a fraction of a pixel.
         agree_px: a match further than this from the track is another thing that looks alike.
         least_correlation: of the patch then and now, 1 for the same looks in whatever light.
-        most_scale: once a patch has grown or shrunk by more than this it is cut anew from the present image.
     """
 
-    half_px: int = 7
-    sigma_px: float = 4.0
     iterations: int = 2
     agree_px: float = 1.5
     least_correlation: float = 0.8
-    most_scale: float = 1.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +107,10 @@ class TemplateMatcher:
 
     def __init__(self, settings: TemplateSettings | None = None) -> None:
         """Lay out the patch."""
-        self._settings = s = settings or TemplateSettings()
-        side = np.arange(-s.half_px, s.half_px + 1, dtype=np.float32)
+        self._settings = settings or TemplateSettings()
+        side = np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32)
         self._spots = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-        weights = np.exp(-(self._spots**2).sum(axis=1) / (2 * s.sigma_px**2))
+        weights = np.exp(-(self._spots**2).sum(axis=1) / (2 * SIGMA_PX**2))
         self._weights: Floats = (weights / weights.sum()).astype(np.float32)
 
     def none(self) -> Templates:
@@ -142,7 +144,7 @@ class TemplateMatcher:
         correlation = np.einsum("np,np,p->n", looks, templates.looks, self._weights)
         held = correlation >= s.least_correlation
         held &= np.linalg.norm(at - raw, axis=1) <= s.agree_px
-        reach = (s.half_px * scales)[:, None]
+        reach = (HALF_PX * scales)[:, None]
         held &= ((at >= reach) & (at <= np.array(image.shape[::-1], np.float32) - 1 - reach)).all(axis=1)
         found = np.where(held[:, None], at.astype(np.float64), raw)
         scales = np.where(held, scales, templates.scales)
@@ -151,7 +153,7 @@ class TemplateMatcher:
 
     def _renewed(self, templates: Templates, held: NDArray[np.bool_], grey: Floats, raw: Array) -> Templates:
         """The patches, those that have changed their size too much cut anew where they are held now."""
-        most = self._settings.most_scale
+        most = MOST_SCALE
         strange = held & ((templates.scales > most) | (templates.scales < 1 / most))
         if not strange.any():
             return templates

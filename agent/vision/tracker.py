@@ -17,6 +17,17 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
+LEVELS = 2
+"""Pyramid levels above the image."""
+BACKWARD_PX = 0.8
+"""A point that does not come back to where it was within this is lost."""
+BORDER_PX = 4.0
+"""Points nearer to the border are lost."""
+LEAST_TEXTURE = 2.5
+"""Mean squared gradient of a patch in its weakest direction, (grey/px)^2; with less (that of noise
+included, about 1 for a webcam) a point would slide along an edge, and is lost."""
+
+
 EIGENVALUE_UNIT = 1024.0
 """OpenCV's Lucas-Kanade measures gradients in units of 1/32 grey/px."""
 
@@ -27,21 +38,12 @@ class TrackerSettings:
 
     Attributes:
         window_px: side of the patch that is matched.
-        levels: pyramid levels above the image.
-        backward_px: a point that does not come back to where it was within this is lost.
-        border_px: points nearer to the border are lost.
-        least_texture: mean squared gradient of a patch in its weakest direction, (grey/px)^2; with less (that
-            of noise included, about 1 for a webcam) a point would slide along an edge, and is lost.
         anchored: whether points are held to the patches in which they were first seen. What is tracked over
             one frame only gains nothing by it.
         template: how they are.
     """
 
     window_px: int = 11
-    levels: int = 2
-    backward_px: float = 0.8
-    border_px: float = 4.0
-    least_texture: float = 2.5
     anchored: bool = True
     template: TemplateSettings = field(default_factory=TemplateSettings)
 
@@ -101,21 +103,21 @@ class Tracker:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
         window = (s.window_px, s.window_px)
         there, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, image, start, guess, winSize=window, maxLevel=s.levels, criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=s.least_texture / EIGENVALUE_UNIT,
+            before, image, start, guess, winSize=window, maxLevel=LEVELS, criteria=criteria,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE / EIGENVALUE_UNIT,
         )  # fmt: skip
         # The way back starts from the expected displacement, not from the answer, which would hide errors.
         way_back = there - (guess_given - start)
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-            image, before, there, way_back, winSize=window, maxLevel=s.levels, criteria=criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=s.least_texture / EIGENVALUE_UNIT,
+            image, before, there, way_back, winSize=window, maxLevel=LEVELS, criteria=criteria,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE / EIGENVALUE_UNIT,
         )  # fmt: skip
         height, width = image.shape
         there, back = there[:, 0], back[:, 0]
         kept = (found[:, 0] == 1) & (found_back[:, 0] == 1)
-        kept &= np.linalg.norm(back - start[:, 0], axis=1) <= s.backward_px
-        kept &= (there >= s.border_px).all(axis=1)
-        kept &= (there[:, 0] < width - s.border_px) & (there[:, 1] < height - s.border_px)
+        kept &= np.linalg.norm(back - start[:, 0], axis=1) <= BACKWARD_PX
+        kept &= (there >= BORDER_PX).all(axis=1)
+        kept &= (there[:, 0] < width - BORDER_PX) & (there[:, 1] < height - BORDER_PX)
         lost: NDArray[np.int64] = self.ids[~kept]
         self.raw = there.astype(np.float64)
         self.keep(kept)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from benchmarks.images.surface_points import Surfaces
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.mapping_filter import FilterSettings
-from mapweave.agent.exploration.settings import ExplorerSettings
+from mapweave.agent.exploration.behaviours import DRIVE, LEAST_FEATURES
 from mapweave.agent.mapping.anchored_keyframe import HERE
-from mapweave.agent.mapping.mapper import MapperSettings
+from mapweave.agent.mapping.mapper import DEPTHS_PER_HEIGHT, MapperSettings
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.view import View
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
@@ -150,7 +150,7 @@ def drive(
     for start in viewpoints(world, setup.describe(), seed):
         with Simulation(world, [setup], seed, [start]) as simulation:
             run = _Run(simulation)
-            if len(run.anchor.features) < ExplorerSettings().least_features:
+            if len(run.anchor.features) < LEAST_FEATURES:
                 continue
             run.go(shape, steps, person, progress)
             return run.recorded(f"{shape}, person" if person else shape)
@@ -167,7 +167,7 @@ def viewpoints(world: World, robot: RobotDescription, seed: int) -> Iterator[Pos
     horizon = np.column_stack([columns, np.full(9, camera.cy)])
     for _ in range(300):
         pose = world.plan.random_free_pose(rng, radius)
-        end = pose @ Pose2(ExplorerSettings().drive + 0.3)
+        end = pose @ Pose2(DRIVE + 0.3)
         depths = surfaces.see(pose, camera, horizon).depths
         in_reach = (depths > NEAREST).all() and (depths < FARTHEST).all()
         if in_reach and is_clear(world.plan, [(pose.x, pose.y), (end.x, end.y)], radius):
@@ -197,7 +197,7 @@ class _Run:
     def go(self, shape: str, steps: int, person: bool, progress: Callable[[], None]) -> None:
         """Drive back and forth; the shape adds turns to those that the image asks for."""
         turns = speeds(shape, steps)[1]
-        reach = ExplorerSettings().drive
+        reach = DRIVE
         controller = ImageDrive(self.robot, ImageDriveSettings(speed=SPEED))
         controller.start(reach)
         observation: Observation | None = None
@@ -244,7 +244,7 @@ class _Run:
         self.tracking.step(observation)
         view = self.tracking.take(observation, sift.extract(observation.image), HERE)
         self.tracking.reanchor()
-        self.tracking.follow(view, settings.depths_per_height * self.robot.camera.mount_height)
+        self.tracking.follow(view, DEPTHS_PER_HEIGHT * self.robot.camera.mount_height)
         return view
 
     def _write(self, observation: Observation, step_ms: float) -> None:

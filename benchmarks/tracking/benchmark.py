@@ -20,6 +20,8 @@ import time
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from mapweave.agent.vision.tracker import BORDER_PX, LEVELS
+
 # numpy reads it when it is imported. One thread for algebra and images, as in Mapweave's own processes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -72,10 +74,10 @@ class PlainFlow:
         s = TrackerSettings()
         start = self.raw.astype(np.float32)[:, None]
         there, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, image, start, start.copy(), winSize=(s.window_px, s.window_px), maxLevel=s.levels,
+            before, image, start, start.copy(), winSize=(s.window_px, s.window_px), maxLevel=LEVELS,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
         )  # fmt: skip
-        inside = (there[:, 0] >= s.border_px) & (there[:, 0] < np.array(image.shape[::-1]) - s.border_px)
+        inside = (there[:, 0] >= BORDER_PX) & (there[:, 0] < np.array(image.shape[::-1]) - BORDER_PX)
         kept = (found[:, 0] == 1) & inside.all(axis=1)
         self.ids, self.raw = self.ids[kept], there[kept, 0].astype(np.float64)
 

@@ -30,6 +30,10 @@ from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, Refusal
 
+PULLS_AT_ONCE = 4
+"""Of different logs."""
+
+
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT = 3600.0
@@ -43,13 +47,11 @@ class IngestSettings:
     Attributes:
         pull: when missing changes are pulled.
         ask_timeout: for a piece of a log, s.
-        pulls_at_once: of different logs.
         retry_interval: after a failed commit (disk full), s.
     """
 
     pull: PullSettings = field(default_factory=PullSettings)
     ask_timeout: float = 2.0
-    pulls_at_once: int = 4
     retry_interval: float = 1.0
 
 
@@ -101,7 +103,7 @@ class Ingest:
         self._logs: dict[MapId, AgentLog] = {}
         self._work: queue.SimpleQueue[Sample | _Pulled | None] = queue.SimpleQueue()
         self._declared: list[Closing] = []
-        self._pullers = ThreadPoolExecutor(self._settings.pulls_at_once, thread_name_prefix="pull")
+        self._pullers = ThreadPoolExecutor(PULLS_AT_ONCE, thread_name_prefix="pull")
         self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
         self._stopping = False
         self._failure = ""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.place_index import PlaceIndex, bounded
-from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP, Pair
 from mapweave.merge.pose_graph.pairs import PairTable
 
 SETTLED = 3600.0
@@ -41,13 +41,13 @@ class SupersededNodes:
             node: has just come.
             before: pairs that it was in, if it was known already.
         """
-        found, s = self._index.overlaps(node, self._node_of), self._index.settings.candidates
+        found, _s = self._index.overlaps(node, self._node_of), self._index.settings.candidates
         for other_id in {one for pair in before for one in pair} & self._left_out:
             other = self._node_of(other_id)
             if other is not None and other_id != node.id:
                 codes, others = (bounded(one).landmarks.codes for one in (node, other))
-                value = voting.pair_overlap(codes, others, s.alike)
-                if value >= s.least_overlap:
+                value = voting.pair_overlap(codes, others, ALIKE)
+                if value >= LEAST_OVERLAP:
                     found[other_id] = value
         return found
 

@@ -27,11 +27,21 @@ from mapweave.mapserver.relocalization.aliased_landmarks import (
 )
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions, AliasedRegionSettings
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, PlaceHypothesis, is_lonely
-from mapweave.mapserver.relocalization.verdict import HypothesisSelectionSettings, HypothesisSelector, unknown
+from mapweave.mapserver.relocalization.verdict import (
+    SLIGHT,
+    HypothesisSelectionSettings,
+    HypothesisSelector,
+    unknown,
+)
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import match
 from mapweave.registration.pose_refinement import look_closer
 from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
+
+RELOCALIZATION_CANDIDATES = 16
+"""Nodes that are compared with the view."""
+EXPLAINED_PX = 12.0
+"""A match nearer than this to where a pose found elsewhere expects it speaks for that."""
 
 
 @dataclass(frozen=True)
@@ -42,16 +52,12 @@ class RelocalizationSettings:
         recognition: when a view counts as recognised.
         judgement: when a place that was recognised is told.
         regions: when a place counts as being there twice, by its surroundings.
-        candidates: nodes that are compared with the view.
-        explained_px: a match nearer than this to where a pose found elsewhere expects it speaks for that.
         faint: a node that looks so much less like the view than one that was recognised is not looked at.
     """
 
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
     judgement: HypothesisSelectionSettings = field(default_factory=HypothesisSelectionSettings)
     regions: AliasedRegionSettings = field(default_factory=AliasedRegionSettings)
-    candidates: int = 16
-    explained_px: float = 12.0
     faint: float = 0.25
 
 
@@ -88,7 +94,7 @@ class Relocalizer:
         s = self._settings
         if len(view) < s.recognition.least_inliers:
             return unknown(f"the view has {len(view)} features; {s.recognition.least_inliers} are needed")
-        ranked = self._index.query(view, s.candidates)
+        ranked = self._index.query(view, RELOCALIZATION_CANDIDATES)
         if not ranked:
             return unknown("no node of any map has features like these")
         sightings, refusals = self.look(view, ranked)
@@ -194,14 +200,14 @@ class Relocalizer:
             mapped = between(self._merged, other, best.node)
             if mapped is not None:
                 pairs = match(double.landmarks.codes, node.landmarks.codes, s.recognition.matching)
-                left = unexplained(double, pairs, node.landmarks.pixels, node.camera, mapped, s.explained_px)
+                left = unexplained(double, pairs, node.landmarks.pixels, node.camera, mapped, EXPLAINED_PX)
                 if left < s.recognition.least_inliers:
                     continue
             likeness = self.alike.compare(double, node)
             if likeness is None or (mapped is not None and same_place(mapped, likeness.node_from_robot.mean)):
                 continue
-            sighting = carried(double, likeness, best, view, s.recognition.matching, s.explained_px)
-            if sighting.recognition.inliers >= s.judgement.slight * best.recognition.inliers:
+            sighting = carried(double, likeness, best, view, s.recognition.matching, EXPLAINED_PX)
+            if sighting.recognition.inliers >= SLIGHT * best.recognition.inliers:
                 found.append(sighting)
         return found
 
@@ -214,14 +220,14 @@ class Relocalizer:
         """
         s = self._settings
         best = max(sightings, key=lambda sighting: sighting.recognition.inliers)
-        least = max(s.recognition.least_inliers, s.judgement.slight * best.recognition.inliers)
+        least = max(s.recognition.least_inliers, SLIGHT * best.recognition.inliers)
         if len(pairs) < least:
             return False
         mapped = between(self._merged, node.id, best.node)
         if mapped is None:
             return True
         from_robot = mapped @ best.recognition.node_from_robot.mean
-        return unexplained(node, pairs, view.pixels, view.camera, from_robot, s.explained_px) >= least
+        return unexplained(node, pairs, view.pixels, view.camera, from_robot, EXPLAINED_PX) >= least
 
 
 def _best_refusal(refusals: list[tuple[NodeId, Refusal]]) -> str:

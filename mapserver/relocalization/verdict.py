@@ -15,6 +15,19 @@ from mapweave.mapserver.relocalization.calibration import probabilities
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, PlaceHypothesis, fuse, supported
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
+GATE = 16.3
+"""Chi-square with 3 degrees of freedom within which two estimates agree."""
+FLOOR_XY = 0.05
+"""Error between two estimates that no covariance tells of, m."""
+FLOOR_HEADING = 0.03
+"""The same, rad."""
+COMPARABLE = 0.6
+"""A second place is a rival if it explains so much of what the best one explains, or if so much of what it
+should see is seen, as compared with the best one."""
+SLIGHT = 0.25
+"""A place that explains less of what the best one explains is no rival in any case."""
+
+
 Elsewhere = Callable[[PlaceHypothesis], PlaceHypothesis | None]
 """Where a robot may be as well that seems to be at a place."""
 
@@ -27,22 +40,11 @@ class HypothesisSelectionSettings:
     """When a place is told.
 
     Attributes:
-        gate: chi-square with 3 degrees of freedom within which two estimates agree.
-        floor_xy: error between two estimates that no covariance tells of, m.
-        floor_heading: the same, rad.
         alone: landmarks that must agree if one node speaks alone. Two nodes that say the same, found each
             by its own, are much better evidence than one: parts of unlike places look alike.
-        comparable: a second place is a rival if it explains so much of what the best one explains, or if
-            so much of what it should see is seen, as compared with the best one.
-        slight: a place that explains less of what the best one explains is no rival in any case.
     """
 
-    gate: float = 16.3
-    floor_xy: float = 0.05
-    floor_heading: float = 0.03
     alone: int = 18
-    comparable: float = 0.6
-    slight: float = 0.25
 
 
 class HypothesisSelector:
@@ -79,11 +81,10 @@ class HypothesisSelector:
         return None if relative is None else relative @ one.recognition.node_from_robot
 
     def _agree(self, first: PoseGaussian, second: PoseGaussian) -> bool:
-        s = self._settings
         between = first.inverse() @ second
-        floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+        floor = np.diag([FLOOR_XY**2, FLOOR_XY**2, FLOOR_HEADING**2])
         d = between.mean.vector
-        return float(d @ np.linalg.solve(between.covariance + floor, d)) < s.gate
+        return float(d @ np.linalg.solve(between.covariance + floor, d)) < GATE
 
     def answer(self, places: Sequence[PlaceHypothesis], elsewhere: Elsewhere) -> RelocalizeAnswer:
         """Say where the robot is, if only one place comes into question.
@@ -96,10 +97,10 @@ class HypothesisSelector:
         supports = supported(places)
         rivals = [
             place for place, support in zip(places, supports, strict=True)
-            if len(place.features) >= s.comparable * len(first.features)
+            if len(place.features) >= COMPARABLE * len(first.features)
             or (
-                len(place.features) >= s.slight * len(first.features)
-                and support.seen >= s.comparable * supports[0].seen
+                len(place.features) >= SLIGHT * len(first.features)
+                and support.seen >= COMPARABLE * supports[0].seen
             )
         ]  # fmt: skip
         if len(rivals) > 1:

@@ -20,6 +20,13 @@ from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantizer, Codes, Ids, Vectors
 from mapweave.mapserver.retrieval.inverted_file import Block, InvertedFile
 
+FILL = 100
+"""Landmarks in a cell when it is learned, on average."""
+MOST_CELLS = 1 << 18
+"""With as many, cells are not learned again: filling new ones takes the memory twice. These are learned at
+40 million landmarks, where twice is still less than a million nodes take once."""
+
+
 log = logging.getLogger(__name__)
 
 MOST_WITHIN = 256
@@ -37,9 +44,6 @@ class LandmarkIndexSettings:
         small: up to as many every one is compared; beyond, those of some cells.
         exact: up to as many `within` works.
         growth: cells are learned anew when there are so many times as many landmarks.
-        fill: landmarks in a cell when it is learned, on average.
-        most_cells: with as many, cells are not learned again: filling new ones takes the memory twice. These
-            are learned at 40 million landmarks, where twice is still less than a million nodes take once.
         probes: cells that are searched for a feature of a view.
         patience: landmarks beyond which cells are learned beside the questions, not between them.
     """
@@ -47,8 +51,6 @@ class LandmarkIndexSettings:
     small: int = 10_000
     exact: int = 30_000
     growth: float = 4.0
-    fill: int = 100
-    most_cells: int = 1 << 18
     probes: int = 8
     patience: int = 1_000_000
 
@@ -189,7 +191,7 @@ class LandmarkIndex:
     def _grow(self) -> None:
         """Learn cells if there are many more landmarks than when it was last done."""
         s, n = self._settings, len(self)
-        few = self._cells is None or len(self._cells.means) < s.most_cells
+        few = self._cells is None or len(self._cells.means) < MOST_CELLS
         if n <= s.small or n < s.growth * self._learned or self._learner is not None or not few:
             return
         self._learned, self._missed = n, []
@@ -218,8 +220,7 @@ class LandmarkIndex:
 
     def _new(self, n: int, end: int) -> InvertedFile:
         """Cells for the landmarks below an id, which are n; what has come since is among what was missed."""
-        s = self._settings
-        count = min(max(2 ** round(math.log2(n / s.fill)), 16), s.most_cells)
+        count = min(max(2 ** round(math.log2(n / FILL)), 16), MOST_CELLS)
         step = max(n // (SAMPLE * count), 1)
         # A part of a block would keep the whole of it.
         sample = np.concatenate([block.codes[::step].copy() for block in self.blocks()])

@@ -14,7 +14,11 @@ from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
-from mapweave.merge.pose_graph.candidates import CandidateSettings
+from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP, CandidateSettings
+
+REACH = 0.6
+"""Distance of two decoded descriptors at which a vote counts nothing."""
+
 
 SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
@@ -34,14 +38,12 @@ class PlaceIndexSettings:
         candidates: what counts as alike and how much overlap is worth noting.
         landmarks: how landmarks are found.
         votes: descriptors of the fleet that each feature of a view votes for.
-        reach: distance of two decoded descriptors at which a vote counts nothing.
         compared: nodes of a large fleet that are compared with one whose overlaps are wanted.
     """
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     landmarks: LandmarkIndexSettings = field(default_factory=LandmarkIndexSettings)
     votes: int = 16
-    reach: float = 0.6
     compared: int = 64
 
 
@@ -178,7 +180,7 @@ class PlaceIndex:
                 return []
             squared, ids = self._landmarks.nearest(codes, self._settings.votes)
             # -1 is nobody's, shifted too.
-            found, scores = voting.votes(squared, ids >> SLOT_BITS, self._settings.reach)
+            found, scores = voting.votes(squared, ids >> SLOT_BITS, REACH)
             if len(exclude):
                 unwanted = [self._slots[node_id] for node_id in exclude if node_id in self._slots]
                 found, scores = found[wanted := ~np.isin(found, unwanted)], scores[wanted]
@@ -201,15 +203,15 @@ class PlaceIndex:
         Returns:
             Overlaps of at least `least_overlap`.
         """
-        s, node = self._settings.candidates, bounded(node)
+        _s, node = self._settings.candidates, bounded(node)
         if len(node.landmarks) == 0 or len(self._landmarks) == 0:
             return {}
         with self._lock:
-            alike = self._landmarks.within(node.landmarks.codes, s.alike)
+            alike = self._landmarks.within(node.landmarks.codes, ALIKE)
             if alike is not None:
                 rows, squared, ids = alike
                 columns, slots = ids & ((1 << SLOT_BITS) - 1), ids >> SLOT_BITS
-                found, values = voting.overlaps(rows, columns, squared, slots, s.alike, s.least_overlap)
+                found, values = voting.overlaps(rows, columns, squared, slots, ALIKE, LEAST_OVERLAP)
                 told = zip(found.tolist(), values.tolist(), strict=True)
                 others = {self._nodes[slot]: value for slot, value in told}
         if alike is None:
@@ -224,8 +226,8 @@ class PlaceIndex:
             other = node_of(other_id)
             if other is not None:
                 others = bounded(other).landmarks.codes
-                told[other_id] = voting.pair_overlap(codes, others, s.candidates.alike)
-        return {other: value for other, value in told.items() if value >= s.candidates.least_overlap}
+                told[other_id] = voting.pair_overlap(codes, others, ALIKE)
+        return {other: value for other, value in told.items() if value >= LEAST_OVERLAP}
 
     def settle(self) -> None:
         """Wait until cells that are being learned are in use."""

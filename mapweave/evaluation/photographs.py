@@ -33,20 +33,17 @@ from mapweave.storage.image_file import read_grey
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
+CANDIDATES = 8
+"""Places that are compared with a question."""
+APART = 2
+"""Places further from each other than so many images are not neighbours."""
+COMPARABLE = 0.6
+"""And with this share of the best one's inliers the other one makes it ambiguous."""
+
 
 @dataclass(frozen=True)
 class PhotographSettings:
-    """How questions are asked.
-
-    Attributes:
-        candidates: places that are compared with a question.
-        apart: places further from each other than so many images are not neighbours,
-        comparable: and with this share of the best one's inliers the other one makes it ambiguous.
-    """
-
-    candidates: int = 8
-    apart: int = 2
-    comparable: float = 0.6
+    """How questions are asked."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +164,7 @@ class AppearanceMap:
         began = time.perf_counter()
         view = self._view(image)
         extracted = time.perf_counter()
-        ranked = [node_id.number for node_id, _ in self._index.query(view, self._settings.candidates)]
+        ranked = [node_id.number for node_id, _ in self._index.query(view, CANDIDATES)]
         certainty, place = self._judge(ranked, view)
         return Verdict(
             query=str(number),
@@ -182,12 +179,11 @@ class AppearanceMap:
         )
 
     def _judge(self, ranked: list[int], view: View) -> tuple[Certainty, int | None]:
-        s = self._settings
         pairs = {number: agreeing(self._nodes[number], view) for number in ranked}
         seen = {number: len(found) for number, found in pairs.items() if found is not None}
         if not seen:
             return Certainty.UNKNOWN, None
-        best, *others = rivals(seen, lambda one, other: abs(one - other) <= s.apart, s.comparable)
+        best, *others = rivals(seen, lambda one, other: abs(one - other) <= APART, COMPARABLE)
         return (Certainty.AMBIGUOUS if others else Certainty.FOUND), best
 
     def _view(self, path: Path) -> View:

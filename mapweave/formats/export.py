@@ -19,7 +19,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.route import edge_cost
 from mapweave.mapserver.roadmap import IMPLIED, Roadmap
-from mapweave.mapserver.routes import RouterSettings
+from mapweave.mapserver.routes import NEAR, RouterSettings
 from mapweave.storage.atomic_file import write_whole
 
 FRAME = "map"
@@ -90,7 +90,7 @@ def export_geojson(part: MapPart, out: Path) -> list[Path]:
     the same cost: what only ties poses is no way, and nodes that stand in one place are joined.
     """
     settings = RouterSettings()
-    roads = Roadmap(part.merged, settings.near, ReachabilityCache())
+    roads = Roadmap(part.merged, NEAR, ReachabilityCache())
     places = {node: part.pose(node) for node in part.nodes}
     features: list[dict[str, Any]] = []
     for node, number in part.numbers.items():

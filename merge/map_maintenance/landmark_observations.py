@@ -21,29 +21,26 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.projected_view import ProjectedView
 from mapweave.registration.matching import squared_distances
 
+MARGIN_PX = 12.0
+"""It should be seen if it projects this far inside the image."""
+SCALE = 1.6
+"""And if its distance has changed by at most this factor."""
+ASIDE = math.radians(25.0)
+"""And if it is seen from a direction that differs by at most this, rad."""
+BEFORE_PX = 12.0
+"""Something hides it that is seen this near to it in the image."""
+BEFORE = 0.8
+"""At less than this share of its distance."""
+NEAR_PX = 25.0
+"""It is found again this near to where it projects."""
+ALIKE = 0.3
+"""By a descriptor that is at most this far from its own; of two that have nothing to do with each other one
+in a hundred is, in a whole image."""
+
 
 @dataclass(frozen=True)
 class LandmarkObservationSettings:
-    """When a landmark should be seen, and when it is.
-
-    Attributes:
-        margin_px: it should be seen if it projects this far inside the image.
-        scale: and if its distance has changed by at most this factor.
-        aside: and if it is seen from a direction that differs by at most this, rad.
-        before_px: something hides it that is seen this near to it in the image,
-        before: at less than this share of its distance.
-        near_px: it is found again this near to where it projects,
-        alike: by a descriptor that is at most this far from its own; of two that have nothing to do with each
-            other one in a hundred is, in a whole image.
-    """
-
-    margin_px: float = 12.0
-    scale: float = 1.6
-    aside: float = math.radians(25.0)
-    before_px: float = 12.0
-    before: float = 0.8
-    near_px: float = 25.0
-    alike: float = 0.3
+    """When a landmark should be seen, and when it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +89,7 @@ class LandmarkObservations:
             apart = np.linalg.norm(pixels[:, None] - view.landmarks.pixels[None], axis=2)
             codes = node.landmarks.codes[sought], view.landmarks.codes
             unlike = squared_distances(decode(codes[0]), decode(codes[1])) - rounding_noise()
-            found[sought] = ((apart < s.near_px) & (unlike < s.alike**2)).any(axis=1)
+            found[sought] = ((apart < NEAR_PX) & (unlike < ALIKE**2)).any(axis=1)
         return LandmarkObservations(node, view, link, node_from_view, shown, found)
 
 
@@ -105,11 +102,11 @@ def expected(old: Node, new: Node, old_from_new: Pose2, s: LandmarkObservationSe
         old_from_new: how they stand.
         s: when a landmark should be seen.
     """
-    there = ProjectedView.of(old, new, old_from_new, s.margin_px, s.scale, s.aside)
+    there = ProjectedView.of(old, new, old_from_new, MARGIN_PX, SCALE, ASIDE)
     shown, candidates = there.fits, np.flatnonzero(there.fits)
     if len(candidates):
         known = new.landmarks.take(new.landmarks.has_depth)
         apart = np.linalg.norm(there.pixels[candidates, None] - known.pixels[None], axis=2)
-        before = (apart < s.before_px) & (known.depths[None] < s.before * there.depths[candidates, None])
+        before = (apart < BEFORE_PX) & (known.depths[None] < BEFORE * there.depths[candidates, None])
         shown[candidates[before.any(axis=1)]] = False
     return shown

@@ -41,6 +41,38 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
+RATES = (0.1, 0.9)
+"""Within which the share is held that a view finds of what it should show."""
+LEAST_SHOWN = 15
+"""A view that should show fewer landmarks tells nothing."""
+SURE = (0.05, 0.05, 0.03)
+"""M, m and rad, nor does one that the merged map does not place within one sigma of this."""
+WEIGHT = 15.0
+"""With the weight of so many landmarks."""
+THING = 0.3
+"""M, landmarks that are nearer than this to each other go together."""
+HIDDEN = 0.05
+"""Probability that a thing is hidden during a visit by what nobody knows of."""
+MISTAKEN = 0.01
+"""Probability that a landmark that is gone is found all the same."""
+GOES = 0.02
+"""Probability that a landmark has gone from one visit to the next."""
+COMES = 0.02
+"""That one that had gone is back."""
+AT_FIRST = 0.95
+"""Probability that it was really there when it was mapped."""
+FAINT = 0.2
+"""A landmark that is there with less than this has faded."""
+NEAR = 2.5
+"""M, views of a place that are not linked with it stand within this."""
+TURNED = math.radians(45.0)
+"""Rad, and are turned by at most this."""
+MOST = 12
+"""So many of them are looked at, the newest."""
+AGAIN = 120.0
+"""S, views of one map that lie nearer in time are of one visit."""
+
+
 SECOND = 1_000_000_000
 
 
@@ -50,43 +82,13 @@ class LandmarkRemovalSettings:
 
     Attributes:
         looks: when it should be seen, and when it is.
-        rates: within which the share is held that a view finds of what it should show.
-        least_shown: a view that should show fewer landmarks tells nothing.
-        sure: m, m and rad, nor does one that the merged map does not place within one sigma of this.
         usual: share of what it should show that a view finds, as far as it tells nothing better,
-        weight: with the weight of so many landmarks.
-        thing: m, landmarks that are nearer than this to each other go together.
-        hidden: probability that a thing is hidden during a visit by what nobody knows of.
-        mistaken: probability that a landmark that is gone is found all the same.
-        goes: probability that a landmark has gone from one visit to the next.
-        comes: that one that had gone is back.
-        at_first: probability that it was really there when it was mapped.
-        faint: a landmark that is there with less than this has faded.
         moved: m, by which two nodes may move to each other before their views are compared anew.
-        near: m, views of a place that are not linked with it stand within this,
-        turned: rad, and are turned by at most this.
-        most: so many of them are looked at, the newest.
-        again: s, views of one map that lie nearer in time are of one visit.
     """
 
     looks: LandmarkObservationSettings = field(default_factory=LandmarkObservationSettings)
-    rates: tuple[float, float] = (0.1, 0.9)
-    least_shown: int = 15
-    sure: tuple[float, float, float] = (0.05, 0.05, 0.03)
     usual: float = 0.1
-    weight: float = 15.0
-    thing: float = 0.3
-    hidden: float = 0.05
-    mistaken: float = 0.01
-    goes: float = 0.02
-    comes: float = 0.02
-    at_first: float = 0.95
-    faint: float = 0.2
     moved: float = 0.05
-    near: float = 2.5
-    turned: float = math.radians(45.0)
-    most: int = 12
-    again: float = 120.0
 
 
 class LandmarkRemover:
@@ -105,7 +107,7 @@ class LandmarkRemover:
         self._graphs: tuple[PoseGraph, ...] = ()
         self._links = Adjacency()
         # Two nodes have drifted by a part of what matters each, since one of them was looked at and before.
-        self._drift = ChangedNodes(s.moved / 8.0, s.moved / (4.0 * s.near))
+        self._drift = ChangedNodes(s.moved / 8.0, s.moved / (4.0 * NEAR))
 
     def fade(self, merged: MergedMap) -> MergedMap:
         """The same map with the landmarks that have faded, of nodes that no others stand for.
@@ -137,7 +139,7 @@ class LandmarkRemover:
             self._looks[node.id] = looks = self._seen(merged, graph, node, views, linked)
             if before is not None and list(map(id, before)) == list(map(id, looks)):
                 continue
-            gone = presence(things(node, s.thing), [one for one in looks if tells(one, s)], s) < s.faint
+            gone = presence(things(node, THING), [one for one in looks if tells(one, s)], s) < FAINT
             self._faded.pop(node.id, None)
             if gone.any():
                 self._faded[node.id] = gone
@@ -164,22 +166,21 @@ class LandmarkRemover:
 
     def _around(self, graph: PoseGraph, row: int, tree: cKDTree) -> list[int]:
         """Rows of nodes that stand near a node and look about the same way, itself among them."""
-        near = np.sort(tree.query_ball_point(graph.means[row, :2], self._settings.near))
+        near = np.sort(tree.query_ball_point(graph.means[row, :2], NEAR))
         turns = np.cos(graph.means[near, 2] - graph.means[row, 2])
-        out: list[int] = near[turns > math.cos(self._settings.turned)].tolist()
+        out: list[int] = near[turns > math.cos(TURNED)].tolist()
         return out
 
     def _views(self, node: Node, near: Sequence[Node], linked: Sequence[Node]) -> list[Node]:
         """Later views of a node's place, the earliest first."""
-        s = self._settings
         known = {one.id for one in linked}
         others = [one for one in near if one.id not in known and is_older(node, one)]
         others = [
             one
             for one in others
-            if one.id.map != node.id.map or one.stamp_ns - node.stamp_ns > s.again * SECOND
+            if one.id.map != node.id.map or one.stamp_ns - node.stamp_ns > AGAIN * SECOND
         ]
-        newest = sorted(others, key=lambda one: (one.stamp_ns, one.id))[-s.most :]
+        newest = sorted(others, key=lambda one: (one.stamp_ns, one.id))[-MOST:]
         views = [*(one for one in linked if is_older(node, one)), *newest]
         return sorted(views, key=lambda one: (one.stamp_ns, one.id))
 
@@ -196,14 +197,14 @@ class LandmarkRemover:
             link, look = linked.get(view.id), before.get(id(view))
             if look is None or look.node is not node or look.link is not link or self._off(look, between):
                 look = LandmarkObservations.of(node, view, link, between, s.looks)
-                if link is None and look.expected.sum() >= s.least_shown:
+                if link is None and look.expected.sum() >= LEAST_SHOWN:
                     doubted.append(len(looks))
             looks.append(look)
         if doubted:
             there = graph.relative([node.id] * len(doubted), [looks[k].view.id for k in doubted])
             sigmas = np.sqrt(np.diagonal(there.covariances, axis1=1, axis2=2))
             for k, those in zip(doubted, sigmas, strict=True):
-                looks[k] = replace(looks[k], sure=bool((those <= s.sure).all()))
+                looks[k] = replace(looks[k], sure=bool((those <= SURE).all()))
         return looks
 
     def _off(self, look: LandmarkObservations, between: Pose2) -> bool:
@@ -213,7 +214,7 @@ class LandmarkRemover:
 
 def tells(look: LandmarkObservations, s: LandmarkRemovalSettings) -> bool:
     """Whether a view tells anything: it should show enough, and stands where it is thought to."""
-    return int(look.expected.sum()) >= s.least_shown and look.sure
+    return int(look.expected.sum()) >= LEAST_SHOWN and look.sure
 
 
 def things(node: Node, size: float) -> NDArray[np.bool_]:
@@ -238,8 +239,8 @@ def presence(
         looks: later views of it that tell something, the earliest first.
         s: how landmarks come and go.
     """
-    there = np.full(len(together), s.at_first)
-    for visit in visits(looks, s.again):
+    there = np.full(len(together), AT_FIRST)
+    for visit in visits(looks, AGAIN):
         # Of the visit's views together: if it is there and in sight, there and hidden, and gone.
         in_sight, hidden, gone = np.ones((3, len(together)))
         told = np.zeros(len(together), np.bool_)
@@ -252,10 +253,10 @@ def presence(
             tells_of = look.expected | look.found
             in_sight *= np.where(tells_of, rate**seen * (1.0 - rate) ** missed, 1.0)
             hidden *= np.where(tells_of, seen == 0, 1.0)
-            gone *= np.where(tells_of, s.mistaken**seen * (1.0 - s.mistaken) ** missed, 1.0)
+            gone *= np.where(tells_of, MISTAKEN**seen * (1.0 - MISTAKEN) ** missed, 1.0)
             told |= tells_of
-        if_there = (1.0 - s.hidden) * in_sight + s.hidden * hidden
-        prior = there * (1.0 - s.goes) + (1.0 - there) * s.comes
+        if_there = (1.0 - HIDDEN) * in_sight + HIDDEN * hidden
+        prior = there * (1.0 - GOES) + (1.0 - there) * COMES
         posterior = prior * if_there / (prior * if_there + (1.0 - prior) * gone)
         there = np.where(told, posterior, there)
     return there
@@ -291,5 +292,5 @@ def found_again(together: NDArray[np.bool_], look: LandmarkObservations, s: Land
     again = look.found & look.expected
     others: NDArray[np.int64] = together @ again.astype(np.int64) - again
     firm = look.expected & (others > 0)
-    rate = ((again & firm).sum() + s.usual * s.weight) / (firm.sum() + s.weight)
-    return float(np.clip(rate, *s.rates))
+    rate = ((again & firm).sum() + s.usual * WEIGHT) / (firm.sum() + WEIGHT)
+    return float(np.clip(rate, *RATES))

@@ -22,7 +22,7 @@ import numpy as np
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.hybridmap.reachability import ReachabilitySettings, least_in_view
+from mapweave.hybridmap.reachability import FARTHEST, STOPS, WIDEST, ReachabilitySettings, least_in_view
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.merge.map_maintenance.adjacency import Adjacency
@@ -34,6 +34,18 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.pose_graph.verification import VerificationSettings
 
+DEPTHS = 0.7
+"""It knows at least this share of the number of depths that the other one knows."""
+ENOUGH = 60
+"""Or at least this many."""
+AGAIN = 120.0
+"""S, that lie between them if both belong to one map: views of one visit complete each other."""
+GATE = 16.3
+"""Chi-square with 3 degrees of freedom within which such a comparison bears out the merged map."""
+FLOOR = (0.05, 0.05, 0.03)
+"""M, m and rad, error of both that no covariance tells of."""
+
+
 SECOND = 1_000_000_000
 
 
@@ -44,24 +56,14 @@ class NodeSupersedingSettings:
     Attributes:
         reach: the servo's basin: from the one node's place it brings a robot to the one that stands for it.
         found: landmarks that both show and that stay in view between them.
-        depths: it knows at least this share of the number of depths that the other one knows,
-        enough: or at least this many.
-        again: s, that lie between them if both belong to one map: views of one visit complete each other.
         detour: m, by which a way between neighbours may become longer.
         near: m, nodes nearer than this to each other stand in one place, as for routes.
-        gate: chi-square with 3 degrees of freedom within which such a comparison bears out the merged map.
-        floor: m, m and rad, error of both that no covariance tells of.
     """
 
     reach: ReachabilitySettings = field(default_factory=ReachabilitySettings)
     found: int = 20
-    depths: float = 0.7
-    enough: int = 60
-    again: float = 120.0
     detour: float = 1.5
     near: float = 0.5
-    gate: float = 16.3
-    floor: tuple[float, float, float] = (0.05, 0.05, 0.03)
 
 
 class NodeSuperseder:
@@ -161,14 +163,13 @@ class _Round:
 
     def revive(self) -> set[NodeId]:
         """Give life back to nodes whose successor is too far off now, or shown to be wrong."""
-        s = self._settings.reach
         gone = set()
         for node, fate in self._fates.items():
             if node not in self._nodes and fate.by not in self._nodes:
                 continue
             if self._merged.component_of(node) == self._merged.component_of(fate.by):
                 between = self._between(node, fate.by)
-                near = between.distance(Pose2()) < 1.1 * s.farthest and abs(between.heading) < 1.1 * s.widest
+                near = between.distance(Pose2()) < 1.1 * FARTHEST and abs(between.heading) < 1.1 * WIDEST
                 if near and _ordered(node, fate.by) not in self._refused:
                     continue
             gone.add(node)
@@ -179,7 +180,7 @@ class _Round:
 
     def look_at(self, fresh: Iterable[NodeId]) -> None:
         """See which nodes can be spared where something is new, the least needed first."""
-        reach = self._settings.reach.farthest
+        reach = FARTHEST
         living = {node for node in fresh if node not in self._fates}
         for node in tuple(living):
             living.update(self._passages.around(node, reach))
@@ -239,12 +240,11 @@ class _Round:
     def _like(self, node: NodeId) -> list[tuple[NodeId, Pose2]]:
         """Nodes within the basin, living or not, and how they stand to it: those most like it first."""
         if node not in self._basins:
-            s = self._settings.reach
-            around = self._passages.around(node, s.farthest, also_gone=True)
+            around = self._passages.around(node, FARTHEST, also_gone=True)
             between = self._passages.stances(node, around)
             distances, turns = np.hypot(between[:, 0], between[:, 1]), np.abs(between[:, 2])
-            order = np.argsort(distances / s.farthest + turns / s.widest, kind="stable")
-            inside = (distances <= s.farthest) & (turns <= s.widest)
+            order = np.argsort(distances / FARTHEST + turns / WIDEST, kind="stable")
+            inside = (distances <= FARTHEST) & (turns <= WIDEST)
             self._basins[node] = [
                 (around[k], Pose2.from_vector(between[k])) for k in order[inside[order]].tolist()
             ]
@@ -255,13 +255,13 @@ class _Round:
         s, a, b = self._settings, self._nodes[one], self._nodes[other]
         if self._one_visit(a, b):
             return None
-        if b.landmarks.has_depth.sum() < min(s.depths * a.landmarks.has_depth.sum(), s.enough):
+        if b.landmarks.has_depth.sum() < min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH):
             return None
         link = self._links.between(one, other) or self._compare(a, b)
         if link is None:
             return None
         link = link if link.a == one else link.turned()
-        found = least_in_view(link.shared, a, b, between, s.reach.stops)
+        found = least_in_view(link.shared, a, b, between, STOPS)
         if found < s.found:
             return None
         return Superseded(other, found, between.distance(Pose2()), abs(between.heading))
@@ -275,16 +275,16 @@ class _Round:
         if verdict is None:
             return None
         off = (verdict.a_from_b.mean.inverse() @ self._between(*verdict.pair)).vector
-        spread = verdict.a_from_b.covariance + np.diag(np.square(s.floor))
+        spread = verdict.a_from_b.covariance + np.diag(np.square(FLOOR))
         # The map's own doubt only lets more pass, and of a large map it takes long to say.
-        if _distance2(off, spread) >= s.gate:
+        if _distance2(off, spread) >= GATE:
             there = self._merged.relative(*verdict.pair)
             assert there is not None, "nodes of one component"
-            return verdict if _distance2(off, spread + there.covariance) < s.gate else None
+            return verdict if _distance2(off, spread + there.covariance) < GATE else None
         return verdict
 
     def _one_visit(self, a: Node, b: Node) -> bool:
-        return a.id.map == b.id.map and abs(a.stamp_ns - b.stamp_ns) < self._settings.again * SECOND
+        return a.id.map == b.id.map and abs(a.stamp_ns - b.stamp_ns) < AGAIN * SECOND
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2:
         return self._merged.pose(a).inverse() @ self._merged.pose(b)

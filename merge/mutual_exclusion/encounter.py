@@ -13,6 +13,11 @@ from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
 
+WINDOW = 2.0
+"""Moments within as much time are one witness, s."""
+NEIGHBOURHOOD = 5.0
+"""Robots that are further apart than as many least distances speak neither for nor against."""
+
 
 @dataclass(frozen=True, eq=False)
 class Encounter:
@@ -36,7 +41,7 @@ class Encounter:
 
     def _windows(self, s: ExclusionSettings) -> NDArray[np.int64]:
         """(T,) number of the window of time in which a moment is; -1 where it is not known of both."""
-        windows = np.floor(self.times / s.window).astype(np.int64)
+        windows = np.floor(self.times / WINDOW).astype(np.int64)
         _, seats = np.unique(windows[self.known], return_inverse=True)
         out = np.full(len(windows), -1, np.int64)
         out[self.known] = seats
@@ -50,8 +55,8 @@ class Encounter:
             s: how long a window is.
         """
         # A body takes this share of the neighbourhood; without it many moments would prove anything.
-        free = 1.0 - s.neighbourhood**-2
-        odds = np.where(self.distances < s.neighbourhood * self.least_apart, free, 1.0)
+        free = 1.0 - NEIGHBOURHOOD**-2
+        odds = np.where(self.distances < NEIGHBOURHOOD * self.least_apart, free, 1.0)
         odds[self.close] = free / clear
         seats = self._windows(s)[self.known]
         # Moments of one window hang together: the mean of their odds is fair all the same, a product is not.

@@ -35,6 +35,12 @@ from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, Stay, s
 from mapweave.merge.mutual_exclusion.visibility_intervals import visibility_intervals
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
+SIGMAS = 2.0
+"""The poses of the two are first moved apart by as many standard deviations, since what is wrong with them
+is wrong at all moments alike."""
+STEP = 0.5
+"""Moments between nodes are looked at as often as this, s."""
+
 
 def clash_of(
     graph: PoseGraph, first: BodyTrajectory, second: BodyTrajectory, settings: ExclusionSettings | None = None
@@ -63,7 +69,7 @@ def clash_of(
     ample = meeting.ample(clear, odds, s)
     bodies, sight = meeting.evidence(clear, odds, still, s)
     close, least_apart = meeting.close, meeting.least_apart
-    shift = s.sigmas * _pose_sigmas(graph, first, second, met.one.nearest[close], met.two.nearest[close])
+    shift = SIGMAS * _pose_sigmas(graph, first, second, met.one.nearest[close], met.two.nearest[close])
     clear = chances_clear(met.apart, shift, met.spreads, least_apart)
     for some in sorted({ample, len(meeting.times)}):
         part = replace(meeting, seen=meeting.seen.take(meeting.seen.moments < some))
@@ -113,7 +119,7 @@ def _met(
     start, end = max(first.times[0], second.times[0]), min(first.times[-1], second.times[-1])
     if first.clock != second.clock or first.agent == second.agent or start > end:
         return None
-    grid = np.arange(math.ceil(start / s.step), math.floor(end / s.step) + 1) * s.step
+    grid = np.arange(math.ceil(start / STEP), math.floor(end / STEP) + 1) * STEP
     times = np.unique(np.concatenate([first.times, second.times, grid]))
     times = times[(times >= start) & (times <= end)]
     one, two = (stay(trail, trail.poses(graph)[:, :2], times, s.trail) for trail in (first, second))

@@ -41,28 +41,29 @@ from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
+MISSED = 0.1
+"""Share of looks, at most, in which the sensors miss a robot that stands in their way."""
+SCENERY = 0.2
+"""How often something else ends a ray where the robot would have been."""
+MARGIN = 0.1
+"""A ray went on if it is longer by more than this than where it would have met the robot, m."""
+MARGIN_SHARE = 0.05
+"""And by this share of it."""
+SIGMAS = (0.0, 1.0, 2.0, 3.0)
+"""The poses are moved by so many standard deviations, in every direction."""
+
 
 @dataclass(frozen=True)
 class MutualVisibilitySettings:
     """What a robot should have seen.
 
     Attributes:
-        missed: share of looks, at most, in which the sensors miss a robot that stands in their way.
-        scenery: how often something else ends a ray where the robot would have been.
         core: a ray surely meets a robot if it comes as near to its middle as this share of its radius: few
             robots are round, but a square hides this much to four of five sides.
-        margin: a ray went on if it is longer by more than this than where it would have met the robot, m;
-        margin_share: and by this share of it.
-        sigmas: the poses are moved by so many standard deviations, in every direction.
         floor_xy: error of how the two maps lie to each other that no covariance tells of, m.
     """
 
-    missed: float = 0.1
-    scenery: float = 0.2
     core: float = 0.8
-    margin: float = 0.1
-    margin_share: float = 0.05
-    sigmas: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0)
     floor_xy: float = 0.03
 
 
@@ -126,7 +127,7 @@ def errors_in_common(
         factor.T @ factor, subset_by_index=[factor.shape[1] - count, factor.shape[1] - 1]
     )
     modes = factor @ vectors
-    ways, weights = _shells(count, np.array(s.sigmas))
+    ways, weights = _shells(count, np.array(SIGMAS))
     by_look = modes.reshape(len(seen), 2, count)
     own = np.einsum("mik,mjk->mij", *[factor.reshape(len(seen), 2, -1)] * 2)
     rest = own - by_look @ by_look.transpose(0, 2, 1)
@@ -191,8 +192,8 @@ def _odds(seen: VisibilityInterval, places: Array, least_apart: float, s: Mutual
     there = (ended & ~went_on & possible).sum(axis=1)
     # A trace more: if no draw is possible, nothing is known.
     unknown = possible.sum(axis=1) - on - there + 1e-9
-    without = unknown + (1.0 - s.scenery) * on + there
-    out: Array = without / (unknown + s.missed * on + (1.0 - s.missed) / s.scenery * there)
+    without = unknown + (1.0 - SCENERY) * on + there
+    out: Array = without / (unknown + MISSED * on + (1.0 - MISSED) / SCENERY * there)
     return out
 
 
@@ -216,7 +217,7 @@ def _outcomes(
     meets = (core > 0.0) & (along > 0.0)
     first = along - np.sqrt(np.maximum(radii**2 - across2, 0.0))
     last = along - np.sqrt(np.maximum(core, 0.0))
-    margins = s.margin + s.margin_share * last
+    margins = MARGIN + MARGIN_SHARE * last
     free = meets & (lengths >= first - margins)
     beyond = free & (lengths > last + margins)
     shape = places.shape[:2]

@@ -33,51 +33,52 @@ from mapweave.merge.pose_graph.projected_view import ProjectedView
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.matching import match
 
+NEAR = 1.5
+"""A view is held against nodes at most so far away, m."""
+TURN = math.radians(50.0)
+"""That look at most so much another way, rad."""
+LASTING = 3600.0
+"""And were made at most so much earlier or later, s."""
+MOST_NODES = 4
+"""Against the nearest ones if there are more."""
+MOST_VIEWS = 80
+"""Of each robot are looked at, evenly chosen."""
+SIGMA_XY = 0.15
+"""How the two stand is known as well as this at least, m."""
+SIGMA_HEADING = math.radians(3.0)
+"""And this, rad."""
+MARGIN = 0.04
+"""A landmark should be seen if it projects this far inside the image, rad."""
+SCALE = 1.4
+"""And if its distance has changed by at most this factor."""
+ASIDE = math.radians(15.0)
+"""And if it is seen from a direction that differs by at most this, rad."""
+AROUND = 0.1
+"""And if the view knows a depth this near to it in the image, rad."""
+BEFORE = 0.8
+"""And none there of less than this share of the landmark's distance."""
+WITHIN = 0.15
+"""It is found if what matches it is this near to where it should be, rad."""
+LEAST = 20
+"""Landmarks that a view should show before it says anything."""
+NOTHING = 0.03
+"""A view shows nothing if it shows at most this share of them."""
+MISSED = 0.02
+"""Share of such views, at most, that show nothing though the merge is true."""
+ALIKE = 0.85
+"""How often places that are taken for each other show the same."""
+APART = 1.5
+"""Views that look at what is nearer than this are one witness, m."""
+
 
 @dataclass(frozen=True)
 class NegativeEvidenceSettings:
     """What a view should show of what another robot has mapped.
 
     Attributes:
-        near: a view is held against nodes at most so far away, m,
-        turn: that look at most so much another way, rad,
-        lasting: and were made at most so much earlier or later, s;
-        most_nodes: against the nearest ones if there are more.
-        most_views: of each robot are looked at, evenly chosen.
-        sigma_xy: how the two stand is known as well as this at least, m,
-        sigma_heading: and this, rad.
-        margin: a landmark should be seen if it projects this far inside the image, rad.
-        scale: and if its distance has changed by at most this factor.
-        aside: and if it is seen from a direction that differs by at most this, rad.
-        around: and if the view knows a depth this near to it in the image, rad,
-        before: and none there of less than this share of the landmark's distance.
-        within: it is found if what matches it is this near to where it should be, rad.
-        least: landmarks that a view should show before it says anything.
-        nothing: a view shows nothing if it shows at most this share of them.
-        missed: share of such views, at most, that show nothing though the merge is true.
-        alike: how often places that are taken for each other show the same.
-        apart: views that look at what is nearer than this are one witness, m.
         most: odds against a merge are never more: that all things changed is as probable as this.
     """
 
-    near: float = 1.5
-    turn: float = math.radians(50.0)
-    lasting: float = 3600.0
-    most_nodes: int = 4
-    most_views: int = 80
-    sigma_xy: float = 0.15
-    sigma_heading: float = math.radians(3.0)
-    margin: float = 0.04
-    scale: float = 1.4
-    aside: float = math.radians(15.0)
-    around: float = 0.1
-    before: float = 0.8
-    within: float = 0.15
-    least: int = 20
-    nothing: float = 0.03
-    missed: float = 0.02
-    alike: float = 0.85
-    apart: float = 1.5
     most: float = 100.0
 
 
@@ -97,12 +98,12 @@ class Views:
 
     def show_nothing(self, s: NegativeEvidenceSettings) -> NDArray[np.bool_]:
         """(N,) which show nothing of what they should."""
-        out: NDArray[np.bool_] = self.found <= s.nothing * self.expected
+        out: NDArray[np.bool_] = self.found <= NOTHING * self.expected
         return out
 
     def odds_against(self, s: NegativeEvidenceSettings) -> Array:
         """(N,) odds against the merge that each gives."""
-        out: Array = np.where(self.show_nothing(s), (1.0 - s.alike) / s.missed, s.alike / (1.0 - s.missed))
+        out: Array = np.where(self.show_nothing(s), (1.0 - ALIKE) / MISSED, ALIKE / (1.0 - MISSED))
         return out
 
     def witnesses(self, s: NegativeEvidenceSettings) -> NDArray[np.int64]:
@@ -111,7 +112,7 @@ class Views:
         for k in range(len(seats)):
             if seats[k] < 0:
                 ways = self.places - self.places[k]
-                seats[(seats < 0) & (np.hypot(ways[:, 0], ways[:, 1]) < s.apart)] = seats.max(initial=-1) + 1
+                seats[(seats < 0) & (np.hypot(ways[:, 0], ways[:, 1]) < APART)] = seats.max(initial=-1) + 1
         return seats
 
     def evidence(self, s: NegativeEvidenceSettings) -> float:
@@ -140,12 +141,12 @@ def negative_evidence(
     s = settings or NegativeEvidenceSettings()
     rows: list[tuple[Array, int, int]] = []
     for looking, mapped in ((first, second), (second, first)):
-        chosen = np.unique(np.linspace(0, len(looking.views) - 1, s.most_views).round().astype(np.int64))
+        chosen = np.unique(np.linspace(0, len(looking.views) - 1, MOST_VIEWS).round().astype(np.int64))
         pairs = _near(graph, looking, mapped, chosen, s)
         for k in np.unique(pairs[:, 0]):
             one = [_look(graph, mapped.views[j], looking.views[k], s) for j in pairs[pairs[:, 0] == k, 1]]
             points = np.concatenate([points for points, _ in one])
-            if len(points) >= s.least:
+            if len(points) >= LEAST:
                 rows.append((points.mean(axis=0), len(points), sum(found for _, found in one)))
     return Views(
         np.array([place for place, _, _ in rows]).reshape(-1, 2),
@@ -167,15 +168,15 @@ def _near(
     ways = np.hypot(*(here[:, None, :2] - there[None, :, :2]).transpose(2, 0, 1))
     turns = np.abs(np.angle(np.exp(1j * (here[:, None, 2] - there[None, :, 2]))))
     gaps = np.abs(looking.view_times[chosen][:, None] - mapped.view_times[None])
-    ways[(turns > s.turn) | (gaps > s.lasting)] = np.inf
-    nearest = np.argsort(ways, axis=1, kind="stable")[:, : s.most_nodes]
-    i, j = np.nonzero(np.take_along_axis(ways, nearest, axis=1) < s.near)
+    ways[(turns > TURN) | (gaps > LASTING)] = np.inf
+    nearest = np.argsort(ways, axis=1, kind="stable")[:, :MOST_NODES]
+    i, j = np.nonzero(np.take_along_axis(ways, nearest, axis=1) < NEAR)
     pairs = np.stack([chosen[i], nearest[i, j]], axis=1)
     if not len(pairs):
         return pairs
     between = graph.relative([lookers[k] for k in pairs[:, 0]], [mappers[k] for k in pairs[:, 1]]).covariances
-    known = np.linalg.eigvalsh(between[:, :2, :2])[:, -1] < s.sigma_xy**2
-    out: NDArray[np.int64] = pairs[known & (between[:, 2, 2] < s.sigma_heading**2)]
+    known = np.linalg.eigvalsh(between[:, :2, :2])[:, -1] < SIGMA_XY**2
+    out: NDArray[np.int64] = pairs[known & (between[:, 2, 2] < SIGMA_HEADING**2)]
     return out
 
 
@@ -191,7 +192,7 @@ def _look(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings)
     one, other = match(node.landmarks.codes, view.landmarks.codes).T
     one, other = seats[one[seats[one] >= 0]], other[seats[one] >= 0]
     off = np.linalg.norm(pixels[one] - view.landmarks.pixels[other], axis=1) / view.camera.fx
-    return merged_from_node.apply(node.points_in_robot[shown][:, :2]), int((off < s.within).sum())
+    return merged_from_node.apply(node.points_in_robot[shown][:, :2]), int((off < WITHIN).sum())
 
 
 def should_show(
@@ -205,10 +206,10 @@ def should_show(
         node_from_view: how they stand.
         s: when a landmark should be seen.
     """
-    there = ProjectedView.of(node, view, node_from_view, s.margin * view.camera.fx, s.scale, s.aside)
+    there = ProjectedView.of(node, view, node_from_view, MARGIN * view.camera.fx, SCALE, ASIDE)
     shown = np.flatnonzero(there.fits)
     known = view.landmarks.take(view.landmarks.has_depth)
     off = np.linalg.norm(there.pixels[shown, None] - known.pixels[None], axis=2) / view.camera.fx
-    about, before = off < s.around, known.depths[None] < s.before * there.depths[shown, None]
+    about, before = off < AROUND, known.depths[None] < BEFORE * there.depths[shown, None]
     clear = (about & ~before).any(axis=1) & ~(about & before).any(axis=1)
     return shown[clear], there.pixels[shown[clear]]

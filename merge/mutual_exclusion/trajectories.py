@@ -13,6 +13,19 @@ from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.range_scans import RangeScans
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
+LONGEST_GAP = 5.2
+"""Between moments that are further apart nobody knows where the robot was, s."""
+LONGEST_WAY = 1.0
+"""Nor if they are further apart, m."""
+ALONG = 0.15
+"""How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
+standard deviation: it stops and goes."""
+ASIDE = 0.05
+"""The same to the side of the line."""
+CLOCK_ERROR = 0.05
+"""Of two robots with the same clock, s."""
+
+
 NANOSECONDS = 1e9
 DRIFT = 0.02
 """How far a robot on its way is off beside its node, as a share of the way between them, one sigma."""
@@ -23,21 +36,7 @@ class BodyTrajectorySettings:
     """How well it is known where a robot is between two moments of its trail.
 
     In the simulator it is within 1 cm of the straight line, but up to a third of its length ahead or behind.
-
-    Attributes:
-        longest_gap: between moments that are further apart nobody knows where the robot was, s.
-        longest_way: nor if they are further apart, m.
-        along: how far ahead or behind on the line between two moments a robot may be midway, as a share of
-            the line, standard deviation: it stops and goes.
-        aside: the same to the side of the line.
-        clock_error: of two robots with the same clock, s.
     """
-
-    longest_gap: float = 5.2
-    longest_way: float = 1.0
-    along: float = 0.15
-    aside: float = 0.05
-    clock_error: float = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +147,7 @@ def stay(
         times: (T,) s.
         settings: how well that is known.
     """
-    s = settings or BodyTrajectorySettings()
+    settings or BodyTrajectorySettings()
     before = np.clip(np.searchsorted(trail.times, times, side="right") - 1, 0, max(len(places) - 2, 0))
     after = np.minimum(before + 1, len(places) - 1)
     gaps = np.maximum(trail.times[after] - trail.times[before], 1e-9)
@@ -157,12 +156,12 @@ def stay(
     share = np.clip((times - trail.times[before]) / gaps, 0.0, 1.0)
     at_moment = (share == 0.0) | (share == 1.0)
     known = (times >= trail.times[0]) & (times <= trail.times[-1])
-    known &= at_moment | ((gaps <= s.longest_gap) & (lengths <= s.longest_way))
+    known &= at_moment | ((gaps <= LONGEST_GAP) & (lengths <= LONGEST_WAY))
     nearest = np.where(share < 0.5, before, after)
     bow = 4.0 * share * (1.0 - share) * lengths
     ahead = lines / np.maximum(lengths, 1e-9)[:, None]
-    along2 = (s.along * bow) ** 2 + (s.clock_error * lengths / gaps) ** 2
-    aside2 = (s.aside * bow) ** 2
+    along2 = (ALONG * bow) ** 2 + (CLOCK_ERROR * lengths / gaps) ** 2
+    aside2 = (ASIDE * bow) ** 2
     outer = ahead[:, :, None] * ahead[:, None, :]
     spreads = (along2 - aside2)[:, None, None] * outer + (aside2 + trail.drifts[nearest] ** 2)[
         :, None, None

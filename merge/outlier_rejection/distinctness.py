@@ -34,6 +34,12 @@ from mapweave.merge.pose_graph.links import Link, link_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 
+APART_XY = 0.5
+"""They contradict each other by more than this, m, or."""
+APART_HEADING = 0.26
+"""By more than this, rad. Less is how well places are measured, not another place."""
+
+
 FOLLOWED = (EdgeKind.MAPPED, EdgeKind.TURNED)
 """Edges whose two nodes share landmarks that were tracked from image to image."""
 
@@ -43,15 +49,7 @@ Landmark = tuple[NodeId, int]
 
 @dataclass(frozen=True)
 class DistinctnessSettings:
-    """When two recognitions mean two places.
-
-    Attributes:
-        apart_xy: they contradict each other by more than this, m, or
-        apart_heading: by more than this, rad. Less is how well places are measured, not another place.
-    """
-
-    apart_xy: float = 0.5
-    apart_heading: float = 0.26
+    """When two recognitions mean two places."""
 
 
 def weigh(
@@ -192,7 +190,7 @@ class _Sides:
         ends = self.near[sides] if others is None else self.far[others]
         own = compose_poses(inverse_poses(self.places[ends]), self.places[starts])
         off = compose_poses(self._between(sides, others).means, own)
-        much = (np.hypot(off[:, 0], off[:, 1]) > s.apart_xy) | (abs(off[:, 2]) > s.apart_heading)
+        much = (np.hypot(off[:, 0], off[:, 1]) > APART_XY) | (abs(off[:, 2]) > APART_HEADING)
         out = np.zeros(len(sides), bool)
         # Covariances cost more than all the rest: only where places seem to be different.
         for fragment in np.unique(self.fragments[starts[much]]):

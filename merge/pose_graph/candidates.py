@@ -18,6 +18,12 @@ from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.node import Edge, Node, NodeId
 from mapweave.registration.matching import squared_distances
 
+ALIKE = 0.5
+"""Distance of two decoded descriptors below which they may be the same landmark."""
+LEAST_OVERLAP = 3.0
+"""See `overlap`."""
+
+
 Pair = tuple[NodeId, NodeId]
 
 
@@ -26,14 +32,10 @@ class CandidateSettings:
     """Which pairs are looked at.
 
     Attributes:
-        alike: distance of two decoded descriptors below which they may be the same landmark.
-        least_overlap: see `overlap`.
         most_per_map: best pairs of one node with the nodes of any one map.
         least_hops: nodes of one map that are fewer edges apart are neighbours, not loops.
     """
 
-    alike: float = 0.5
-    least_overlap: float = 3.0
     most_per_map: int = 4
     least_hops: int = 3
 
@@ -67,16 +69,16 @@ def overlaps(nodes: Collection[Node], settings: CandidateSettings | None = None)
     Returns:
         Overlaps of at least `least_overlap` by (smaller id, greater id).
     """
-    s = settings or CandidateSettings()
+    settings or CandidateSettings()
     ordered = sorted(nodes, key=lambda node: node.id)
     vectors = [decode(node.landmarks.codes) for node in ordered]
     table: dict[Pair, float] = {}
     for i, a in enumerate(ordered):
         for j in range(i):
             squared = squared_distances(vectors[j], vectors[i])
-            rows, columns = np.nonzero(squared < s.alike**2)
-            value = overlap(rows, columns, squared[rows, columns], s.alike)
-            if value >= s.least_overlap:
+            rows, columns = np.nonzero(squared < ALIKE**2)
+            value = overlap(rows, columns, squared[rows, columns], ALIKE)
+            if value >= LEAST_OVERLAP:
                 table[ordered[j].id, a.id] = value
     return table
 
@@ -101,7 +103,7 @@ def choose_pairs(
     ranked: dict[tuple[NodeId, Any], list[tuple[float, Pair]]] = {}
     for pair, value in table.items():
         a, b = pair
-        if value < s.least_overlap or b in near.get(a, ()):
+        if value < LEAST_OVERLAP or b in near.get(a, ()):
             continue
         for one, other in ((a, b), (b, a)):
             ranked.setdefault((one, other.map), []).append((-value, pair))

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 from mapweave.hybridmap.node import MapId, NodeId
-from mapweave.merge.pose_graph.candidates import CandidateSettings, Pair
+from mapweave.merge.pose_graph.candidates import LEAST_OVERLAP, CandidateSettings, Pair
 
 
 class PairTable:
@@ -96,7 +96,7 @@ class PairTable:
         near = self._around(node)
         by_map: dict[MapId, list[tuple[float, Pair]]] = {}
         for other, value in others.items():
-            if value >= s.least_overlap and other not in near:
+            if value >= LEAST_OVERLAP and other not in near:
                 pair = (node, other) if node < other else (other, node)
                 by_map.setdefault(other.map, []).append((-value, pair))
         return frozenset(pair for best in by_map.values() for _, pair in sorted(best)[: s.most_per_map])

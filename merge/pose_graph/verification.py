@@ -12,6 +12,9 @@ from mapweave.hybridmap.node import Node
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
 
+MOST_SIGMA_HEADING = 0.05
+"""Likewise of the heading, rad."""
+
 
 @dataclass(frozen=True)
 class VerificationSettings:
@@ -21,12 +24,10 @@ class VerificationSettings:
         recognition: when they count as the same place.
         most_sigma_xy: largest standard deviation of their relative position, m. A link that may be off by
             half a metre joins nothing that a robot could drive.
-        most_sigma_heading: likewise of the heading, rad.
     """
 
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
     most_sigma_xy: float = 0.16
-    most_sigma_heading: float = 0.05
 
 
 def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Link | RefusedLink:
@@ -49,7 +50,7 @@ def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Li
     verdict = examine(a, b, s)
     if isinstance(verdict, Recognition):
         sigma_xy, sigma_heading = verdict.evidence["sigma_xy"], verdict.evidence["sigma_heading"]
-        if sigma_xy > s.most_sigma_xy or sigma_heading > s.most_sigma_heading:
+        if sigma_xy > s.most_sigma_xy or sigma_heading > MOST_SIGMA_HEADING:
             degrees = math.degrees(sigma_heading)
             reason = f"the same place, but known to {sigma_xy:.2f} m and {degrees:.1f} deg only"
             return RefusedLink(a.id, b.id, reason)
