@@ -20,7 +20,6 @@ from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.random_exploration import RandomExploration
 from mapweave.agent.exploration.settings import ExplorerSettings
 from mapweave.agent.global_localization.resumption import Resumption
-from mapweave.agent.global_localization.settings import ResumptionSettings
 from mapweave.agent.mapping.mapper import Mapper, MapperSettings
 from mapweave.agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
 from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
@@ -48,7 +47,6 @@ class PipelineSettings:
     explorer: ExplorerSettings = field(default_factory=ExplorerSettings)
     passenger: CarriedMappingSettings = field(default_factory=CarriedMappingSettings)
     navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
-    resumption: ResumptionSettings = field(default_factory=ResumptionSettings)
     floor: OccupancyGridSettings = field(default_factory=OccupancyGridSettings)
     seed: int = 0
 
@@ -245,7 +243,7 @@ class Pipeline:
         if self._resumption is None:
             drives, settings = isinstance(self._mission, Explore), self._settings
             self._resumption = Resumption(
-                self._description, self._sift, self.map, drives, settings.resumption, settings.seed
+                self._description, self._sift, self.map, drives, settings.seed
             )
         command = self._resumption.step(observation, bool(self._blind))
         found, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot

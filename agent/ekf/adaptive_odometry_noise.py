@@ -13,9 +13,16 @@ from mapweave.hybridmap.pose import Array
 class AdaptiveOdometryNoise:
     """The wheels' noise, as it is said or as images have shown it to be."""
 
-    def __init__(self, noise: WheelNoise, settings: FilterSettings) -> None:
-        """Begin with trust."""
+    def __init__(self, noise: WheelNoise, side_slip: float, settings: FilterSettings) -> None:
+        """Begin with trust.
+
+        Args:
+            noise: of the wheels, as it is said.
+            side_slip: standard deviation of a step's slip aside, as a share of the wheels' way.
+            settings: of the filter.
+        """
         self._noise = noise
+        self._side_slip = side_slip
         self._settings = settings
         self._steps_doubted = 0
 
@@ -35,7 +42,7 @@ class AdaptiveOdometryNoise:
     def side_slip(self, odometry: Odometry) -> float:
         """Standard deviation of a step's slip aside, m."""
         way = abs(odometry.forward) + self._noise.axle * abs(odometry.turn)
-        return self._settings.side_slip * way
+        return self._side_slip * way
 
     def refuted(self, odometry: Odometry, surprise: float) -> Array:
         """The root for a step that its image refutes by so many sigmas; the next are doubted as well."""

@@ -47,7 +47,12 @@ class MappingFilter:
     """
 
     def __init__(
-        self, camera: Camera, axle: float, wheel_noise: float, settings: FilterSettings | None = None
+        self,
+        camera: Camera,
+        axle: float,
+        wheel_noise: float,
+        settings: FilterSettings | None = None,
+        side_slip: float = 0.0,
     ) -> None:
         """Start at the anchor, with certainty, knowing no landmark.
 
@@ -56,6 +61,7 @@ class MappingFilter:
             axle: distance between the wheels, m.
             wheel_noise: standard deviation of a wheel's way as a share of the way.
             settings: see there.
+            side_slip: standard deviation of a step's slip aside, as a share of the wheels' way.
         """
         self.settings = settings or FilterSettings()
         self.ids: Ids = np.zeros(0, np.int64)
@@ -63,7 +69,7 @@ class MappingFilter:
         self._camera = camera
         self._pinhole = Pinhole(camera)
         self._wheels = AdaptiveOdometryNoise(
-            WheelNoise(axle, wheel_noise, self.settings.wheel_floor), self.settings
+            WheelNoise(axle, wheel_noise, self.settings.wheel_floor), side_slip, self.settings
         )
         self._gate = pixel_gate(self.settings.gate_probability)
         self._noise = PixelNoise(self.settings.pixel_sigma, self._pinhole.focal, self.settings.adaptation)

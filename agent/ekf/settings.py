@@ -14,7 +14,6 @@ class FilterSettings:
         adaptation: how much of an image's noise beyond what is said is taken over at once, 0 ... 1: a floor
             that is not flat, shaking and blur make all pixels worse than any tracker knows.
         wheel_floor: standard deviation of a wheel's way in a step without any, m.
-        side_slip: standard deviation of the slip aside of a step, as a share of the wheels' way.
         pose_noise: process noise of each step on (x m, y m, heading rad), standard deviations.
         slip_sigmas: wheels that an image refutes by more than this have slipped.
         slip: sigma of (forward m, turn rad) of a step whose wheels the landmarks refute.
@@ -37,7 +36,6 @@ class FilterSettings:
     pixel_sigma: float = 0.7
     adaptation: float = 0.1
     wheel_floor: float = 1e-5
-    side_slip: float = 0.0
     pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     slip_sigmas: float = 4.5
     slip: tuple[float, float] = (0.1, 0.2)
@@ -54,16 +52,3 @@ class FilterSettings:
     converged_share: float = 0.05
     widest_slope: float = 4.0
     nearest: float = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class LocalizationSettings:
-    """How the localization filter believes, gates and judges itself.
-
-    Attributes:
-        wheel_floor: standard deviation of a wheel's way in a step without any, m.
-        side_slip: standard deviation of the slip aside of a step, as a share of the wheels' way.
-    """
-
-    wheel_floor: float = 1e-5
-    side_slip: float = 0.0

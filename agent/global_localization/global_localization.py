@@ -2,7 +2,7 @@
 
 What it looks for is passed in: places of its own map, and of the fleet's if it has a fleet. It is the same
 search for a robot that has to get somewhere (one recognition will do) and for one that is to map on (two
-must agree); see `GlobalLocalizationSettings`.
+must agree); see `SearchPolicy`.
 """
 
 from __future__ import annotations
@@ -12,28 +12,12 @@ from collections.abc import Generator
 
 from mapweave.agent.global_localization.candidates import APART, Candidate, Candidates, FleetMap, OwnMap
 from mapweave.agent.global_localization.pose_consistency import PoseHypothesis, consistent
-from mapweave.agent.global_localization.settings import GlobalLocalizationSettings
+from mapweave.agent.global_localization.search_policy import SearchPolicy
 from mapweave.agent.localization.place_recognition import exact_enough
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Sift
-
-SURE = (0.06, 0.03)
-"""Standard deviations up to which a recognition is believed, m and rad."""
-LENIENCY = 1.0
-"""And after each whole turn in vain this many times `sure` more."""
-LOOKS = 1
-"""Recognitions that must agree, 1 or 2; 2 counts the own map's alone."""
-TURNS = (1, 1)
-"""Whole turns at the first place, and at each further one; one where anything is recognised."""
-PLACES = 0
-"""How many places it looks around at; 0 for no end."""
-CARRIED_PAUSE = 0.5
-"""Seconds between two looks of a robot that somebody else moves."""
-CARRIED_LOOKS = 120
-"""How often such a robot looks in vain before it counts as lost."""
-
 
 STILL = 0.2
 """Seconds that the robot stands still before a look."""
@@ -81,8 +65,8 @@ class GlobalLocalization:
         sift: Sift,
         motion: MotionPrimitives,
         own_map: OwnMap,
+        policy: SearchPolicy,
         fleet: FleetMap | None = None,
-        settings: GlobalLocalizationSettings | None = None,
     ) -> None:
         """Take the means.
 
@@ -91,8 +75,8 @@ class GlobalLocalization:
             sift: finds features.
             motion: moves the robot.
             own_map: what the robot knows itself.
+            policy: how hard it tries, and what it believes.
             fleet: what others know; None for a robot that counts on its own map alone.
-            settings: how hard it tries.
         """
         self.detail = ""
         self._description = description
@@ -100,7 +84,7 @@ class GlobalLocalization:
         self._motion = motion
         self._own = own_map
         self._fleet = fleet
-        self._settings = settings or GlobalLocalizationSettings()
+        self._policy = policy
         self._hypotheses: list[PoseHypothesis] = []
         self._hint: tuple[int, Pose2] | None = None
         self._look_again: Pose2 | None = None
@@ -108,13 +92,13 @@ class GlobalLocalization:
         self._looks = self._views = 0
 
     def search(self, believed: Pose2 | None = None) -> Search:
-        """Look around here, then elsewhere; None if that was in vain at as many places as the settings say.
+        """Look around here, then elsewhere; None if that was in vain at as many places as the policy says.
 
         Args:
             believed: `map_from_robot` in the own map by the wheels, if the robot has only just lost sight of
                 everything: then it looks first where nodes nearby have looked.
         """
-        _s, motion = self._settings, self._motion
+        policy, motion = self._policy, self._motion
         self.detail, self._ambiguous = "looking", ""
         for heading in self._familiar(believed):
             yield from motion.turn(wrap_angle(heading - motion.odom_from_robot.heading), TURN_RATE)
@@ -125,15 +109,15 @@ class GlobalLocalization:
         place, begin = 1, motion.turned
         while True:
             self._looks, self._views, self._hint = 0, 0, None
-            found = yield from self._look_around(TURNS[0] if place == 1 else TURNS[1], begin)
+            found = yield from self._look_around(policy.turns[0] if place == 1 else policy.turns[1], begin)
             if found is not None:
                 return found
             if self._views < LEAST_VIEWS * self._looks:
                 # With a covered lens, or in the dark, there is nothing to be learnt from going elsewhere.
                 continue
-            last = place == PLACES
+            last = place == policy.places
             moved = False if last else (yield from self._move())
-            if last or not (moved or PLACES == 0):
+            if last or not (moved or policy.places == 0):
                 break
             place += 1
         self._give_up(f"at {place} place{'s' if place > 1 else ''}")
@@ -141,12 +125,12 @@ class GlobalLocalization:
 
     def wait(self) -> Search:
         """Look while somebody else moves the robot; None after `carried_looks` views in vain."""
-        while self._views < CARRIED_LOOKS:
+        while self._views < self._policy.carried_looks:
             found = yield from self.look()
             if found is not None:
                 return found
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
-            yield from self._motion.stand(CARRIED_PAUSE)
+            yield from self._motion.stand(self._policy.carried_pause)
         self._give_up(f"in {self._views} images")
         return None
 
@@ -170,7 +154,7 @@ class GlobalLocalization:
         own = self._own.candidates(view, image, features)
         self._take_hint(own)
         self._ambiguous = own.ambiguous or self._ambiguous
-        if LOOKS > 1:
+        if self._policy.looks > 1:
             return self._second_of_two(own)
         told = None if self._fleet is None else (yield from self._fleet.candidates(view))
         return self._single(own, told, leniency)
@@ -179,7 +163,7 @@ class GlobalLocalization:
 
     def _single(self, own: Candidates, told: Candidates | None, leniency: float) -> Candidate | None:
         """The place that one view shows, by the own map and by the fleet's, which must not contradict it."""
-        sure = SURE
+        sure = self._policy.sure
         self.detail = own.reason if told is None else told.reason
         if told is not None and told.ambiguous:
             self._ambiguous = told.ambiguous
@@ -202,20 +186,19 @@ class GlobalLocalization:
 
     def _second_of_two(self, own: Candidates) -> Candidate | None:
         """The place that a view shows if an earlier view of other things agrees with it."""
-        s = self._settings
         if own.ambiguous or not own.places:
             self.detail = own.ambiguous or own.reason
             return None
         best = own.places[0]
-        exact = exact_enough(best.node_from_robot, SURE)
-        if not exact_enough(best.node_from_robot, SURE, VAGUE):
+        exact = exact_enough(best.node_from_robot, self._policy.sure)
+        if not exact_enough(best.node_from_robot, self._policy.sure, VAGUE):
             self.detail = f"node {best.node} is in view, but too far off"
             return None
         self.detail = f"{own.reason}; another view must, too"
         motion = self._motion
         here = self._own.map.nodes[best.node].map_from_robot.mean @ best.node_from_robot.mean
         now = PoseHypothesis(here, motion.odom_from_robot, motion.way, motion.turned, exact)
-        agreeing = [earlier for earlier in self._hypotheses if consistent(earlier, now, s.consistency)]
+        agreeing = [earlier for earlier in self._hypotheses if consistent(earlier, now)]
         self._hypotheses.append(now)
         if exact and agreeing:
             return best
@@ -243,7 +226,7 @@ class GlobalLocalization:
         for _ in range(math.ceil(turns * math.tau / LOOK_TURN)):
             yield from motion.stand(STILL)
             in_vain = (motion.turned - begin) / math.tau
-            found = yield from self.look(1.0 + LENIENCY * in_vain)
+            found = yield from self.look(1.0 + self._policy.leniency * in_vain)
             if found is not None:
                 return found
             if motion.turned - start >= (turns if self._hint is None else 1) * math.tau:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.ekf.localization_filter import LocalizationFilter, LocalizationSettings
+from mapweave.agent.ekf.localization_filter import LocalizationFilter, FilterSettings
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.vision.node_tracks import NodeTracks
 from mapweave.agent.vision.tracker import TrackerSettings
@@ -33,7 +33,7 @@ class NodeLocalizerSettings:
     """
 
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    filter: LocalizationSettings = field(default_factory=LocalizationSettings)
+    filter: FilterSettings = field(default_factory=FilterSettings)
 
 
 class NodeLocalizer:
@@ -138,7 +138,8 @@ class NodeLocalizer:
             node.points_in_robot[landmarks],
             node.landmarks.covariances_in_robot(node.camera, scale_share=scale_share)[landmarks],
             scale_share,
-            settings=replace(self._settings.filter, side_slip=description.side_slip),
+            settings=self._settings.filter,
+            side_slip=description.side_slip,
         )
 
     def _expected(self) -> Array:

@@ -86,8 +86,8 @@ class Tracking:
         self._tracker = Tracker(lens, settings.tracker)
         self._hidden = OccludedTracks(settings.hidden)
         self._unheld = PredictionOffset()
-        own = replace(settings.filter, side_slip=description.side_slip)
-        self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
+        d = description
+        self._filter = MappingFilter(d.camera, d.axle, d.wheel_noise, settings.filter, d.side_slip)
         # Two images are compared by points that live for one step: nothing to hold them to.
         once = replace(settings.tracker, anchored=False)
         self._continuity = KidnapDetector(lens, description.camera, once, settings.continuity)

@@ -14,7 +14,7 @@ from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefineme
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder, TraverseSettings
 from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
 from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
-from mapweave.agent.global_localization.settings import GlobalLocalizationSettings
+from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer, NodeLocalizerSettings
 from mapweave.agent.mission import Answer, Question, WhichWay
@@ -51,7 +51,6 @@ class NavigatorSettings:
     """How the robot navigates.
 
     Attributes:
-        localization: while it is lost.
         localizer: tracking and filtering of the landmarks of the place that it has found.
         follower: along a route.
         detour: between nodes.
@@ -63,7 +62,6 @@ class NavigatorSettings:
         looks: so often in a row; then it is lost.
     """
 
-    localization: GlobalLocalizationSettings = field(default_factory=GlobalLocalizationSettings)
     localizer: NodeLocalizerSettings = field(default_factory=NodeLocalizerSettings)
     follower: RouteFollowerSettings = field(default_factory=RouteFollowerSettings)
     detour: LocalPlannerSettings = field(default_factory=LocalPlannerSettings)
@@ -126,8 +124,8 @@ class Navigator:
         self._detour = LocalPlanner(description, s.detour)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
         self._localization = GlobalLocalization(
-            description, sift, self._motion, OwnMap(own_map, self._rng), FleetMap(self._motion),
-            s.localization,
+            description, sift, self._motion, OwnMap(own_map, self._rng), TO_NAVIGATE,
+            FleetMap(self._motion),
         )  # fmt: skip
         self._blocks = BlockedEdges(s.blocks)
         self._surveyor = TraverseRecorder(description, s.surveyor)
