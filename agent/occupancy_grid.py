@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.observation import RobotDescription
+from mapweave.agent.settings import OccupancyGridSettings
 from mapweave.hybridmap.pose import Array, Pose2
 
 OCCUPANCY_GRID_HIT = 0.9
@@ -19,21 +19,6 @@ MISS = 0.35
 """Log-odds that it loses when a ranger passes through."""
 MOST = 3.0
 """Log-odds are kept within plus and minus this, so that a thing that moved away is forgotten."""
-
-
-@dataclass(frozen=True)
-class OccupancyGridSettings:
-    """The grid.
-
-    Attributes:
-        cell: side of a cell, m.
-        side: side of the whole grid, m; its middle is where the map began.
-        clearance: kept between the footprint's edge and anything seen, m.
-    """
-
-    cell: float = 0.1
-    side: float = 48.0
-    clearance: float = 0.10
 
 
 RAYS = 48

@@ -20,6 +20,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Node
 from mapweave.hybridmap.pose import Array, Pose2
 
+# What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`.
 FARTHEST = 2.5
 """M, between two nodes."""
 WIDEST = math.radians(45.0)
@@ -33,11 +34,6 @@ STOPS = 9
 
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
 """Edges that say that two nodes show the same, and not that anybody drove from one to the other."""
-
-
-@dataclass(frozen=True)
-class ReachabilitySettings:
-    """What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,20 +51,16 @@ class Reachability:
     reason: str
 
 
-def reachability_of(
-    edge: Edge, a: Node, b: Node, settings: ReachabilitySettings | None = None
-) -> Reachability:
+def reachability_of(edge: Edge, a: Node, b: Node) -> Reachability:
     """Say whether the servo could drive an edge, in either direction: what is in view there is so back.
 
     Args:
         edge: between the two.
         a: node at the edge's a.
         b: node at its b.
-        settings: what the servo manages.
     """
     if edge.kind not in RECOGNISED:
         return Reachability(True, -1, f"{edge.kind} by a robot: it can be driven")
-    settings or ReachabilitySettings()
     between = edge.a_from_b.mean
     count = int(least_in_view(left(edge.shared, a, b), a, b, between, STOPS))
     distance, turn = between.distance(Pose2()), abs(between.heading)
@@ -86,7 +78,7 @@ def reachability_of(
     return Reachability(True, count, f"can be driven: {count} landmarks stay in view")
 
 
-def closed_edges(hybrid_map: HybridMap, settings: ReachabilitySettings | None = None) -> set[EdgeId]:
+def closed_edges(hybrid_map: HybridMap) -> set[EdgeId]:
     """Edges of a map that the servo could not drive."""
     nodes = hybrid_map.nodes
     return {
@@ -95,7 +87,7 @@ def closed_edges(hybrid_map: HybridMap, settings: ReachabilitySettings | None = 
         if edge.kind in RECOGNISED
         and edge.a in nodes
         and edge.b in nodes
-        and not reachability_of(edge, nodes[edge.a], nodes[edge.b], settings).drivable
+        and not reachability_of(edge, nodes[edge.a], nodes[edge.b]).drivable
     }
 
 

@@ -9,19 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.node import Edge, EdgeId, Node
-from mapweave.hybridmap.reachability import Reachability, ReachabilitySettings, left, reachability_of
+from mapweave.hybridmap.reachability import Reachability, left, reachability_of
 
 
 class ReachabilityCache:
     """What was found out of edges, from merged map to merged map: an edge is looked at once."""
 
-    def __init__(self, settings: ReachabilitySettings | None = None) -> None:
-        """Start with nothing known.
-
-        Args:
-            settings: what the servo manages.
-        """
-        self._settings = settings or ReachabilitySettings()
+    def __init__(self) -> None:
+        """Start with nothing known."""
         self._known: dict[EdgeId, tuple[tuple[object, ...], Reachability]] = {}
 
     def reach(self, edge: Edge, a: Node, b: Node, gone: Sequence[NDArray[np.bool_] | None]) -> Reachability:
@@ -37,7 +32,7 @@ class ReachabilityCache:
         known = self._known.get(edge.id)
         if known is None or any(one is not other for one, other in zip(known[0], behind, strict=True)):
             seen = replace(edge, shared=left(edge.shared, a, b, gone))
-            known = behind, reachability_of(seen, a, b, self._settings)
+            known = behind, reachability_of(seen, a, b)
             self._known[edge.id] = known
         return known[1]
 

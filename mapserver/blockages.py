@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Collection
-from dataclasses import dataclass
 
 from mapweave.hybridmap.node import NodeId
 
+FORGET = 120.0
+"""After it was said last, s; infinite where only simulated time passes, which no server knows."""
+MOST = 256
+"""So many pairs are kept, those that were said last."""
+
+
 Pair = tuple[NodeId, NodeId]
-
-
-@dataclass(frozen=True)
-class BlockageSettings:
-    """How long what a robot said counts for the others.
-
-    Attributes:
-        forget: after it was said last, s; infinite where only simulated time passes, which no server knows.
-        most: so many pairs are kept, those that were said last.
-    """
-
-    forget: float = 120.0
-    most: int = 256
 
 
 class Blockages:
@@ -31,9 +23,9 @@ class Blockages:
     it is only dear: what stood in one robot's way may have gone, and need not be in another's.
     """
 
-    def __init__(self, settings: BlockageSettings | None = None) -> None:
+    def __init__(self, forget: float = FORGET, most: int = MOST) -> None:
         """Nothing is blocked."""
-        self._settings = settings or BlockageSettings()
+        self._forget, self._most = forget, most
         self._said: dict[Pair, float] = {}
         self._turn = threading.Lock()
 
@@ -49,12 +41,12 @@ class Blockages:
                 pair = (a, b) if a <= b else (b, a)
                 self._said.pop(pair, None)
                 self._said[pair] = now
-            while len(self._said) > self._settings.most:
+            while len(self._said) > self._most:
                 del self._said[next(iter(self._said))]
 
     def known(self, now: float) -> list[Pair]:
         """What still counts at a time of the server's clock, s."""
-        forget = self._settings.forget
+        forget = self._forget
         with self._turn:
             self._said = {pair: said for pair, said in self._said.items() if now - said < forget}
             return list(self._said)

@@ -23,25 +23,18 @@ from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
+EVERY = 2.0
+"""S between two news of one agent, at least."""
+BEAT = 15.0
+"""S after which it is told the number of the last news again, so that lost ones are missed."""
+MOST = 2048
+"""Nodes in one message."""
+
+
 DISTANCE = 0.05
 """A node that lies less far from where its agent was told that it lies is not told anew, m."""
 TURN = math.radians(1.0)
 """And is turned by less, rad."""
-
-
-@dataclass(frozen=True)
-class PoseBroadcastSettings:
-    """What is worth telling, and how often.
-
-    Attributes:
-        every: s between two news of one agent, at least.
-        beat: s after which it is told the number of the last news again, so that lost ones are missed.
-        most: nodes in one message.
-    """
-
-    every: float = 2.0
-    beat: float = 15.0
-    most: int = 2048
 
 
 @dataclass
@@ -61,7 +54,6 @@ class PoseBroadcast:
         bus: Bus,
         keys: Keys,
         name: str,
-        settings: PoseBroadcastSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin to answer.
@@ -70,12 +62,10 @@ class PoseBroadcast:
             bus: the connection; stays the caller's.
             keys: of the fleet.
             name: of the server in the fleet.
-            settings: what is worth telling.
             clock: only grows, s.
         """
         self._clock = clock
         self._bus, self._keys, self._name = bus, keys, name
-        self._settings = settings or PoseBroadcastSettings()
         self._run = secrets.randbits(64)
         self._lock = threading.Lock()
         self._told: dict[str, _Told] = {}
@@ -95,14 +85,14 @@ class PoseBroadcast:
             now: monotonic, s.
         """
         now = self._clock() if now is None else now
-        if now - self._looked < self._settings.every:
+        if now - self._looked < EVERY:
             return
         self._looked = now
         with self._lock:
             if merged.graphs != self._graphs:
                 self._tell_news(merged, now)
             for agent, told in self._told.items():
-                if now - told.last >= self._settings.beat:
+                if now - told.last >= BEAT:
                     self._send(agent, PoseNews(self._run, told.sequence, told.sequence), now)
 
     def _tell_news(self, merged: MergedMap, now: float) -> None:
@@ -125,8 +115,8 @@ class PoseBroadcast:
             told = self._told.setdefault(agent, _Told())
             rest, left = iter(places.items()), iter(lost)
             while True:
-                some = dict(islice(rest, self._settings.most))
-                less = tuple(islice(left, self._settings.most))
+                some = dict(islice(rest, MOST))
+                less = tuple(islice(left, MOST))
                 if not some and not less:
                     break
                 told.sequence += 1
@@ -137,7 +127,7 @@ class PoseBroadcast:
 
     def _moved(self, graphs: Iterable[PoseGraph]) -> Iterator[tuple[NodeId, MergedPose]]:
         """Nodes that lie noticeably elsewhere than where their agents were told that they lie."""
-        _s, nobody = self._settings, _Told()
+        nobody = _Told()
         for graph in graphs:
             for node, (x, y, heading) in zip(graph.nodes, graph.means.tolist(), strict=True):
                 before = self._told.get(node.agent, nobody).places.get(node)

@@ -12,9 +12,9 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.map_files import maps_of
-from mapweave.mapserver.merging.merger import Merger, MergerSettings
-from mapweave.merge.merging import MergeSettings
+from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.codec import encode_body
 
@@ -108,7 +108,7 @@ def merge_parts(
     Raises:
         InvalidValue: a map cannot be merged; nobody must lose it by writing the others.
     """
-    merger = Merger(settings=MergerSettings(merging=settings or MergeSettings()))
+    merger = Merger(settings=settings)
     merger.rule(rulings)
     bodies = [(map_id, body) for map_id, one in sorted(maps.items()) for body in one.contents()]
     for k, (map_id, body) in enumerate(bodies):

@@ -16,6 +16,14 @@ from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import View
 from mapweave.vision.lens import Lens
 
+LEAST_TEXTURE = 1.5
+"""The image's mean squared gradient around a feature, in its weakest direction, (grey/px)^2. On an edge it
+is that of noise alone: such a feature slides along the edge when it is tracked (aperture problem),
+unnoticed by a forward-backward check."""
+LEAST_ROUNDNESS = 0.04
+"""The same in the weakest direction as a share of that in the strongest."""
+
+
 CONTRAST = 0.02
 """SIFT's contrast threshold; lower finds more and weaker features."""
 CELLS = 4
@@ -36,15 +44,9 @@ class SiftSettings:
 
     Attributes:
         most: features kept of one image.
-        least_texture: the image's mean squared gradient around a feature, in its weakest direction,
-            (grey/px)^2. On an edge it is that of noise alone: such a feature slides along the edge when it
-            is tracked (aperture problem), unnoticed by a forward-backward check.
-        least_roundness: the same in the weakest direction as a share of that in the strongest.
     """
 
     most: int = 150
-    least_texture: float = 1.5
-    least_roundness: float = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,7 @@ class Sift:
         strengths = cv2.cornerEigenValsAndVecs(smooth, TEXTURE_BLOCK_PX, ksize=3)[..., :2] / 4.0
         at = np.array([k.pt for k in keypoints]).round().astype(int)
         strong, weak = strengths[at[:, 1], at[:, 0]].T
-        enough = (weak >= self._settings.least_texture) & (weak >= self._settings.least_roundness * strong)
+        enough = (weak >= LEAST_TEXTURE) & (weak >= LEAST_ROUNDNESS * strong)
         return [k for k, good in zip(keypoints, enough.tolist(), strict=True) if good]
 
     def _spread(self, keypoints: list[cv2.KeyPoint], width: int, height: int) -> list[cv2.KeyPoint]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,24 +13,17 @@ from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import snap
 
+SHARE = 0.7
+"""A landmark is known better if its depth's sigma has fallen below this share of what it was."""
+LEAST = 5
+"""A node is told anew if so many of its landmarks are known better: it costs some 3 kB."""
+FLOOR = (0.01, 0.015)
+"""What a depth is never better than: m, and share of the depth; as when it was mapped."""
+
+
 DOUBT = 3.3
 """A depth that is off from the mapped one by more than this many sigma of that is no better one: what was
 followed may be something else."""
-
-
-@dataclass(frozen=True)
-class LandmarkRefinementSettings:
-    """When a node is put anew.
-
-    Attributes:
-        share: a landmark is known better if its depth's sigma has fallen below this share of what it was.
-        least: a node is told anew if so many of its landmarks are known better: it costs some 3 kB.
-        floor: what a depth is never better than: m, and share of the depth; as when it was mapped.
-    """
-
-    share: float = 0.7
-    least: int = 5
-    floor: tuple[float, float] = (0.01, 0.015)
 
 
 class LandmarkRefinement:
@@ -39,10 +32,9 @@ class LandmarkRefinement:
     Each node is put anew once a drive at most: when the robot leaves it, or has arrived.
     """
 
-    def __init__(self, own_map: HybridMap, settings: LandmarkRefinementSettings | None = None) -> None:
+    def __init__(self, own_map: HybridMap) -> None:
         """Take the robot's own map; nodes of others are theirs to mend."""
         self._map = own_map
-        self._settings = settings or LandmarkRefinementSettings()
         self._localizer: NodeLocalizer | None = None
         self._told: set[NodeId] = set()
 
@@ -60,7 +52,7 @@ class LandmarkRefinement:
         node = self._map.nodes.get(localizer.node.id)
         if node is None or node.id in self._told or len(node.landmarks) != len(localizer.node.landmarks):
             return None
-        landmarks = refined(node.landmarks, *localizer.depths(), self._settings)
+        landmarks = refined(node.landmarks, *localizer.depths())
         if landmarks is None:
             return None
         self._told.add(node.id)
@@ -68,9 +60,7 @@ class LandmarkRefinement:
         return replace(node, landmarks=snap(landmarks, node.camera))
 
 
-def refined(
-    mapped: Landmarks, depths: Array, sigmas: Array, s: LandmarkRefinementSettings
-) -> Landmarks | None:
+def refined(mapped: Landmarks, depths: Array, sigmas: Array) -> Landmarks | None:
     """Take over the depths that are known better; None if these are too few to tell.
 
     Args:
@@ -79,11 +69,11 @@ def refined(
         sigmas: (N,) m, of independent errors.
         s: what counts as better.
     """
-    sober = np.hypot(sigmas, s.floor[0] + s.floor[1] * depths)
+    sober = np.hypot(sigmas, FLOOR[0] + FLOOR[1] * depths)
     with np.errstate(invalid="ignore"):
-        better = sober < s.share * mapped.depth_sigmas
+        better = sober < SHARE * mapped.depth_sigmas
         better &= np.abs(depths - mapped.depths) < DOUBT * mapped.depth_sigmas
-    if np.count_nonzero(better) < s.least:
+    if np.count_nonzero(better) < LEAST:
         return None
     new = [np.where(better, one, old).astype(np.float32) for one, old in
            ((depths, mapped.depths), (sober, mapped.depth_sigmas))]  # fmt: skip

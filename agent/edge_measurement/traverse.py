@@ -16,6 +16,13 @@ from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
+FLOOR = (0.005, 0.005)
+"""Error of a settled pose that its covariance does not tell of, m and rad: tracks err alike for a while,
+and the landmarks of a node were mapped by the same wheels."""
+WIDEST = 0.1
+"""A traverse known no better than this is not worth telling, m."""
+
+
 SETTLED = 3
 """Images through which a node's landmarks must have been followed: fewer than lie between two looks for the
 next node."""
@@ -30,20 +37,6 @@ something stands in between."""
 
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
-
-
-@dataclass(frozen=True)
-class TraverseSettings:
-    """When a drive from node to node is a measurement.
-
-    Attributes:
-        floor: error of a settled pose that its covariance does not tell of, m and rad: tracks err alike
-            for a while, and the landmarks of a node were mapped by the same wheels.
-        widest: a traverse known no better than this is not worth telling, m.
-    """
-
-    floor: tuple[float, float] = (0.005, 0.005)
-    widest: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +63,9 @@ class TraverseRecorder:
     that it drove blind for long, nor from where it had to be found anew.
     """
 
-    def __init__(self, description: RobotDescription, settings: TraverseSettings | None = None) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Start with no node passed."""
         self._description = description
-        self._settings = settings or TraverseSettings()
         self._watched: NodeLocalizer | None = None
         self._images = 0
         self._forget()
@@ -139,13 +131,12 @@ class TraverseRecorder:
         self._fewest, self._way = self._in_sight, 0.0
         if start is None or start == self._node:
             return None
-        s = self._settings
         widest = float(np.sqrt(np.linalg.eigvalsh(between.covariance[:2, :2])[-1]))
         straight = DETOUR * between.mean.distance(Pose2()) + 2.0 * REACH
-        return Traverse(start, self._node, between, fewest) if widest < s.widest and way < straight else None
+        return Traverse(start, self._node, between, fewest) if widest < WIDEST and way < straight else None
 
     def _sober(self, pose: PoseGaussian) -> PoseGaussian:
         """A pose of the filter with the uncertainty that the filter cannot know."""
-        xy, heading = self._settings.floor
+        xy, heading = FLOOR
         more: Array = np.diag([xy**2, xy**2, heading**2])
         return PoseGaussian(pose.mean, pose.covariance + more)

@@ -5,25 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from mapweave.agent.ekf.motion import WheelNoise
-from mapweave.agent.ekf.settings import FilterSettings
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Array
+
+SLIP = (0.1, 0.2)
+"""Sigma of (forward m, turn rad) of a step whose wheels the landmarks refute."""
+DISTRUST = 10
+"""For so many steps after that, wheels that claim to stand are not believed."""
 
 
 class AdaptiveOdometryNoise:
     """The wheels' noise, as it is said or as images have shown it to be."""
 
-    def __init__(self, noise: WheelNoise, side_slip: float, settings: FilterSettings) -> None:
+    def __init__(self, noise: WheelNoise, side_slip: float) -> None:
         """Begin with trust.
 
         Args:
             noise: of the wheels, as it is said.
             side_slip: standard deviation of a step's slip aside, as a share of the wheels' way.
-            settings: of the filter.
         """
         self._noise = noise
         self._side_slip = side_slip
-        self._settings = settings
         self._steps_doubted = 0
 
     @property
@@ -37,7 +39,7 @@ class AdaptiveOdometryNoise:
             return self._noise.root(odometry)
         # Slip and lost encoders last for more than one step.
         self._steps_doubted -= 1
-        return self._noise.refuted_root(odometry, 1.0, self._settings.slip[0])
+        return self._noise.refuted_root(odometry, 1.0, SLIP[0])
 
     def side_slip(self, odometry: Odometry) -> float:
         """Standard deviation of a step's slip aside, m."""
@@ -47,12 +49,12 @@ class AdaptiveOdometryNoise:
     def refuted(self, odometry: Odometry, surprise: float) -> Array:
         """The root for a step that its image refutes by so many sigmas; the next are doubted as well."""
         self.doubt()
-        return self._noise.refuted_root(odometry, surprise, self._settings.slip[0])
+        return self._noise.refuted_root(odometry, surprise, SLIP[0])
 
     def slipped(self) -> Array:
         """The root for a step of which the wheels may say anything."""
-        return np.diag(self._settings.slip)
+        return np.diag(SLIP)
 
     def doubt(self) -> None:
         """From now on, for a while."""
-        self._steps_doubted = self._settings.distrust
+        self._steps_doubted = DISTRUST

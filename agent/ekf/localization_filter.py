@@ -14,9 +14,9 @@ from mapweave.agent.ekf.iterated import Measurement, iterated_update
 from mapweave.agent.ekf.landmark_estimates import Ids, NodeLandmarks
 from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState, turning
 from mapweave.agent.ekf.motion import WheelNoise, move_pose
-from mapweave.agent.ekf.settings import FilterSettings
 from mapweave.agent.ekf.update_report import Health, UpdateReport
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian

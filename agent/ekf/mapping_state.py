@@ -12,6 +12,14 @@ from mapweave.agent.ekf.motion import move_pose, move_rays, propagate
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
+PRIOR_DEPTH = 2.5
+"""Depth at which a landmark is expected when nothing is known, m."""
+PRIOR_SPREAD = 1.2
+"""Sigma of the prior inverse depth, in units of 1 / PRIOR_DEPTH: it reaches from 0.3 PRIOR_DEPTH (two
+sigma) to infinity (one sigma)."""
+LEAST_AGREEING = 3
+"""With fewer accepted landmarks than this an update is not healthy."""
+
 
 @dataclass(frozen=True, eq=False)
 class MappingState:

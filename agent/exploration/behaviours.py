@@ -8,10 +8,11 @@ from collections.abc import Generator, Iterator
 import numpy as np
 
 from mapweave.agent.clearance import clearance
-from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.servo.image_drive import ImageDrive, ImageDriveSettings
+from mapweave.agent.servo.image_drive import ImageDrive
+from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 DRIVE = 0.6
@@ -47,7 +48,7 @@ class ExplorationBehaviours:
         self._description = description
         self._mapper = mapper
         self._settings = settings
-        self._drive = ImageDrive(description, ImageDriveSettings(speed=settings.drive_speed))
+        self._drive = ImageDrive(description, settings.drive_speed)
         self._observation: Observation | None = None
 
     def see(self, observation: Observation) -> None:

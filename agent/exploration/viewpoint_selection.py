@@ -7,11 +7,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.exploration.settings import REACH, SPACING, ExplorerSettings
 from mapweave.agent.occupancy_grid import DistanceField, OccupancyGrid
+from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.pose import Array
 
+SPACING = 1.7
+"""Places are at least this far from each other, m."""
+REACH = 7.0
+"""The longest way to a next place, m."""
 SIGHT = 1.6
 """What lies around a place, and what others know around theirs, is judged within this radius, m."""
 VIEW = 3.0

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.localization.node_localizer import NodeLocalizer, NodeLocalizerSettings
+from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.registration.levelling import level
@@ -19,30 +20,14 @@ from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
+EXPECTED = RecognitionSettings(least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0)
+"""Less is asked than of a lost robot, because the pose must also be the expected one."""
 PLAUSIBLE = 0.3
 """A recognition this far from where the robot believes to be is not believed, m."""
 PLAUSIBLE_TURN = 0.25
 """Likewise, rad."""
 MORE = 1.3
 """What is tracked already is given up for a fresh look that finds this many times as many landmarks."""
-
-
-@dataclass(frozen=True)
-class NodeDetectorSettings:
-    """When a node counts as found.
-
-    Attributes:
-        localizer: tracking and filtering of its landmarks from then on.
-        recognition: when it counts as recognised. Less is asked than of a lost robot, because the pose
-            must also be the expected one.
-    """
-
-    localizer: NodeLocalizerSettings = field(default_factory=NodeLocalizerSettings)
-    recognition: RecognitionSettings = field(
-        default_factory=lambda: RecognitionSettings(
-            least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0
-        )
-    )
 
 
 class Expected(NamedTuple):
@@ -71,8 +56,8 @@ class NodeDetector:
         description: RobotDescription,
         lens: Lens,
         sift: Sift,
-        settings: NodeDetectorSettings,
         rng: np.random.Generator,
+        settings: AgentSettings | None = None,
     ) -> None:
         """Take the robot's camera.
 
@@ -80,8 +65,8 @@ class NodeDetector:
             description: of the robot.
             lens: of its camera.
             sift: finds features.
-            settings: when a node counts as found.
             rng: for verification.
+            settings: of the tracks and the filter of a node that was found.
         """
         self._description = description
         self._lens = lens
@@ -99,27 +84,27 @@ class NodeDetector:
         Returns:
             Leg of the first that is found, and what follows its landmarks from this image on; or None.
         """
-        s, features = self._settings, self._sift.extract(image)
+        features = self._sift.extract(image)
         view = features.view(self._description.camera)
         for one in wanted:
-            found = recognise(one.node, view, s.recognition, self._rng)
+            found = recognise(one.node, view, EXPECTED, self._rng)
             if found is None or not self._plausible(found.node_from_robot.mean, one):
                 continue
             if found.inliers > MORE * one.tracked:
-                node, closer = one.node, look_closer(one.node, view, found, s.recognition.pose)
+                node, closer = one.node, look_closer(one.node, view, found, EXPECTED.pose)
                 if node.landmarks.scale_share:
                     levelled = level(node, view, found)
                     if self._plausible(levelled.node_from_robot.mean, one):
                         node, closer = levelled.node, levelled.node_from_robot
                 found = replace(found, node_from_robot=closer)
                 return one.leg, NodeLocalizer(
-                    self._description, self._lens, node, image, features, found, s.localizer
+                    self._description, self._lens, node, image, features, found, self._settings
                 )
         return None
 
     def _plausible(self, found: Pose2, expected: Expected) -> bool:
         """Whether the robot may be there, by what it believes."""
-        _s, believed = self._settings, expected.node_from_robot
+        believed = expected.node_from_robot
         turned = abs(wrap_angle(found.heading - believed.heading))
         return (
             found.distance(believed) <= PLAUSIBLE * expected.doubt

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,17 +59,6 @@ TURN_ONLY = 0.15
 """m; between two views nearer than this the robot has turned on the spot rather than driven."""
 
 
-@dataclass(frozen=True)
-class KeyframeBuilderSettings:
-    """How nodes and edges are made.
-
-    Attributes:
-        selection: what a node may cost on the wire, and which landmarks it keeps if they cost more.
-    """
-
-    selection: SelectionSettings = field(default_factory=SelectionSettings)
-
-
 class KeyframeBuilder:
     """Makes the nodes and edges of one map.
 
@@ -82,7 +71,7 @@ class KeyframeBuilder:
         self,
         map_id: MapId,
         description: RobotDescription,
-        settings: KeyframeBuilderSettings,
+        selection: SelectionSettings,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
     ) -> None:
@@ -91,7 +80,7 @@ class KeyframeBuilder:
         Args:
             map_id: of the map.
             description: of the robot.
-            settings: how.
+            selection: which landmarks a node keeps.
             contents: of a map that was begun.
             next_number: the first that no node or edge has ever had.
         """
@@ -100,7 +89,7 @@ class KeyframeBuilder:
         self._map_id = map_id
         self._description = description
         self._camera = description.camera
-        self._settings = settings
+        self._selection = selection
         self._last: AnchoredKeyframe | None = None
         self._next_number = next_number
         self._new: list[ChangeBody] = []
@@ -204,7 +193,7 @@ class KeyframeBuilder:
 
     def _landmarks(self, view: View, tracking: Tracking) -> tuple[Landmarks, NDArray[np.int64]]:
         """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""
-        s, camera = self._settings, self._camera
+        camera = self._camera
         depths, sigmas = np.full(len(view.tracks), np.nan), np.full(len(view.tracks), np.nan)
         poses, pixels = tracking.history.sightings(view.tracks)
         if len(poses) >= 2 and len(view.tracks):
@@ -232,7 +221,7 @@ class KeyframeBuilder:
         )  # fmt: skip
         seen = np.isfinite(pixels[:, good, 0]).mean(axis=0) if len(poses) else np.ones(len(good))
         likely = worth(seen, good / max(len(view.tracks), 1))
-        kept = choose(landmarks, likely, camera, s.selection)[:MOST_LANDMARKS]
+        kept = choose(landmarks, likely, camera, self._selection)[:MOST_LANDMARKS]
         # Rounded now, the robot works with the same numbers as everybody who gets the node.
         landmarks, order = settle(landmarks.take(kept), camera)
         return landmarks, view.tracks[good[kept[order]]]
@@ -267,7 +256,7 @@ class KeyframeBuilder:
 
     def _close_loops(self, node: Node) -> list[Edge]:
         """Recognise places of the own map (paper, section 5): each gives a new edge."""
-        _s, near = self._settings, []
+        near = []
         for other in self.map.nodes.values():
             between = other.map_from_robot.mean.inverse() @ node.map_from_robot.mean
             reach = float(np.hypot(between.x, between.y))

@@ -9,14 +9,14 @@ elsewhere it was at most 8 %, or 30 % where the same wall was still ahead.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import Enum, auto
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
@@ -72,22 +72,14 @@ class FrameOverlap(Enum):
     """Nothing, where there should be something: it is dark, the lens is covered, or the camera dazzled."""
 
 
-@dataclass(frozen=True)
-class KidnapDetectorSettings:
-    """When an image does not continue another."""
-
-
 class KidnapDetector:
     """Compares two images by the points that are tracked, or by corners where these are too few."""
 
-    def __init__(
-        self, lens: Lens, camera: Camera, tracker: TrackerSettings, settings: KidnapDetectorSettings
-    ) -> None:
+    def __init__(self, lens: Lens, camera: Camera, tracker: TrackerSettings) -> None:
         """Take the camera and how its points are tracked."""
         self._lens = lens
         self._camera = camera
         self._tracker = tracker
-        self._settings = settings
 
     def compare(
         self,
@@ -134,7 +126,7 @@ class KidnapDetector:
 
     def _alike(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool:
         """Whether the images are the same by and large, where smooth shapes leave little to be tracked."""
-        _s, (height, width) = self._settings, before.shape
+        height, width = before.shape
         aside = round(self._camera.fx * math.tan(turn))
         if abs(aside) > width // 2:
             return False

@@ -8,7 +8,6 @@ somebody may carry a box through the view, which then seems to stand still while
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2, wrap_angle
@@ -19,17 +18,11 @@ SHARE = 0.1
 """... and, besides, as a share of the way and of the turns: no wheel is quite round."""
 
 
-@dataclass(frozen=True)
-class OdometryConsistencySettings:
-    """When wheels and image contradict each other."""
-
-
 class OdometryConsistency:
     """Reckons by the wheels alone, beside the filter."""
 
-    def __init__(self, settings: OdometryConsistencySettings) -> None:
+    def __init__(self) -> None:
         """The two agree."""
-        self._settings = settings
         self.settle()
 
     def settle(self) -> None:

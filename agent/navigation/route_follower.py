@@ -13,18 +13,20 @@ from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.progress_monitor import ProgressMonitor
-from mapweave.agent.navigation.route_follower_settings import NEAR, RouteFollowerSettings
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.odometry_drive import OdometryDrive
 from mapweave.agent.servo.proximity import ranger_points
 from mapweave.agent.servo.servo_step import State
 from mapweave.agent.servo.supervisor import Servo
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from mapweave.hybridmap.query import RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
+NEAR = 0.35
+"""Within this distance of the goal the last, blind turns are made if it is not in sight, m."""
 PASSED = 0.22
 """An intermediate node is passed within this distance, m."""
 SIGHT_TURN = 0.6
@@ -84,7 +86,7 @@ class RouteFollower:
         route: tuple[RouteLeg, ...],
         fix: Fix,
         detour: LocalPlanner,
-        settings: RouteFollowerSettings,
+        settings: AgentSettings,
         rng: np.random.Generator,
     ) -> None:
         """Start on a route.
@@ -103,13 +105,13 @@ class RouteFollower:
         self.detail = ""
         self.fix = fix
         self._description = description
-        self._lookout = NodeDetector(description, lens, sift, settings.lookout, rng)
+        self._lookout = NodeDetector(description, lens, sift, rng, settings)
         self._route = route
         self._start_from_leg = [Pose2()]
         for hop in route[1:]:
             self._start_from_leg.append(self._start_from_leg[-1] @ hop.previous_from_node.mean)
         self._detour = detour
-        self._settings = settings
+        self._settings = settings.navigation
         self._servo = Servo(description)
         self._servoing = -1
         self._blind_drive = OdometryDrive(description)
@@ -160,7 +162,7 @@ class RouteFollower:
         self.detail = f"{distance:.2f} m to node {node}, {self._last - self.leg} further"
         parking = self.leg == self._last
         self.progress = RouteProgress.DRIVING
-        if self.fix.blind > s.blind and not (parking and distance < NEAR):
+        if self.fix.blind > s.blind_distance and not (parking and distance < NEAR):
             self.progress = RouteProgress.UNSURE
             return Command()
         self._progressed.take(distance, self._description.tick)
@@ -214,7 +216,7 @@ class RouteFollower:
 
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
         """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
-        _s, tick = self._settings, self._description.tick
+        tick = self._description.tick
         self._servo_barred = max(self._servo_barred - tick, 0.0)
         if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):
             return False

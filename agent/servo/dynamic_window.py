@@ -7,7 +7,6 @@ tried against accelerations, as the robot is slow and its stopping distance is c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,17 +32,11 @@ BACKWARD = 0.08
 """M, what it costs to drive back: the rangers see as well there, the camera does not."""
 
 
-@dataclass(frozen=True)
-class DynamicWindowSettings:
-    """How arcs are chosen."""
-
-
 class DynamicWindow:
     """The fan of arcs of one robot."""
 
-    def __init__(self, description: RobotDescription, settings: DynamicWindowSettings | None = None) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Prepare for a robot's footprint."""
-        self._settings = settings or DynamicWindowSettings()
         self._radius = description.radius
 
     def toward(self, ahead: Array, points: Array, speed: float, rate: float) -> Command:

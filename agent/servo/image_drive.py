@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,23 +33,17 @@ CONE = 0.9
 """Rad, rangers within this of the direction of travel matter."""
 
 
-@dataclass(frozen=True, slots=True)
-class ImageDriveSettings:
-    """Settings of the exploration drive.
-
-    Attributes:
-        speed: m/s.
-    """
-
-    speed: float = 0.2
-
-
 class ImageDrive:
     """Drives a way forth and back again, steered by the features' bearings alone."""
 
-    def __init__(self, description: RobotDescription, settings: ImageDriveSettings | None = None) -> None:
-        """Prepare for a robot; `start` must come before each drive."""
-        self.settings = settings or ImageDriveSettings()
+    def __init__(self, description: RobotDescription, speed: float = 0.2) -> None:
+        """Prepare for a robot; `start` must come before each drive.
+
+        Args:
+            description: of the robot.
+            speed: m/s.
+        """
+        self._wanted = speed
         self._description = description
         self._rangers = np.asarray(description.ranger_bearings, dtype=np.float64)
         self.start(0.0)
@@ -99,12 +92,11 @@ class ImageDrive:
 
     def _speed(self, travelled: float, free: float) -> float:
         """m/s: ramps at both ends of the way, slower toward obstacles."""
-        settings = self.settings
         ends = (0.0, self._distance) if self._outward else (self._turned_at, 0.0)
         way = min(abs(travelled - ends[0]), abs(travelled - ends[1]))
         ramp = math.sqrt(2.0 * ACCELERATION * max(way, 0.0))
         share = clip(max(free - STOP, 0.0) / (SLOW - STOP), 1.0)
-        top = min(settings.speed, self._description.max_forward)
+        top = min(self._wanted, self._description.max_forward)
         return max(min(ramp, top), min(0.03, top)) * max(share, 0.15)
 
     def _turn(

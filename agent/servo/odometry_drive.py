@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,20 +32,14 @@ PATIENCE_TICKS = 20
 """How long an obstacle in the way is waited for before the drive is stuck."""
 
 
-@dataclass(frozen=True, slots=True)
-class OdometryDriveSettings:
-    """Settings of the blind drive."""
-
-
 class OdometryDrive:
     """Turn, drive, turn. For edges whose far end is not in view, such as turns on the spot.
 
     The pose it is given comes from odometry or a filter; it is corrected whenever that is.
     """
 
-    def __init__(self, description: RobotDescription, settings: OdometryDriveSettings | None = None) -> None:
+    def __init__(self, description: RobotDescription) -> None:
         """Prepare for a robot; `start` must come before each drive."""
-        self.settings = settings or OdometryDriveSettings()
         self._description = description
         self._max_forward = max(description.max_forward, 1e-3) * CRUISE
         self._max_turn = max(description.max_turn, 1e-3) * CRUISE
@@ -71,7 +64,7 @@ class OdometryDrive:
             goal_from_robot: where the robot is now, in the goal's robot frame.
             obstacles: (K, 2) m, in robot, points that the rangers hit now.
         """
-        _settings, pose = self.settings, goal_from_robot
+        pose = goal_from_robot
         rho = math.hypot(pose.x, pose.y)
         heading = wrap_angle(pose.heading)
         reach = POSITION_TOLERANCE * (2.0 if self._at_goal else 1.0)

@@ -35,7 +35,7 @@ RIDGE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class TemplateSettings:
+class TemplateCriteria:
     """How tracks are held to the patches in which they were first seen.
 
     Attributes:
@@ -105,9 +105,9 @@ class Match:
 class TemplateMatcher:
     """Cuts patches and finds them again, moved, grown and lit differently."""
 
-    def __init__(self, settings: TemplateSettings | None = None) -> None:
+    def __init__(self, settings: TemplateCriteria | None = None) -> None:
         """Lay out the patch."""
-        self._settings = settings or TemplateSettings()
+        self._settings = settings or TemplateCriteria()
         side = np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32)
         self._spots = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
         weights = np.exp(-(self._spots**2).sum(axis=1) / (2 * SIGMA_PX**2))

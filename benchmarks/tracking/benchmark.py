@@ -33,7 +33,8 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.tracking.scenes import Drive, drives
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift

@@ -41,7 +41,7 @@ class SupersededNodes:
             node: has just come.
             before: pairs that it was in, if it was known already.
         """
-        found, _s = self._index.overlaps(node, self._node_of), self._index.settings.candidates
+        found = self._index.overlaps(node, self._node_of)
         for other_id in {one for pair in before for one in pair} & self._left_out:
             other = self._node_of(other_id)
             if other is not None and other_id != node.id:

@@ -42,11 +42,6 @@ COMPARABLE = 0.6
 
 
 @dataclass(frozen=True)
-class PhotographSettings:
-    """How questions are asked."""
-
-
-@dataclass(frozen=True)
 class Reference:
     """Which places show what a question shows, by the numbers of their images: from `low` to `high`."""
 
@@ -140,13 +135,10 @@ def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], com
 class AppearanceMap:
     """Places by their looks alone."""
 
-    def __init__(
-        self, camera: Camera, distortion: tuple[float, ...], settings: PhotographSettings | None = None
-    ):
+    def __init__(self, camera: Camera, distortion: tuple[float, ...]):
         """Begin with none, for a camera and its lens."""
         self._camera = camera
         self._sift = Sift(Lens(camera, distortion))  # type: ignore[arg-type]
-        self._settings = settings or PhotographSettings()
         self._index = PlaceIndex()
         self._nodes: dict[int, Node] = {}
 

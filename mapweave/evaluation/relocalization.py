@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import track
 
 from mapweave.agent.drivers.replay import Replay, images_of, read_camera
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.drive import DriveMap, Truth
 from mapweave.evaluation.photographs import AppearanceMap, Photographs
 from mapweave.evaluation.splits import robots_of
@@ -61,7 +61,7 @@ def evaluate_relocalization(
     folder: Path,
     camera_file: Path | None,
     focal_px: float | None,
-    settings: PipelineSettings,
+    settings: AgentSettings,
     console: Console,
 ) -> RelocalizationEvaluation:
     """Map from one pass, ask from the others.
@@ -90,7 +90,7 @@ def evaluate_relocalization(
     )
 
 
-def _examine_drive(folder: Path, settings: PipelineSettings, console: Console) -> RelocalizationEvaluation:
+def _examine_drive(folder: Path, settings: AgentSettings, console: Console) -> RelocalizationEvaluation:
     names = robots_of(folder / "splits.toml")
     if len(names) < 2:
         raise DeviceError(

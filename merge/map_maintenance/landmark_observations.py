@@ -38,11 +38,6 @@ ALIKE = 0.3
 in a hundred is, in a whole image."""
 
 
-@dataclass(frozen=True)
-class LandmarkObservationSettings:
-    """When a landmark should be seen, and when it is."""
-
-
 @dataclass(frozen=True, eq=False)
 class LandmarkObservations:
     """What one later view tells of a node's landmarks.
@@ -66,9 +61,7 @@ class LandmarkObservations:
     sure: bool = True
 
     @staticmethod
-    def of(
-        node: Node, view: Node, link: Link | None, node_from_view: Pose2, s: LandmarkObservationSettings
-    ) -> LandmarkObservations:
+    def of(node: Node, view: Node, link: Link | None, node_from_view: Pose2) -> LandmarkObservations:
         """Look for a node's landmarks in a view.
 
         Args:
@@ -76,9 +69,8 @@ class LandmarkObservations:
             view: of its place.
             link: between the two, if there is one.
             node_from_view: how they stand.
-            s: when a landmark should be seen, and when it is.
         """
-        shown = expected(node, view, node_from_view, s)
+        shown = expected(node, view, node_from_view)
         found = np.zeros(len(node.landmarks), np.bool_)
         if link is not None:
             found[link.shared[:, 0 if link.a == node.id else 1]] = True
@@ -93,14 +85,13 @@ class LandmarkObservations:
         return LandmarkObservations(node, view, link, node_from_view, shown, found)
 
 
-def expected(old: Node, new: Node, old_from_new: Pose2, s: LandmarkObservationSettings) -> NDArray[np.bool_]:
+def expected(old: Node, new: Node, old_from_new: Pose2) -> NDArray[np.bool_]:
     """(N,) which landmarks of a node another view should show.
 
     Args:
         old: the node.
         new: the view.
         old_from_new: how they stand.
-        s: when a landmark should be seen.
     """
     there = ProjectedView.of(old, new, old_from_new, MARGIN_PX, SCALE, ASIDE)
     shown, candidates = there.fits, np.flatnonzero(there.fits)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +32,17 @@ from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.changed_nodes import ChangedNodes
-from mapweave.merge.map_maintenance.landmark_observations import (
-    LandmarkObservations,
-    LandmarkObservationSettings,
-)
+from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations
 from mapweave.merge.map_maintenance.node_age import is_older
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+USUAL = 0.1
+"""Share of what it should show that a view finds, as far as it tells nothing better."""
+MOVED = 0.05
+"""M, by which two nodes may move to each other before their views are compared anew."""
+
 
 RATES = (0.1, 0.9)
 """Within which the share is held that a view finds of what it should show."""
@@ -76,38 +79,21 @@ AGAIN = 120.0
 SECOND = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class LandmarkRemovalSettings:
-    """When a landmark has faded.
-
-    Attributes:
-        looks: when it should be seen, and when it is.
-        usual: share of what it should show that a view finds, as far as it tells nothing better,
-        moved: m, by which two nodes may move to each other before their views are compared anew.
-    """
-
-    looks: LandmarkObservationSettings = field(default_factory=LandmarkObservationSettings)
-    usual: float = 0.1
-    moved: float = 0.05
-
-
 class LandmarkRemover:
     """Goes from merged map to merged map with what later views tell: each is compared once."""
 
-    def __init__(self, settings: LandmarkRemovalSettings | None = None) -> None:
+    def __init__(self) -> None:
         """Begin with nothing seen again.
 
         Args:
             settings: when a landmark has faded.
         """
-        self._settings = settings or LandmarkRemovalSettings()
-        s = self._settings
         self._looks: dict[NodeId, list[LandmarkObservations]] = {}
         self._faded: dict[NodeId, NDArray[np.bool_]] = {}
         self._graphs: tuple[PoseGraph, ...] = ()
         self._links = Adjacency()
         # Two nodes have drifted by a part of what matters each, since one of them was looked at and before.
-        self._drift = ChangedNodes(s.moved / 8.0, s.moved / (4.0 * NEAR))
+        self._drift = ChangedNodes(MOVED / 8.0, MOVED / (4.0 * NEAR))
 
     def fade(self, merged: MergedMap) -> MergedMap:
         """The same map with the landmarks that have faded, of nodes that no others stand for.
@@ -129,7 +115,7 @@ class LandmarkRemover:
 
     def _fade(self, merged: MergedMap, graph: PoseGraph) -> None:
         nodes = [merged.maps[node.map].nodes[node] for node in graph.nodes]
-        tree, s = cKDTree(graph.means[:, :2]), self._settings
+        tree = cKDTree(graph.means[:, :2])
         for row in self._affected(graph, nodes, tree, merged.superseded):
             node = nodes[row]
             linked = {link.b if link.a == node.id else link.a: link for link in self._links.at(node.id)}
@@ -139,7 +125,7 @@ class LandmarkRemover:
             self._looks[node.id] = looks = self._seen(merged, graph, node, views, linked)
             if before is not None and list(map(id, before)) == list(map(id, looks)):
                 continue
-            gone = presence(things(node, THING), [one for one in looks if tells(one, s)], s) < FAINT
+            gone = presence(things(node, THING), [one for one in looks if tells(one)]) < FAINT
             self._faded.pop(node.id, None)
             if gone.any():
                 self._faded[node.id] = gone
@@ -188,7 +174,6 @@ class LandmarkRemover:
         self, merged: MergedMap, graph: PoseGraph, node: Node, views: list[Node], linked: dict[NodeId, Link]
     ) -> list[LandmarkObservations]:
         """What the views tell; what they told before holds while they stand to the node as they did."""
-        s = self._settings
         before = {id(look.view): look for look in self._looks.get(node.id, ())}
         looks: list[LandmarkObservations] = []
         doubted: list[int] = []
@@ -196,7 +181,7 @@ class LandmarkRemover:
             between = merged.pose(node.id).inverse() @ merged.pose(view.id)
             link, look = linked.get(view.id), before.get(id(view))
             if look is None or look.node is not node or look.link is not link or self._off(look, between):
-                look = LandmarkObservations.of(node, view, link, between, s.looks)
+                look = LandmarkObservations.of(node, view, link, between)
                 if link is None and look.expected.sum() >= LEAST_SHOWN:
                     doubted.append(len(looks))
             looks.append(look)
@@ -209,10 +194,10 @@ class LandmarkRemover:
 
     def _off(self, look: LandmarkObservations, between: Pose2) -> bool:
         off = look.between.inverse() @ between
-        return max(off.distance(Pose2()), abs(off.heading)) >= self._settings.moved
+        return max(off.distance(Pose2()), abs(off.heading)) >= MOVED
 
 
-def tells(look: LandmarkObservations, s: LandmarkRemovalSettings) -> bool:
+def tells(look: LandmarkObservations) -> bool:
     """Whether a view tells anything: it should show enough, and stands where it is thought to."""
     return int(look.expected.sum()) >= LEAST_SHOWN and look.sure
 
@@ -229,15 +214,12 @@ def things(node: Node, size: float) -> NDArray[np.bool_]:
     return near
 
 
-def presence(
-    together: NDArray[np.bool_], looks: Sequence[LandmarkObservations], s: LandmarkRemovalSettings
-) -> Array:
+def presence(together: NDArray[np.bool_], looks: Sequence[LandmarkObservations]) -> Array:
     """(N,) probability that each landmark of a node is still there after some views.
 
     Args:
         together: (N, N) which of them may be of one thing, see `things`.
         looks: later views of it that tell something, the earliest first.
-        s: how landmarks come and go.
     """
     there = np.full(len(together), AT_FIRST)
     for visit in visits(looks, AGAIN):
@@ -246,7 +228,7 @@ def presence(
         told = np.zeros(len(together), np.bool_)
         for look in visit:
             again = look.found & look.expected
-            rate = found_again(together, look, s)
+            rate = found_again(together, look)
             # One that is found is there, whatever is around it; one that is not is judged with its thing.
             seen = np.where(look.found, 1, together @ again.astype(np.int64))
             missed = np.where(look.found, 0, together @ (look.expected & ~look.found).astype(np.int64))
@@ -278,7 +260,7 @@ def visits(looks: Sequence[LandmarkObservations], again: float) -> list[list[Lan
     return found
 
 
-def found_again(together: NDArray[np.bool_], look: LandmarkObservations, s: LandmarkRemovalSettings) -> float:
+def found_again(together: NDArray[np.bool_], look: LandmarkObservations) -> float:
     """How often a view finds a landmark that it should show and that is there.
 
     That is measured where it finds something else of the same thing, as far as there is enough of it: so what
@@ -287,10 +269,9 @@ def found_again(together: NDArray[np.bool_], look: LandmarkObservations, s: Land
     Args:
         together: (N, N) which landmarks may be of one thing.
         look: what the view shows.
-        s: within which bounds.
     """
     again = look.found & look.expected
     others: NDArray[np.int64] = together @ again.astype(np.int64) - again
     firm = look.expected & (others > 0)
-    rate = ((again & firm).sum() + s.usual * WEIGHT) / (firm.sum() + WEIGHT)
+    rate = ((again & firm).sum() + USUAL * WEIGHT) / (firm.sum() + WEIGHT)
     return float(np.clip(rate, *RATES))

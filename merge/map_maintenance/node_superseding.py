@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.hybridmap.reachability import FARTHEST, STOPS, WIDEST, ReachabilitySettings, least_in_view
+from mapweave.hybridmap.reachability import FARTHEST, STOPS, WIDEST, least_in_view
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.merge.map_maintenance.adjacency import Adjacency
@@ -32,7 +32,14 @@ from mapweave.merge.map_maintenance.traversability import ForeignEdges, Traversa
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
-from mapweave.merge.pose_graph.verification import VerificationSettings
+
+FOUND = 20
+"""Landmarks that both show and that stay in view between them."""
+DETOUR = 1.5
+"""M, by which a way between neighbours may become longer."""
+NEAR = 0.5
+"""M, nodes nearer than this to each other stand in one place, as for routes."""
+
 
 DEPTHS = 0.7
 """It knows at least this share of the number of depths that the other one knows."""
@@ -49,41 +56,19 @@ FLOOR = (0.05, 0.05, 0.03)
 SECOND = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class NodeSupersedingSettings:
-    """When a node stands for another one.
-
-    Attributes:
-        reach: the servo's basin: from the one node's place it brings a robot to the one that stands for it.
-        found: landmarks that both show and that stay in view between them.
-        detour: m, by which a way between neighbours may become longer.
-        near: m, nodes nearer than this to each other stand in one place, as for routes.
-    """
-
-    reach: ReachabilitySettings = field(default_factory=ReachabilitySettings)
-    found: int = 20
-    detour: float = 1.5
-    near: float = 0.5
-
-
 class NodeSuperseder:
     """Goes from merged map to merged map with what was superseded: only what is new is looked at."""
 
     def __init__(
         self,
-        settings: NodeSupersedingSettings | None = None,
-        verification: VerificationSettings | None = None,
         reaches: ReachabilityCache | None = None,
     ) -> None:
         """Begin with nothing superseded.
 
         Args:
-            settings: when a node is.
-            verification: as in the merge.
             reaches: what is known of edges; it is written to.
         """
-        self._settings = settings or NodeSupersedingSettings()
-        self._comparisons = Comparisons(verification)
+        self._comparisons = Comparisons()
         self._reaches = reaches or ReachabilityCache()
         self._fates: dict[NodeId, Superseded] = {}
         self._seen: dict[NodeId, Node] = {}
@@ -109,10 +94,9 @@ class NodeSuperseder:
                 del self._fates[node]
                 fresh |= {node} & nodes.keys()
         if nodes:
-            s = self._settings
             foreign = self._foreign.of(merged.maps)
-            passages = Traversability(merged, self._links, self._reaches, s.near, foreign, self._fates)
-            this = _Round(merged, nodes, self._links, self._fates, self._firm, passages, self._comparisons, s)
+            passages = Traversability(merged, self._links, self._reaches, NEAR, foreign, self._fates)
+            this = _Round(merged, nodes, self._links, self._fates, self._firm, passages, self._comparisons)
             this.look_at(fresh | this.revive())
         return replace(merged, superseded=dict(sorted(self._fates.items())))
 
@@ -148,10 +132,8 @@ class _Round:
         firm: dict[NodeId, NodeId],
         passages: Traversability,
         comparisons: Comparisons,
-        settings: NodeSupersedingSettings,
     ) -> None:
         self._merged, self._nodes, self._fates, self._firm = merged, nodes, fates, firm
-        self._settings = settings
         self._comparisons = comparisons
         self._links = links
         self._refused = {refusal.pair for refusal in merged.refused if refusal.edge is None}
@@ -219,7 +201,7 @@ class _Round:
                 return
             heirs[orphan] = heir
         fate = self._heir(node, node)
-        if fate is None or not self._passages.spare(node, fate.by, self._settings.detour):
+        if fate is None or not self._passages.spare(node, fate.by, DETOUR):
             return
         self._passages.remove(node)
         self._stands_for.pop(node, None)
@@ -252,7 +234,7 @@ class _Round:
 
     def _covers(self, one: NodeId, other: NodeId, between: Pose2) -> Superseded | None:
         """Whether the other one, which is within the basin, can stand for the one."""
-        s, a, b = self._settings, self._nodes[one], self._nodes[other]
+        a, b = self._nodes[one], self._nodes[other]
         if self._one_visit(a, b):
             return None
         if b.landmarks.has_depth.sum() < min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH):
@@ -262,16 +244,16 @@ class _Round:
             return None
         link = link if link.a == one else link.turned()
         found = least_in_view(link.shared, a, b, between, STOPS)
-        if found < s.found:
+        if found < FOUND:
             return None
         return Superseded(other, found, between.distance(Pose2()), abs(between.heading))
 
     def _compare(self, a: Node, b: Node) -> Link | None:
         """A link between two nodes that the merge had no need to compare; one that it refused is none."""
-        s, pair = self._settings, _ordered(a.id, b.id)
+        pair = _ordered(a.id, b.id)
         if pair in self._refused:
             return None
-        verdict = self._comparisons.link(a, b, s.found)
+        verdict = self._comparisons.link(a, b, FOUND)
         if verdict is None:
             return None
         off = (verdict.a_from_b.mean.inverse() @ self._between(*verdict.pair)).vector

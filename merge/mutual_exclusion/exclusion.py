@@ -28,12 +28,12 @@ from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.encounter import Encounter
 from mapweave.merge.mutual_exclusion.mutual_visibility import errors_in_common, none_wrong, odds_against
-from mapweave.merge.mutual_exclusion.negative_evidence import negative_evidence
+from mapweave.merge.mutual_exclusion.negative_evidence import MOST, negative_evidence
 from mapweave.merge.mutual_exclusion.quadrature import DRAWS, quadrature_points
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectory, Stay, stay
 from mapweave.merge.mutual_exclusion.visibility_intervals import visibility_intervals
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ExclusionSettings
 
 SIGMAS = 2.0
 """The poses of the two are first moved apart by as many standard deviations, since what is wrong with them
@@ -63,7 +63,7 @@ def clash_of(
     # Covariances cost more than all the rest, and views more than the sensors: they are asked for only if the
     # poses as they are clash, as far as that could be enough.
     meeting, clear, odds, still = met.meeting, met.clear, met.odds, np.ones(1)
-    if not meeting.refuses(clear, odds, still, s, math.log(s.absence.most)):
+    if not meeting.refuses(clear, odds, still, s, math.log(MOST)):
         return None
     # Nor for all looks, where the first of them are ample.
     ample = meeting.ample(clear, odds, s)
@@ -73,20 +73,20 @@ def clash_of(
     clear = chances_clear(met.apart, shift, met.spreads, least_apart)
     for some in sorted({ample, len(meeting.times)}):
         part = replace(meeting, seen=meeting.seen.take(meeting.seen.moments < some))
-        errors = errors_in_common(graph, part.seen, s.sight) if len(part.seen) else none_wrong(part.seen)
-        moved = odds_against(part.seen, errors, least_apart, s.sight)
+        errors = errors_in_common(graph, part.seen) if len(part.seen) else none_wrong(part.seen)
+        moved = odds_against(part.seen, errors, least_apart)
         if part.refuses(clear, moved, errors.weights, s):
             evidence = sum(part.evidence(clear, moved, errors.weights, s))
             return _clash(graph, (first, second), meeting, odds[0] if sight > bodies else None, evidence)
-    if not part.refuses(clear, moved, errors.weights, s, math.log(s.absence.most)):
+    if not part.refuses(clear, moved, errors.weights, s, math.log(MOST)):
         return None
-    views = negative_evidence(graph, first, second, s.absence)
-    absent = views.evidence(s.absence)
+    views = negative_evidence(graph, first, second)
+    absent = views.evidence()
     if not part.refuses(clear, moved, errors.weights, s, absent):
         return None
     evidence = sum(part.evidence(clear, moved, errors.weights, s)) + absent
     clash = _clash(graph, (first, second), meeting, odds[0] if sight > bodies else None, evidence)
-    return replace(clash, blank=int(views.show_nothing(s.absence).sum()))
+    return replace(clash, blank=int(views.show_nothing().sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def _met(
     grid = np.arange(math.ceil(start / STEP), math.floor(end / STEP) + 1) * STEP
     times = np.unique(np.concatenate([first.times, second.times, grid]))
     times = times[(times >= start) & (times <= end)]
-    one, two = (stay(trail, trail.poses(graph)[:, :2], times, s.trail) for trail in (first, second))
+    one, two = (stay(trail, trail.poses(graph)[:, :2], times) for trail in (first, second))
     told = first.radius > 0.0 and second.radius > 0.0
     least_apart = first.radius + second.radius if told else s.least_apart
     known = one.known & two.known
@@ -136,7 +136,7 @@ def _met(
         return None
     spreads = (one.spreads + two.spreads)[close]
     clear = chances_clear(apart[close], np.zeros(len(close)), spreads, least_apart)
-    odds = odds_against(seen, none_wrong(seen), least_apart, s.sight)
+    odds = odds_against(seen, none_wrong(seen), least_apart)
     meeting = Encounter(times, known, distances, close, seen, least_apart)
     return _Met(meeting, apart[close], spreads, clear, odds, one, two)
 

@@ -41,6 +41,13 @@ from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
+CORE = 0.8
+"""A ray surely meets a robot if it comes as near to its middle as this share of its radius: few robots are
+round, but a square hides this much to four of five sides."""
+FLOOR_XY = 0.03
+"""Error of how the two maps lie to each other that no covariance tells of, m."""
+
+
 MISSED = 0.1
 """Share of looks, at most, in which the sensors miss a robot that stands in their way."""
 SCENERY = 0.2
@@ -51,20 +58,6 @@ MARGIN_SHARE = 0.05
 """And by this share of it."""
 SIGMAS = (0.0, 1.0, 2.0, 3.0)
 """The poses are moved by so many standard deviations, in every direction."""
-
-
-@dataclass(frozen=True)
-class MutualVisibilitySettings:
-    """What a robot should have seen.
-
-    Attributes:
-        core: a ray surely meets a robot if it comes as near to its middle as this share of its radius: few
-            robots are round, but a square hides this much to four of five sides.
-        floor_xy: error of how the two maps lie to each other that no covariance tells of, m.
-    """
-
-    core: float = 0.8
-    floor_xy: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +84,7 @@ def none_wrong(seen: VisibilityInterval) -> Errors:
     return Errors(np.zeros((1, len(seen), 2)), np.zeros((len(seen), 2, 2)), np.ones(1))
 
 
-def errors_in_common(
-    graph: PoseGraph, seen: VisibilityInterval, settings: MutualVisibilitySettings | None = None
-) -> Errors:
+def errors_in_common(graph: PoseGraph, seen: VisibilityInterval) -> Errors:
     """The principal components of what may be wrong with all looks.
 
     Args:
@@ -101,7 +92,6 @@ def errors_in_common(
         seen: at least one look.
         settings: the shifts are `sigmas` standard deviations along each component and between them.
     """
-    s = settings or MutualVisibilitySettings()
     rows = np.unique(np.concatenate([seen.observers, seen.others]))
     joint = graph.covariance([graph.nodes[k] for k in rows]).reshape(3 * len(rows), -1)
     headings = graph.means[:, 2]
@@ -120,7 +110,7 @@ def errors_in_common(
     agents = np.array([graph.nodes[row].agent for row in seen.others])
     apart = np.kron(np.where(agents == agents[0], 1.0, -1.0)[:, None], np.eye(2))
     root = np.linalg.cholesky(joint + 1e-10 * np.eye(len(joint)))
-    factor = np.hstack([design @ root, s.floor_xy * apart])
+    factor = np.hstack([design @ root, FLOOR_XY * apart])
     # There are many more looks than nodes, so the principal components come from the smaller side.
     count = min(MODES, *factor.shape)
     _, vectors = scipy.linalg.eigh(
@@ -163,7 +153,6 @@ def odds_against(
     seen: VisibilityInterval,
     errors: Errors,
     least_apart: float,
-    settings: MutualVisibilitySettings | None = None,
 ) -> Array:
     """(S, M) odds against the merge that each look gives, in each way in which the poses may be wrong.
 
@@ -171,22 +160,17 @@ def odds_against(
         seen: the looks.
         errors: the ways.
         least_apart: the robots' middles are never nearer than this, m.
-        settings: what is expected of sensors.
     """
-    s = settings or MutualVisibilitySettings()
     draws = quadrature_points(seen.spreads + errors.rest)
     out: Array = np.array(
-        [
-            _odds(seen, seen.offsets[:, None] + shift[:, None] + draws, least_apart, s)
-            for shift in errors.shifts
-        ]
+        [_odds(seen, seen.offsets[:, None] + shift[:, None] + draws, least_apart) for shift in errors.shifts]
     )
     return out
 
 
-def _odds(seen: VisibilityInterval, places: Array, least_apart: float, s: MutualVisibilitySettings) -> Array:
+def _odds(seen: VisibilityInterval, places: Array, least_apart: float) -> Array:
     """(M,) odds against the merge if the other one was equally likely at each of (M, D, 2) places, m."""
-    went_on, ended = _outcomes(seen, places, s)
+    went_on, ended = _outcomes(seen, places)
     possible = np.hypot(places[..., 0], places[..., 1]) >= least_apart
     on = (went_on & possible).sum(axis=1)
     there = (ended & ~went_on & possible).sum(axis=1)
@@ -197,23 +181,21 @@ def _odds(seen: VisibilityInterval, places: Array, least_apart: float, s: Mutual
     return out
 
 
-def _outcomes(
-    seen: VisibilityInterval, places: Array, s: MutualVisibilitySettings
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _outcomes(seen: VisibilityInterval, places: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(M, D) whether a ray went on where it would have met the other one, and whether one ended there."""
     middles = places.mean(axis=1)
     wander = np.hypot(*(places - middles[:, None]).transpose(2, 0, 1)).max(axis=1)
     u, middle = seen.directions, middles[seen.looks]
     across = np.abs(u[:, 0] * middle[:, 1] - u[:, 1] * middle[:, 0])
     along = (u * middle).sum(axis=1)
-    reach = (s.core * seen.radii + wander)[seen.looks]
+    reach = (CORE * seen.radii + wander)[seen.looks]
     may_meet = np.flatnonzero((across < reach) & (along > -reach) & (seen.lengths > along - 2.0 * reach))
     looks, u, lengths = seen.looks[may_meet], u[may_meet], seen.lengths[may_meet, None]
     x, y = places[looks, :, 0], places[looks, :, 1]
     along = u[:, :1] * x + u[:, 1:] * y
     across2 = (u[:, :1] * y - u[:, 1:] * x) ** 2
     radii = seen.radii[looks, None]
-    core = (s.core * radii) ** 2 - across2
+    core = (CORE * radii) ** 2 - across2
     meets = (core > 0.0) & (along > 0.0)
     first = along - np.sqrt(np.maximum(radii**2 - across2, 0.0))
     last = along - np.sqrt(np.maximum(core, 0.0))

@@ -33,6 +33,10 @@ from mapweave.merge.pose_graph.projected_view import ProjectedView
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.matching import match
 
+MOST = 100.0
+"""Odds against a merge are never more: that all things changed is as probable as this."""
+
+
 NEAR = 1.5
 """A view is held against nodes at most so far away, m."""
 TURN = math.radians(50.0)
@@ -71,17 +75,6 @@ APART = 1.5
 """Views that look at what is nearer than this are one witness, m."""
 
 
-@dataclass(frozen=True)
-class NegativeEvidenceSettings:
-    """What a view should show of what another robot has mapped.
-
-    Attributes:
-        most: odds against a merge are never more: that all things changed is as probable as this.
-    """
-
-    most: float = 100.0
-
-
 @dataclass(frozen=True, eq=False)
 class Views:
     """N views that should show something.
@@ -96,17 +89,17 @@ class Views:
     expected: NDArray[np.int64]
     found: NDArray[np.int64]
 
-    def show_nothing(self, s: NegativeEvidenceSettings) -> NDArray[np.bool_]:
+    def show_nothing(self) -> NDArray[np.bool_]:
         """(N,) which show nothing of what they should."""
         out: NDArray[np.bool_] = self.found <= NOTHING * self.expected
         return out
 
-    def odds_against(self, s: NegativeEvidenceSettings) -> Array:
+    def odds_against(self) -> Array:
         """(N,) odds against the merge that each gives."""
-        out: Array = np.where(self.show_nothing(s), (1.0 - ALIKE) / MISSED, ALIKE / (1.0 - MISSED))
+        out: Array = np.where(self.show_nothing(), (1.0 - ALIKE) / MISSED, ALIKE / (1.0 - MISSED))
         return out
 
-    def witnesses(self, s: NegativeEvidenceSettings) -> NDArray[np.int64]:
+    def witnesses(self) -> NDArray[np.int64]:
         """(N,) number of the place that each looks at."""
         seats = np.full(len(self.places), -1, np.int64)
         for k in range(len(seats)):
@@ -115,20 +108,19 @@ class Views:
                 seats[(seats < 0) & (np.hypot(ways[:, 0], ways[:, 1]) < APART)] = seats.max(initial=-1) + 1
         return seats
 
-    def evidence(self, s: NegativeEvidenceSettings) -> float:
+    def evidence(self) -> float:
         """Natural logarithm of the odds against the merge."""
         if not len(self.places):
             return 0.0
-        seats = self.witnesses(s)
-        means = np.bincount(seats, self.odds_against(s)) / np.bincount(seats)
-        return min(float(np.log(means).sum()), math.log(s.most))
+        seats = self.witnesses()
+        means = np.bincount(seats, self.odds_against()) / np.bincount(seats)
+        return min(float(np.log(means).sum()), math.log(MOST))
 
 
 def negative_evidence(
     graph: PoseGraph,
     first: BodyTrajectory,
     second: BodyTrajectory,
-    settings: NegativeEvidenceSettings | None = None,
 ) -> Views:
     """What the views of two robots should show of what the other one has mapped, and what they do show.
 
@@ -136,15 +128,13 @@ def negative_evidence(
         graph: the merged component that holds the nodes of both.
         first: of one robot.
         second: of another one, by the same clock.
-        settings: when a view should show something.
     """
-    s = settings or NegativeEvidenceSettings()
     rows: list[tuple[Array, int, int]] = []
     for looking, mapped in ((first, second), (second, first)):
         chosen = np.unique(np.linspace(0, len(looking.views) - 1, MOST_VIEWS).round().astype(np.int64))
-        pairs = _near(graph, looking, mapped, chosen, s)
+        pairs = _near(graph, looking, mapped, chosen)
         for k in np.unique(pairs[:, 0]):
-            one = [_look(graph, mapped.views[j], looking.views[k], s) for j in pairs[pairs[:, 0] == k, 1]]
+            one = [_look(graph, mapped.views[j], looking.views[k]) for j in pairs[pairs[:, 0] == k, 1]]
             points = np.concatenate([points for points, _ in one])
             if len(points) >= LEAST:
                 rows.append((points.mean(axis=0), len(points), sum(found for _, found in one)))
@@ -160,7 +150,6 @@ def _near(
     looking: BodyTrajectory,
     mapped: BodyTrajectory,
     chosen: NDArray[np.int64],
-    s: NegativeEvidenceSettings,
 ) -> NDArray[np.int64]:
     """(P, 2) views, and nodes of the other robot that might show the same, the nearest ones of each view."""
     lookers, mappers = ([view.id for view in trail.views] for trail in (looking, mapped))
@@ -180,11 +169,11 @@ def _near(
     return out
 
 
-def _look(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings) -> tuple[Array, int]:
+def _look(graph: PoseGraph, node: Node, view: Node) -> tuple[Array, int]:
     """(K, 2) m, in merged, a node's landmarks that a view should show, and how many of them it shows."""
     merged_from_node = graph.pose(node.id)
     node_from_view = merged_from_node.inverse() @ graph.pose(view.id)
-    shown, pixels = should_show(node, view, node_from_view, s)
+    shown, pixels = should_show(node, view, node_from_view)
     if not len(shown):
         return np.zeros((0, 2)), 0
     seats = np.full(len(node.landmarks), -1)
@@ -195,16 +184,13 @@ def _look(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings)
     return merged_from_node.apply(node.points_in_robot[shown][:, :2]), int((off < WITHIN).sum())
 
 
-def should_show(
-    node: Node, view: Node, node_from_view: Pose2, s: NegativeEvidenceSettings
-) -> tuple[NDArray[np.int64], Array]:
+def should_show(node: Node, view: Node, node_from_view: Pose2) -> tuple[NDArray[np.int64], Array]:
     """Which of a node's landmarks a view should show, and (K, 2) px where.
 
     Args:
         node: that has mapped them.
         view: another node.
         node_from_view: how they stand.
-        s: when a landmark should be seen.
     """
     there = ProjectedView.of(node, view, node_from_view, MARGIN * view.camera.fx, SCALE, ASIDE)
     shown = np.flatnonzero(there.fits)

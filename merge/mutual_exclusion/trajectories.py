@@ -19,7 +19,8 @@ LONGEST_WAY = 1.0
 """Nor if they are further apart, m."""
 ALONG = 0.15
 """How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
-standard deviation: it stops and goes."""
+standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a
+third of its length ahead or behind."""
 ASIDE = 0.05
 """The same to the side of the line."""
 CLOCK_ERROR = 0.05
@@ -29,14 +30,6 @@ CLOCK_ERROR = 0.05
 NANOSECONDS = 1e9
 DRIFT = 0.02
 """How far a robot on its way is off beside its node, as a share of the way between them, one sigma."""
-
-
-@dataclass(frozen=True)
-class BodyTrajectorySettings:
-    """How well it is known where a robot is between two moments of its trail.
-
-    In the simulator it is within 1 cm of the straight line, but up to a third of its length ahead or behind.
-    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,18 +129,14 @@ class Stay:
     nearest: NDArray[np.int64]
 
 
-def stay(
-    trail: BodyTrajectory, places: Array, times: Array, settings: BodyTrajectorySettings | None = None
-) -> Stay:
+def stay(trail: BodyTrajectory, places: Array, times: Array) -> Stay:
     """Where a robot was, on the straight lines between its moments, which it drives at a pace of its own.
 
     Args:
         trail: of N moments.
         places: (N, 2) m, where it was then.
         times: (T,) s.
-        settings: how well that is known.
     """
-    settings or BodyTrajectorySettings()
     before = np.clip(np.searchsorted(trail.times, times, side="right") - 1, 0, max(len(places) - 2, 0))
     after = np.minimum(before + 1, len(places) - 1)
     gaps = np.maximum(trail.times[after] - trail.times[before], 1e-9)

@@ -19,7 +19,7 @@ from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
 from mapweave.merge.outlier_rejection.link_probability import standpoints
 from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
+    LEAST_EVIDENCE,
     Sorted,
     group_links,
     sort_links,
@@ -28,6 +28,7 @@ from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
 
 Key = tuple[NodeId, NodeId]
 """Names of two pieces of map, smaller first."""
@@ -238,7 +239,7 @@ def _borne_out(
         inside.setdefault(piece.name, (piece.graph, []))[1].append(link)
     out: list[Link] = []
     for graph, here in inside.values():
-        least = max(0.0, s.least_evidence - heard[here[0].a.map].log_odds)
+        least = max(0.0, LEAST_EVIDENCE - heard[here[0].a.map].log_odds)
         good = borne_out(here, graph, agreed, least, s)
         out += [link for link, yes in zip(here, good, strict=True) if yes]
     return out

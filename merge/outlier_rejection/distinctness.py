@@ -28,10 +28,10 @@ from mapweave.hybridmap.explanation import DOUBLES
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
 from mapweave.hybridmap.pose import Array
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, link_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 
 APART_XY = 0.5
@@ -47,17 +47,11 @@ Landmark = tuple[NodeId, int]
 """Which node, and which of its landmarks."""
 
 
-@dataclass(frozen=True)
-class DistinctnessSettings:
-    """When two recognitions mean two places."""
-
-
 def weigh(
     links: Sequence[Link],
     by_node: Mapping[NodeId, Fragment],
     maps: Mapping[MapId, HybridMap],
     consistency: ConsistencySettings | None = None,
-    settings: DistinctnessSettings | None = None,
 ) -> list[Link]:
     """Count how many landmarks of each link are found at other places too.
 
@@ -66,13 +60,12 @@ def weigh(
         by_node: the fragment of each node.
         maps: with the robots' own edges.
         consistency: when two measurements contradict each other,
-        settings: and by how much at least.
 
     Returns:
         The links in the same order; where there are such landmarks, with their number among the evidence.
         Links that do not tell their landmarks stay as they are. The order has no say.
     """
-    c, s = consistency or ConsistencySettings(), settings or DistinctnessSettings()
+    c = consistency or ConsistencySettings()
     # What a robot says of nodes of others it did not see: they would lose their links by it.
     own = (e for one in maps.values() for e in one.edges.values() if e.within)
     claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
@@ -82,10 +75,10 @@ def weigh(
     if known:
         sides = _Sides.of(known, by_node)
         loops, pairs = sides.loops(), sides.pairs()
-        astray = sides.contradict(loops, None, c, s)
+        astray = sides.contradict(loops, None, c)
         for k in loops[astray]:
             doubles |= _ends(known[k])
-        for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c, s)]:
+        for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c)]:
             node, one, other = sides.meeting(i, j)
             doubles |= {(node, int(landmark)) for landmark in np.intersect1d(one, other)}
         if doubles:
@@ -176,7 +169,6 @@ class _Sides:
         sides: NDArray[np.int64],
         others: NDArray[np.int64] | None,
         c: ConsistencySettings,
-        s: DistinctnessSettings,
     ) -> NDArray[np.bool_]:
         """(K,) whether two sides that go out from one node contradict the way between their far ends.
 
@@ -184,7 +176,6 @@ class _Sides:
             sides: (K,) which.
             others: (K,) which; None: loops, and the way between the two ends of each.
             c: when they contradict it,
-            s: and by how much at least.
         """
         starts = self.far[sides]
         ends = self.near[sides] if others is None else self.far[others]

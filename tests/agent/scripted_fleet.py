@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from mapweave.agent.mission import Answer, Question
-from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
+from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId

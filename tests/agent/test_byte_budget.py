@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapweave.agent.mapping.mapper import Mapper, MapperSettings
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.node import MapId, Node

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.mapping import keyframe_builder
-from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder, KeyframeBuilderSettings
+from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.camera import Camera

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.global_localization.pose_consistency import ConsistencySettings
-from mapweave.agent.global_localization.settings import ResumptionSettings
 from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
 from mapweave.agent.observation import Command, Observation, Odometry
-from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.wire.codec import encode_body
 from tests.agent.ranged_body import BEARINGS, BODY, MAP, ROOM, essence, live, on, rangers, still
 
@@ -237,7 +237,7 @@ def test_a_lost_robot_asks_the_fleet(walls):
 def test_seeds_choose_the_side():
     turns = set()
     for seed in range(6):
-        pipeline = on(Explore(), PipelineSettings(seed=seed))
+        pipeline = on(Explore(), AgentSettings(seed=seed))
         grey = np.full((240, 320), 100, np.uint8)
         for tick in range(3):
             step = pipeline.step(Observation(tick, Odometry(0.0, 0.0), grey, np.full(len(BEARINGS), 3.0)))
@@ -256,7 +256,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
         The pipeline, what was in its map before, and the steps since.
     """
     near = ResumptionSettings(consistency=ConsistencySettings(way=0.2))
-    pipeline, before = on(Carried(), PipelineSettings(resumption=near)), Pose2(-1.0)
+    pipeline, before = on(Carried(), AgentSettings(resumption=near)), Pose2(-1.0)
     for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
         pipeline.step(walls.observe(before, Pose2(x), tick))
         before = Pose2(x)

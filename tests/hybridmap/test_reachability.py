@@ -13,7 +13,7 @@ from mapweave.hybridmap.descriptor import quantise
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.reachability import ReachabilitySettings, closed_edges, least_in_view, reachability_of
+from mapweave.hybridmap.reachability import closed_edges, least_in_view, reachability_of
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from synthetic.world import CAMERA, random_vectors
 

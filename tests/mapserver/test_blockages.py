@@ -11,7 +11,7 @@ import pytest
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.blockages import Blockages, BlockageSettings
+from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.routes import Router
 from synthetic.world import room, take_map

@@ -14,7 +14,7 @@ import pytest
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.pose_broadcast import PoseBroadcast, PoseBroadcastSettings
+from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph

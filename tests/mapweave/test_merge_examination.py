@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.drivers.replay import Replay
-from mapweave.agent.global_localization.settings import ResumptionSettings
-from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.evaluation.merging import changes
 from mapweave.evaluation.pieces import OVERLAP, cut
@@ -104,7 +103,7 @@ def test_who_cannot_find_itself_begins_another_map(recording: Path, tmp_path: Pa
     (folder / "camera.toml").write_text(CAMERA_TOML)
     for k, image in enumerate(shown):
         cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
-    soon = replace(PipelineSettings(), resumption=ResumptionSettings(carried_looks=3, carried_pause=0.1))
+    soon = replace(AgentSettings(), resumption=ResumptionSettings(carried_looks=3, carried_pause=0.1))
     made = [change for some in changes("one", Replay(folder), soon) for change in some]
     maps = {epoch: [c for c in made if c.map == MapId("one", epoch)] for epoch in (1, 2)}
     assert len(maps[1]) + len(maps[2]) == len(made)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.errors import SettingsError
-from mapweave.merge.merging import MergeSettings
+from mapweave.merge.settings import MergeSettings
 from mapweave.settings import Settings, load_settings, merge_settings
 from mapweave.storage.settings_file import build
 

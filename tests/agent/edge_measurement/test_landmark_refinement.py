@@ -8,11 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.edge_measurement.landmark_refinement import (
-    LandmarkRefinement,
-    LandmarkRefinementSettings,
-    refined,
-)
+from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement, refined
 from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.ekf.localization_state import LocalizationState
 from mapweave.agent.localization.fix import Fix

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder, TraverseSettings
+from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription

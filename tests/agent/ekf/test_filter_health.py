@@ -6,9 +6,9 @@ import pytest
 from mapweave.agent.ekf.adaptive_odometry_noise import AdaptiveOdometryNoise
 from mapweave.agent.ekf.filter_health import FilterHealth
 from mapweave.agent.ekf.motion import WheelNoise
-from mapweave.agent.ekf.settings import FilterSettings
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.pose import Pose2
 
 SETTINGS = FilterSettings(prior_depth=2.5, parallax_px=5.0, patience=2)

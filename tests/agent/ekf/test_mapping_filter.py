@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.motion import WheelNoise, move_pose, move_rays
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Pose2

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapweave.agent.ekf.mapping_filter import FilterSettings, MappingFilter
+from mapweave.agent.ekf.mapping_filter import MappingFilter
+from mapweave.agent.settings import FilterSettings
 from synthetic.mapping_error import error, filter_error, follow, landmark_nees
 from synthetic.mapping_optimum import batch_optimum
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run

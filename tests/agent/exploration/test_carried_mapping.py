@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from mapweave.agent.exploration.carried_mapping import CarriedMapping, CarriedMappingSettings
+from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.change import NodePut

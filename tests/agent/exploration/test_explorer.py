@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.exploration.settings import ExplorerSettings, Phase
+from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.mission import Answer, Explore, WhatIsKnown
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -27,7 +28,7 @@ ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(0.0, ma
 
 def live(walls, settings: ExplorerSettings, ticks: int, told: dict[int, Answer], seed: int = 0) -> list[Step]:
     """Let a pipeline explore a wide room with pictures ahead, with what it is told at some ticks."""
-    pipeline = Pipeline(MAP, BODY, PipelineSettings(explorer=settings, seed=seed))
+    pipeline = Pipeline(MAP, BODY, AgentSettings(exploration=settings, seed=seed))
     pipeline.set_mission(Explore())
     pose, moved, steps = Pose2(), Odometry(0.0, 0.0), []
     for tick in range(ticks):

@@ -11,7 +11,6 @@ import pytest
 
 from mapweave.agent.global_localization.global_localization import MOVE
 from mapweave.agent.global_localization.resumption import Resumption
-from mapweave.agent.global_localization.settings import ResumptionSettings
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -8,12 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.localization.place_recognition import (
-    PlaceRecognitionSettings,
-    lookalikes,
-    recognise_place,
-    recognise_places,
-)
+from mapweave.agent.localization.place_recognition import lookalikes, recognise_place, recognise_places
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, NodeId

@@ -9,17 +9,10 @@ import skimage.data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.mapping.kidnap_detection import (
-    FrameOverlap,
-    KidnapDetector,
-    KidnapDetectorSettings,
-    relit,
-    turned,
-)
-from mapweave.agent.mapping.mapper import Mapper, MapperSettings
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
+from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit, turned
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry
-from mapweave.agent.vision.tracker import TrackerSettings
+from mapweave.agent.settings import TrackerSettings, TrackingSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.agent.mapping.odometry_consistency import OdometryConsistency, OdometryConsistencySettings
+from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from mapweave.agent.mapping.anchored_keyframe import HERE
 from mapweave.agent.mapping.tracking import Tracking
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
 from mapweave.agent.observation import Observation, Odometry
+from mapweave.agent.settings import TrackingSettings
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder, TrajectoryRecorderSettings
+from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.node import MapId

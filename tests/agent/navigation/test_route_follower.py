@@ -6,11 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.localization.node_detector import Expected, NodeDetector, NodeDetectorSettings
+from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.progress_monitor import ProgressMonitor
 from mapweave.agent.navigation.route_follower import MOST_LOOKED_FOR, RouteFollower, RouteProgress
-from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.servo.servo_step import ServoStep
 from mapweave.agent.servo.supervisor import Servo

@@ -15,8 +15,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.calibration import HypothesisSupport, probabilities
 from mapweave.mapserver.relocalization.place_hypotheses import fuse
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
-from mapweave.mapserver.relocalization.verdict import HypothesisSelectionSettings
-from mapweave.mapserver.routes import Router, RouterSettings
+from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.recognition import examine_matches
 from synthetic.world import Sensing, World, room, take_map, take_view

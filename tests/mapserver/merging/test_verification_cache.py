@@ -18,11 +18,10 @@ from mapweave.mapserver.merging.merger import Merger, MergerSettings
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, VerificationCache, fingerprint_of
 from mapweave.mapserver.merging.verification_cache_file import load, save
 from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX, VerificationCacheKeeper
-from mapweave.merge.merging import MergeSettings
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
-from mapweave.merge.pose_graph.verification import VerificationSettings
+from mapweave.merge.settings import MergeSettings
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)

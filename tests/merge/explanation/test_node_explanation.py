@@ -27,13 +27,12 @@ from mapweave.merge.outlier_rejection.link_probability import (
     prior_odds,
     standpoints,
 )
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.verification import VerificationSettings
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.recognition import RecognitionSettings
 from synthetic.world import room, take_map
 

@@ -16,14 +16,7 @@ from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.merging.merger import Merger, MergerSettings
 from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations, expected
-from mapweave.merge.map_maintenance.landmark_removal import (
-    LandmarkRemovalSettings,
-    LandmarkRemover,
-    found_again,
-    presence,
-    things,
-)
-from mapweave.merge.map_maintenance.node_superseding import NodeSupersedingSettings
+from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover, found_again, presence, things
 from mapweave.merge.pose_graph.links import Link
 from synthetic.world import CAMERA, Sensing, World, random_vectors, room, take_map, take_node
 

@@ -23,7 +23,6 @@ from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.roadmap import Roadmap
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.node_explanation import explain_nodes
-from mapweave.merge.map_maintenance.node_superseding import NodeSupersedingSettings
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify

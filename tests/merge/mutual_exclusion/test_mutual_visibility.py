@@ -14,12 +14,7 @@ from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.mutual_visibility import (
-    MutualVisibilitySettings,
-    errors_in_common,
-    none_wrong,
-    odds_against,
-)
+from mapweave.merge.mutual_exclusion.mutual_visibility import errors_in_common, none_wrong, odds_against
 from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval

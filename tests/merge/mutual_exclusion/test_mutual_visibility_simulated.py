@@ -19,10 +19,9 @@ from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.mutual_visibility import MutualVisibilitySettings
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ExclusionSettings
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 

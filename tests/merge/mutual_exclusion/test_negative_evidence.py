@@ -9,13 +9,8 @@ import pytest
 from mapweave.hybridmap.node import Landmarks, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.negative_evidence import (
-    NegativeEvidenceSettings,
-    Views,
-    negative_evidence,
-    should_show,
-)
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
+from mapweave.merge.mutual_exclusion.negative_evidence import Views, negative_evidence, should_show
+from mapweave.merge.settings import ExclusionSettings
 from tests.merge.mutual_exclusion.rooms import CAMERA, Room, meeting
 
 S = NegativeEvidenceSettings()
