@@ -84,13 +84,16 @@ def none_wrong(seen: VisibilityInterval) -> Errors:
     return Errors(np.zeros((1, len(seen), 2)), np.zeros((len(seen), 2, 2)), np.ones(1))
 
 
-def errors_in_common(graph: PoseGraph, seen: VisibilityInterval) -> Errors:
+def errors_in_common(graph: PoseGraph, seen: VisibilityInterval, floor_xy: float = FLOOR_XY) -> Errors:
     """The principal components of what may be wrong with all looks.
 
     Args:
         graph: of the nodes.
         seen: at least one look.
-        settings: the shifts are `sigmas` standard deviations along each component and between them.
+        floor_xy: error of how the two maps lie to each other that no covariance tells of, m.
+
+    Returns:
+        Shifts of SIGMAS standard deviations along each component and between them.
     """
     rows = np.unique(np.concatenate([seen.observers, seen.others]))
     joint = graph.covariance([graph.nodes[k] for k in rows]).reshape(3 * len(rows), -1)
@@ -110,7 +113,7 @@ def errors_in_common(graph: PoseGraph, seen: VisibilityInterval) -> Errors:
     agents = np.array([graph.nodes[row].agent for row in seen.others])
     apart = np.kron(np.where(agents == agents[0], 1.0, -1.0)[:, None], np.eye(2))
     root = np.linalg.cholesky(joint + 1e-10 * np.eye(len(joint)))
-    factor = np.hstack([design @ root, FLOOR_XY * apart])
+    factor = np.hstack([design @ root, floor_xy * apart])
     # There are many more looks than nodes, so the principal components come from the smaller side.
     count = min(MODES, *factor.shape)
     _, vectors = scipy.linalg.eigh(

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from mapweave.agent.global_localization import pose_consistency
 from mapweave.agent.mission import Carried, Explore, GoTo, Idle, WhereAmI
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, Step
@@ -14,7 +15,6 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.merge.settings import ConsistencySettings
 from mapweave.wire.codec import encode_body
 from tests.agent.ranged_body import BEARINGS, BODY, MAP, ROOM, essence, live, on, rangers, still
 
@@ -245,6 +245,12 @@ def test_seeds_choose_the_side():
     assert turns == {1.0, -1.0}
 
 
+@pytest.fixture
+def near_views(monkeypatch) -> None:
+    """All pictures hang in one direction, so views from places close to each other must do."""
+    monkeypatch.setattr(pose_consistency, "OTHER_VIEW", (0.2, 0.9))
+
+
 def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list[Step]]:
     """A robot that has mapped from x = -1.0 to -0.3 m, has a goal for a while, and then is carried on.
 
@@ -255,8 +261,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
     Returns:
         The pipeline, what was in its map before, and the steps since.
     """
-    near = ResumptionSettings(consistency=ConsistencySettings(way=0.2))
-    pipeline, before = on(Carried(), AgentSettings(resumption=near)), Pose2(-1.0)
+    pipeline, before = on(Carried()), Pose2(-1.0)
     for tick, x in enumerate(np.arange(-1.0, -0.3, 0.025)):
         pipeline.step(walls.observe(before, Pose2(x), tick))
         before = Pose2(x)
@@ -271,6 +276,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
     return pipeline, elements, steps
 
 
+@pytest.mark.usefixtures("near_views")
 def test_after_navigating_it_maps_on_once_it_recognises_a_place(walls):
     """It was carried 0.3 m further meanwhile, which the wheels do not know.
 
@@ -288,6 +294,7 @@ def test_after_navigating_it_maps_on_once_it_recognises_a_place(walls):
             assert (from_start @ node.map_from_robot.mean).distance(Pose2(-1.0).inverse() @ true) < 0.05
 
 
+@pytest.mark.usefixtures("near_views")
 def test_after_navigating_to_where_it_knows_nothing_it_does_not_map_on(walls):
     away = [Pose2(x, 0.0, math.pi) for x in np.arange(0.3, 0.9, 0.025)]
     pipeline, elements, steps = carried_after_navigating(walls, away)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from mapweave.agent.edge_measurement import traverse
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer
@@ -42,9 +43,9 @@ class Landmarks(NodeLocalizer):
 class Drive:
     """A robot on its way from A, whose wheels slip."""
 
-    def __init__(self, seed: int = 0, settings: TraverseSettings | None = None) -> None:
+    def __init__(self, seed: int = 0) -> None:
         self.rng = np.random.default_rng(seed)
-        self.surveyor = TraverseRecorder(ROBOT, settings)
+        self.surveyor = TraverseRecorder(ROBOT)
         self.pose = NODES[A]
         self.measured: list[Traverse] = []
 
@@ -81,16 +82,17 @@ def test_a_passage_is_told_when_the_next_node_is_reached():
     assert drive.told == [(A, B)]
 
 
-def test_what_is_measured_is_as_good_as_it_says():
+def test_what_is_measured_is_as_good_as_it_says(monkeypatch):
     """The mean over 60 drives: no surer than it is right, and not much less sure either."""
+    monkeypatch.setattr(traverse, "FLOOR", (0.0, 0.0))
     nees = []
     for seed in range(60):
-        drive = Drive(seed, TraverseSettings(floor=(0.0, 0.0)))
+        drive = Drive(seed)
         drive.by(A, 20)
         drive.by(None, 10)
         drive.by(B, 60)
-        [traverse] = drive.measured
-        nees.append(traverse.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[B]))
+        [measured] = drive.measured
+        nees.append(measured.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[B]))
     assert 1.0 < np.mean(nees) < 4.0
 
 
@@ -149,8 +151,9 @@ def test_a_roundabout_way_says_nothing_of_the_straight_one():
     assert not drive.told
 
 
-def test_what_is_known_badly_is_not_told():
-    drive = Drive(settings=TraverseSettings(widest=0.015))
+def test_what_is_known_badly_is_not_told(monkeypatch):
+    monkeypatch.setattr(traverse, "WIDEST", 0.015)
+    drive = Drive()
     drive.by(A, 20)
     drive.by(B, 60)
     assert not drive.told

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.exploration.phase import Phase
+from mapweave.agent.exploration.viewpoint_selection import REACH
 from mapweave.agent.mission import Answer, Explore, WhatIsKnown
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
@@ -54,9 +55,9 @@ def test_it_asks_about_its_own_map_and_nothing_waits_for_the_answer(walls):
     steps = live(walls, ExplorerSettings(), 40, {})
     (first, *_) = questions(steps)
     assert (first.map, first.x, first.y) == (MAP, pytest.approx(0.0), pytest.approx(0.0))
-    assert first.reach > ExplorerSettings().reach
+    assert first.reach > REACH
     assert first.number < 0, "the navigator's questions are positive"
-    silent = live(walls, ExplorerSettings(ask=False), 40, {})
+    silent = live(walls, ExplorerSettings(ask_fleet=False), 40, {})
     assert questions(silent) == []
     assert [step.command for step in steps] == [step.command for step in silent]
 
@@ -93,7 +94,7 @@ def turns(steps: list[Step]) -> list[float]:
 
 
 def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
-    by_chance = ExplorerSettings(wander=True)
+    by_chance = ExplorerSettings(random=True)
     steps = live(walls, by_chance, 250, {})
     sides = turns(steps)
     assert len(sides) >= 3

@@ -100,10 +100,6 @@ def between_twins(seed: int) -> float:
     return first.x - second.x
 
 
-BLIND = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
-"""Robots that see nothing of each other."""
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_twins_should_have_seen_each_other(seed: int) -> None:
     """Within five minutes, whatever the room: where little of it is free they are seldom in sight."""
@@ -179,11 +175,13 @@ def test_broken_sensors_say_nothing(fails: str) -> None:
     assert walks.clash() is None
 
 
-def test_who_does_not_tell_how_large_it_is_is_not_looked_for() -> None:
+def test_who_does_not_tell_how_large_it_is_is_not_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     walks = Walks("twins", 0, (0, 1))
     walks.nodes = [replace(node, radius=0.0) for node in walks.nodes]
-    blind = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
-    assert walks.clash(between_twins(0)) == walks.clash(between_twins(0), blind)
+    seeing = walks.clash(between_twins(0))
+    # Robots that see nothing of each other.
+    monkeypatch.setattr("mapweave.merge.mutual_exclusion.mutual_visibility.CORE", 0.0)
+    assert seeing == walks.clash(between_twins(0))
 
 
 class Exploration:
