@@ -21,11 +21,6 @@ from mapweave.registration.planar_ambiguity import mirrored
 from mapweave.registration.projection import Stack
 from mapweave.registration.sightings import Sightings
 
-SCALE_SIGMA = 0.01
-"""Share by which all points of one frame may be too near or too far together; they come from one drive with
-one set of wheels, so their errors are not independent."""
-
-
 HYPOTHESES = 100
 """Poses tried from three bearings, and as many from two points with depth."""
 FINALISTS = 2
@@ -49,10 +44,13 @@ class PlanarPoseSettings:
     Attributes:
         pixel_sigma: standard deviation of a matched pixel, px. A SIFT feature found again at another scale
             is off by about one pixel.
+        scale_sigma: share by which all points of one frame may be too near or too far together; they come
+            from one drive with one set of wheels, so their errors are not independent.
         least_inliers: fewer give no pose.
     """
 
     pixel_sigma: float = 1.0
+    scale_sigma: float = 0.01
     least_inliers: int = 4
 
 
@@ -131,7 +129,7 @@ def solve_sightings(
     if not kept:
         return None
     best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
-    fix = refine(stack, best, SCALE_SIGMA, prior, rounds=PLANAR_POSE_ROUNDS)
+    fix = refine(stack, best, settings.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return _weighed(fix, parts, stack, settings, prior)
@@ -155,7 +153,7 @@ def _weighed(
     ours, theirs = _scores(parts, np.stack([mean.vector, other[0].vector])).tolist()
     if theirs <= ours:
         return replace(fix, rival=max(theirs, 0.0) / ours if ours > 0.0 else 1.0)
-    better = refine(stack, other[0], SCALE_SIGMA, prior, rounds=PLANAR_POSE_ROUNDS)
+    better = refine(stack, other[0], s.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
         return replace(fix, rival=1.0)
     return replace(better, rival=max(ours, 0.0) / theirs)

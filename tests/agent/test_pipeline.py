@@ -278,10 +278,7 @@ def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list
 
 @pytest.mark.usefixtures("near_views")
 def test_after_navigating_it_maps_on_once_it_recognises_a_place(walls):
-    """It was carried 0.3 m further meanwhile, which the wheels do not know.
-
-    All pictures hang in one direction, so looks from places close to each other must do.
-    """
+    """It was carried 0.3 m further meanwhile, which the wheels do not know."""
     places = [Pose2(x) for x in np.arange(0.0, 0.9, 0.025)]
     pipeline, elements, _ = carried_after_navigating(walls, places)
     assert elements < set(pipeline.map.nodes)

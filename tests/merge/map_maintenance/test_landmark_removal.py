@@ -16,6 +16,7 @@ from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.map_maintenance import landmark_observations as observations
+from mapweave.merge.map_maintenance import landmark_removal as removal
 from mapweave.merge.map_maintenance import node_superseding
 from mapweave.merge.map_maintenance.landmark_observations import LandmarkObservations, expected
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover, found_again, presence, things
