@@ -76,9 +76,9 @@ class ExplorerSettings:
     """How the robot explores.
 
     Attributes:
-        drive_speed: on the drive back and forth that maps a view, m/s.
-        turn_rate: rad/s.
-        travel_speed: on the way to the next place, m/s.
+        drive_speed: speed of the drive back and forth that maps a view, m/s.
+        turn_rate: largest rate of turns on the spot and on the way, rad/s.
+        travel_speed: speed on the way to the next place, m/s.
         ask_fleet: whether to ask the fleet what others have mapped, and to leave that to them.
         random: explore by chance, as the paper does (section 4.1), instead of place by place.
     """
@@ -95,8 +95,8 @@ class NavigatorSettings:
     """How the robot drives to a goal.
 
     Attributes:
-        speed: between nodes, m/s.
-        turn_rate: between nodes, rad/s.
+        speed: speed between nodes, m/s.
+        turn_rate: largest rate of turns between nodes, rad/s.
         blind_distance: way without any landmark in sight after which the robot must find itself again, m.
         looks: how often in a row it looks in vain and drives on by wheels before it is lost.
         further: how far it drives on by wheels after a look in vain, m: they are off by a few percent, and to
@@ -123,7 +123,7 @@ class OccupancyGridSettings:
     Attributes:
         cell: side of a cell, m.
         side: side of the whole grid, m; its middle is where the map began.
-        clearance: kept between the footprint's edge and anything seen, m.
+        clearance: room kept between the footprint's edge and anything seen, m.
     """
 
     cell: Positive = 0.1
@@ -136,7 +136,7 @@ class AgentSettings:
     """A robot's program.
 
     Attributes:
-        seed: of all that the robot does by chance.
+        seed: seed of all that the robot does by chance.
         sift: features of an image.
         landmarks: which landmarks a node keeps.
         tracker: of image points.

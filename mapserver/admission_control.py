@@ -29,14 +29,14 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class AdmissionSettings:
-    """How questions are shared out.
+    """How a map server shares out the questions that take long.
 
     Attributes:
         workers: questions that are worked on at once; 0 for one a core, four at the most.
         in_time: a question that would have its answer later than this, as far as is known, is refused, unless
             a worker is free, s.
-        too_late: one whose turn comes so late that its answer would take so many times as long is refused
-            as well: the others behind it are answered in time then.
+        too_late: a question whose turn comes so late that its answer would take so many times as long is
+            refused as well: the others behind it are answered in time then.
         first_guess: how long a question takes, before any was answered, s.
         smoothing: weight of the newest question in the mean time that one takes.
     """

@@ -18,8 +18,8 @@ class ConsistencySettings:
     Attributes:
         gate: chi-square with 3 degrees of freedom that a loop may miss by; 16.27 is 99.9 %, since a link must
             agree with every other one.
-        floor_xy: error of any loop that no covariance tells of, m.
-        floor_heading: the same, rad.
+        floor_xy: position error of any loop that no covariance tells of, m.
+        floor_heading: heading error of any loop that no covariance tells of, rad.
         least_links: independent links (no node in common) that join two pieces.
         dominance: how many times the landmarks of a contradicting set the kept set must have, and how many
             times its witnesses if that set would be believed without it.

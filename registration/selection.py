@@ -43,7 +43,7 @@ class SelectionSettings:
     """How many landmarks a node keeps, and which.
 
     Attributes:
-        most_bytes: what a node may cost on the wire, all but its wake included.
+        most_bytes: what a node may cost on the wire, all but its wake included, bytes; at least 660.
     """
 
     most_bytes: int = 3000

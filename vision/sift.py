@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
@@ -46,7 +48,7 @@ class SiftSettings:
         most: features kept of one image.
     """
 
-    most: int = 150
+    most: Annotated[int, Meta(ge=8)] = 150
 
 
 @dataclass(frozen=True, eq=False)
