@@ -81,7 +81,7 @@ def _problems(kind: Any, value: Any, path: str) -> Iterator[str]:
         for inner in value:
             yield from _problems(kind, inner, path)
     elif isinstance(value, float) and not math.isfinite(value):
-        yield f"{path}: {value!r} is no number"
+        yield f"{path}: {value!r} is no float"
     elif isinstance(value, int) and abs(value) > sys.float_info.max:
         yield f"{path}: the number has too many digits"
 
@@ -107,8 +107,15 @@ def _told(error: str, values: Mapping[str, Any]) -> str:
     there: Any = values
     for name, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
         there = there[int(number)] if number else there[name]
-    what = what.replace("`", "").replace("object", "table").replace("array", "list")
-    what = what[:1].lower() + what[1:]
-    if not isinstance(there, Mapping | list):
-        what = f"{what}; it is {there!r}"
+    missing = re.fullmatch(r"Object missing required field `(\w+)`", what)
+    if missing:
+        what = f"{missing[1]} is missing"
+    else:
+        what = (
+            f"{what[:1].lower()}{what[1:]}".replace("`", "")
+            .replace("object", "table")
+            .replace("array", "list")
+        )
+        if not isinstance(there, Mapping | list):
+            what = f"{what}; it is {there!r}"
     return f"{path}: {what}" if path else what

@@ -107,8 +107,8 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[agent]\nseed = true", "agent.seed: expected int, got bool; it is True"),
         ("[agent.navigation]\nspeed = 'far'", "agent.navigation.speed: expected float, got str; it is 'far'"),
         ("[agent.navigation]\nspeed = false", "agent.navigation.speed: expected float, got bool"),
-        ("[agent.navigation]\nspeed = nan", "agent.navigation.speed: nan is no number"),
-        ("[agent.navigation]\nspeed = inf", "agent.navigation.speed: inf is no number"),
+        ("[agent.navigation]\nspeed = nan", "agent.navigation.speed: nan is no float"),
+        ("[agent.navigation]\nspeed = inf", "agent.navigation.speed: inf is no float"),
         ("[agent.navigation]\nspeed = 0", "agent.navigation.speed: expected float > 0.0; it is 0"),
         ("[agent.navigation]\nspeed = -0.2", "agent.navigation.speed: expected float > 0.0; it is -0.2"),
         (
