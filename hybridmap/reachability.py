@@ -21,15 +21,6 @@ from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Node
 from mapweave.hybridmap.pose import Array, Pose2
 
 # What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`.
-FARTHEST = 2.5
-"""M, between two nodes."""
-WIDEST = math.radians(45.0)
-"""Rad, between their headings."""
-LEAST = 7
-"""Common landmarks that stay in view: as many as a look for the next node asks for; the servo itself holds
-on to four."""
-STOPS = 9
-"""Poses on the way at which is counted."""
 
 
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
@@ -49,6 +40,17 @@ class Reachability:
     drivable: bool
     in_view: int
     reason: str
+
+
+FARTHEST = 2.5
+"""M, between two nodes."""
+WIDEST = math.radians(45.0)
+"""Rad, between their headings."""
+LEAST = 7
+"""Common landmarks that stay in view: as many as a look for the next node asks for; the servo itself holds
+on to four."""
+STOPS = 9
+"""Poses on the way at which is counted."""
 
 
 def reachability_of(edge: Edge, a: Node, b: Node) -> Reachability:

@@ -15,10 +15,6 @@ from msgspec import Meta
 
 from mapweave.hybridmap.errors import Busy
 
-LONGEST_PAUSE = 10.0
-"""Nobody is sent away for longer, s."""
-
-
 LATENESS = 0.5
 """Who comes so much after or before the appointment still has it, s: the way there and back takes time."""
 MOST_BOOKED = 1024
@@ -51,6 +47,10 @@ class AdmissionSettings:
     def threads(self) -> int:
         """Workers on this machine."""
         return self.workers or min(os.cpu_count() or 1, 4)
+
+
+LONGEST_PAUSE = 10.0
+"""Nobody is sent away for longer, s."""
 
 
 class AdmissionControl:

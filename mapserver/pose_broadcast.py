@@ -23,19 +23,6 @@ from mapweave.wire.bus import Bus, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
-EVERY = 2.0
-"""S between two news of one agent, at least."""
-BEAT = 15.0
-"""S after which it is told the number of the last news again, so that lost ones are missed."""
-MOST = 2048
-"""Nodes in one message."""
-
-
-DISTANCE = 0.05
-"""A node that lies less far from where its agent was told that it lies is not told anew, m."""
-TURN = math.radians(1.0)
-"""And is turned by less, rad."""
-
 
 @dataclass
 class _Told:
@@ -44,6 +31,18 @@ class _Told:
     places: dict[NodeId, MergedPose] = field(default_factory=dict)
     sequence: int = 0
     last: float = -math.inf
+
+
+EVERY = 2.0
+"""S between two news of one agent, at least."""
+BEAT = 15.0
+"""S after which it is told the number of the last news again, so that lost ones are missed."""
+MOST = 2048
+"""Nodes in one message."""
+DISTANCE = 0.05
+"""A node that lies less far from where its agent was told that it lies is not told anew, m."""
+TURN = math.radians(1.0)
+"""And is turned by less, rad."""
 
 
 class PoseBroadcast:

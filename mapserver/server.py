@@ -34,12 +34,6 @@ from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
 
-STATUS_EVERY = 0.5
-"""Seconds between two status messages."""
-MERGE_SHARE = 0.4
-"""At most this share of the time is spent making the merged map anew."""
-
-
 log = logging.getLogger(__name__)
 
 
@@ -54,6 +48,12 @@ class ServerSettings:
 
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
+
+
+STATUS_EVERY = 0.5
+"""Seconds between two status messages."""
+MERGE_SHARE = 0.4
+"""At most this share of the time is spent making the merged map anew."""
 
 
 class MapServer:

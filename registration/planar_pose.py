@@ -21,14 +21,8 @@ from mapweave.registration.planar_ambiguity import mirrored
 from mapweave.registration.projection import Stack
 from mapweave.registration.sightings import Sightings
 
-HYPOTHESES = 100
-"""Poses tried from three bearings, and as many from two points with depth."""
-FINALISTS = 2
-"""Best hypotheses that are refined."""
 PLANAR_POSE_ROUNDS = 8
 """Of Gauss-Newton at most."""
-APART = 0.3
-"""Two poses nearer to each other than this are the same, m."""
 
 
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
@@ -100,6 +94,12 @@ def solve_planar_pose(
     return replace(solved, inliers=inliers)
 
 
+HYPOTHESES = 100
+"""Poses tried from three bearings, and as many from two points with depth."""
+FINALISTS = 2
+"""Best hypotheses that are refined."""
+
+
 def solve_sightings(
     parts: Sequence[Sightings],
     *,
@@ -133,6 +133,10 @@ def solve_sightings(
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return _weighed(fix, parts, stack, settings, prior)
+
+
+APART = 0.3
+"""Two poses nearer to each other than this are the same, m."""
 
 
 def _weighed(

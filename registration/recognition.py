@@ -25,13 +25,6 @@ from mapweave.registration.matching import MatchSettings, match
 from mapweave.registration.planar_pose import PlanarFix, PlanarPoseSettings, solve_sightings
 from mapweave.registration.sightings import Sightings
 
-LEAST_SHARE = 0.35
-"""Of the matches that could have been inliers."""
-LEAST_DEPTHS = 0.5
-"""Of the landmarks that fit by their pixels and have a depth on both sides, how many agree in depth too."""
-MOST_MEAN_SQUARE = 3.0
-"""Largest mean squared normalised residual; 1 is expected."""
-
 
 @dataclass(frozen=True)
 class RecognitionSettings:
@@ -272,6 +265,14 @@ def _sightings(
         depth_sigmas=seen.depth_sigmas,
         inverted=inverted,
     )
+
+
+LEAST_SHARE = 0.35
+"""Of the matches that could have been inliers."""
+LEAST_DEPTHS = 0.5
+"""Of the landmarks that fit by their pixels and have a depth on both sides, how many agree in depth too."""
+MOST_MEAN_SQUARE = 3.0
+"""Largest mean squared normalised residual; 1 is expected."""
 
 
 def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:

@@ -22,12 +22,6 @@ from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import FINE_BITS, PixelGrid, round_depths
 from mapweave.registration.matching import squared_distances
 
-CROWD = 0.08
-"""Landmarks nearer to each other than about this share of the image's width crowd each other."""
-ALIKE = 0.5
-"""Distance of two decoded descriptors beyond which they cannot be taken for each other."""
-
-
 FIXED_BYTES = 330
 """A node without landmarks: names, pose, camera, 16 ranges, checksums and the transport's frame."""
 
@@ -67,6 +61,12 @@ def worth(seen: NDArray[Any], rank: NDArray[Any]) -> Array:
     """
     likely: Array = (DOUBT + seen) * np.sqrt(1.5 - rank)
     return likely
+
+
+CROWD = 0.08
+"""Landmarks nearer to each other than about this share of the image's width crowd each other."""
+ALIKE = 0.5
+"""Distance of two decoded descriptors beyond which they cannot be taken for each other."""
 
 
 def choose(

@@ -18,24 +18,6 @@ from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import View
 from mapweave.vision.lens import Lens
 
-LEAST_TEXTURE = 1.5
-"""The image's mean squared gradient around a feature, in its weakest direction, (grey/px)^2. On an edge it
-is that of noise alone: such a feature slides along the edge when it is tracked (aperture problem),
-unnoticed by a forward-backward check."""
-LEAST_ROUNDNESS = 0.04
-"""The same in the weakest direction as a share of that in the strongest."""
-
-
-CONTRAST = 0.02
-"""SIFT's contrast threshold; lower finds more and weaker features."""
-CELLS = 4
-"""The image is cut into cells x cells; each may give at most `crowding` times its even share."""
-CROWDING = 2.5
-"""See cells."""
-BORDER_PX = 6.0
-"""Features nearer to the image's border are left out, they cannot be tracked."""
-
-
 TEXTURE_BLOCK_PX = 11
 """Side of the square in which texture is measured, about that of a tracked patch."""
 
@@ -74,6 +56,22 @@ class Features:
     def view(self, camera: Camera) -> View:
         """The same as a question to the map."""
         return View(self.pixels.astype(np.float32), self.codes, camera)
+
+
+LEAST_TEXTURE = 1.5
+"""The image's mean squared gradient around a feature, in its weakest direction, (grey/px)^2. On an edge it
+is that of noise alone: such a feature slides along the edge when it is tracked (aperture problem),
+unnoticed by a forward-backward check."""
+LEAST_ROUNDNESS = 0.04
+"""The same in the weakest direction as a share of that in the strongest."""
+CONTRAST = 0.02
+"""SIFT's contrast threshold; lower finds more and weaker features."""
+CELLS = 4
+"""The image is cut into cells x cells; each may give at most `crowding` times its even share."""
+CROWDING = 2.5
+"""See cells."""
+BORDER_PX = 6.0
+"""Features nearer to the image's border are left out, they cannot be tracked."""
 
 
 class Sift:

@@ -13,18 +13,6 @@ from mapweave.hybridmap.node import Landmarks, Node, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import snap
 
-SHARE = 0.7
-"""A landmark is known better if its depth's sigma has fallen below this share of what it was."""
-LEAST = 5
-"""A node is told anew if so many of its landmarks are known better: it costs some 3 kB."""
-FLOOR = (0.01, 0.015)
-"""What a depth is never better than: m, and share of the depth; as when it was mapped."""
-
-
-DOUBT = 3.3
-"""A depth that is off from the mapped one by more than this many sigma of that is no better one: what was
-followed may be something else."""
-
 
 class LandmarkRefinement:
     """Watches a drive, and says how the landmarks of the robot's own nodes are known after it.
@@ -58,6 +46,17 @@ class LandmarkRefinement:
         self._told.add(node.id)
         # Rounded now, the robot works with the same numbers as everybody who gets the node.
         return replace(node, landmarks=snap(landmarks, node.camera))
+
+
+SHARE = 0.7
+"""A landmark is known better if its depth's sigma has fallen below this share of what it was."""
+LEAST = 5
+"""A node is told anew if so many of its landmarks are known better: it costs some 3 kB."""
+FLOOR = (0.01, 0.015)
+"""What a depth is never better than: m, and share of the depth; as when it was mapped."""
+DOUBT = 3.3
+"""A depth that is off from the mapped one by more than this many sigma of that is no better one: what was
+followed may be something else."""
 
 
 def refined(mapped: Landmarks, depths: Array, sigmas: Array) -> Landmarks | None:

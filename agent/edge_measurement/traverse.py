@@ -16,26 +16,6 @@ from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
-FLOOR = (0.005, 0.005)
-"""Error of a settled pose that its covariance does not tell of, m and rad: tracks err alike for a while,
-and the landmarks of a node were mapped by the same wheels."""
-WIDEST = 0.1
-"""A traverse known no better than this is not worth telling, m."""
-
-
-SETTLED = 3
-"""Images through which a node's landmarks must have been followed: fewer than lie between two looks for the
-next node."""
-TRAVERSE_GAP = 0.5
-"""What may lie between the landmarks of two nodes, as `Fix.blind` counts it, m."""
-REACH = 0.45
-"""This near to a node the robot has passed it, m. It is twice the distance within which the follower takes
-a node for passed."""
-DETOUR = 1.3
-"""Nor is one on a way longer than the straight line by more than this factor, and `reach` at either end:
-something stands in between."""
-
-
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
 
@@ -54,6 +34,24 @@ class Traverse:
     end: NodeId
     start_from_end: PoseGaussian
     landmarks: int
+
+
+FLOOR = (0.005, 0.005)
+"""Error of a settled pose that its covariance does not tell of, m and rad: tracks err alike for a while,
+and the landmarks of a node were mapped by the same wheels."""
+WIDEST = 0.1
+"""A traverse known no better than this is not worth telling, m."""
+SETTLED = 3
+"""Images through which a node's landmarks must have been followed: fewer than lie between two looks for the
+next node."""
+TRAVERSE_GAP = 0.5
+"""What may lie between the landmarks of two nodes, as `Fix.blind` counts it, m."""
+REACH = 0.45
+"""This near to a node the robot has passed it, m. It is twice the distance within which the follower takes
+a node for passed."""
+DETOUR = 1.3
+"""Nor is one on a way longer than the straight line by more than this factor, and `reach` at either end:
+something stands in between."""
 
 
 class TraverseRecorder:

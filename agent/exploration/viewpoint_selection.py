@@ -12,18 +12,8 @@ from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.pose import Array
 
-SPACING = 1.7
-"""Places are at least this far from each other, m."""
-REACH = 7.0
-"""The longest way to a next place, m."""
 SIGHT = 1.6
 """What lies around a place, and what others know around theirs, is judged within this radius, m."""
-VIEW = 3.0
-"""A look around shows floor up to this far, m."""
-LOOK_TIME = 60.0
-"""About what a look around takes, s."""
-LEAST_AREA = 1.0
-"""New floor that is worth one, m^2."""
 
 
 DIRECTIONS = 36
@@ -56,6 +46,12 @@ def seen_around(views: Array, position: Array, reach: float) -> float:
     return float((off <= near[:, 3]).any(axis=1).mean())
 
 
+SPACING = 1.7
+"""Places are at least this far from each other, m."""
+REACH = 7.0
+"""The longest way to a next place, m."""
+
+
 def next_viewpoint(
     floor: OccupancyGrid, position: Array, been: Array, others: Array, settings: ExplorerSettings
 ) -> list[Array]:
@@ -81,6 +77,14 @@ def next_viewpoint(
             if path:
                 return path
     return []
+
+
+VIEW = 3.0
+"""A look around shows floor up to this far, m."""
+LOOK_TIME = 60.0
+"""About what a look around takes, s."""
+LEAST_AREA = 1.0
+"""New floor that is worth one, m^2."""
 
 
 def _new_floor(

@@ -20,15 +20,6 @@ from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
-EXPECTED = RecognitionSettings(least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0)
-"""Less is asked than of a lost robot, because the pose must also be the expected one."""
-PLAUSIBLE = 0.3
-"""A recognition this far from where the robot believes to be is not believed, m."""
-PLAUSIBLE_TURN = 0.25
-"""Likewise, rad."""
-MORE = 1.3
-"""What is tracked already is given up for a fresh look that finds this many times as many landmarks."""
-
 
 class Expected(NamedTuple):
     """A node that may be in view.
@@ -46,6 +37,16 @@ class Expected(NamedTuple):
     node_from_robot: Pose2
     doubt: float = 1.0
     tracked: int = 0
+
+
+EXPECTED = RecognitionSettings(least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0)
+"""Less is asked than of a lost robot, because the pose must also be the expected one."""
+PLAUSIBLE = 0.3
+"""A recognition this far from where the robot believes to be is not believed, m."""
+PLAUSIBLE_TURN = 0.25
+"""Likewise, rad."""
+MORE = 1.3
+"""What is tracked already is given up for a fresh look that finds this many times as many landmarks."""
 
 
 class NodeDetector:

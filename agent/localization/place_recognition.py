@@ -11,13 +11,6 @@ from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.recognition import Recognition, recognise
 
-TRIES = 5
-"""Nodes that are verified, by descending votes."""
-VOTES = 6
-"""A node with fewer votes is not tried."""
-LEAST_INLIERS = 24
-"""Landmarks that must agree: one node speaks alone here, and the map is small."""
-
 
 def recognise_place(
     hybrid_map: HybridMap,
@@ -29,6 +22,14 @@ def recognise_place(
     See `recall_all`.
     """
     return next(iter(recognise_places(hybrid_map, view, rng)), None)
+
+
+TRIES = 5
+"""Nodes that are verified, by descending votes."""
+VOTES = 6
+"""A node with fewer votes is not tried."""
+LEAST_INLIERS = 24
+"""Landmarks that must agree: one node speaks alone here, and the map is small."""
 
 
 def recognise_places(

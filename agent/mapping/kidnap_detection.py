@@ -21,6 +21,31 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
+PATCH_PX = 11
+"""Side of the square in which texture is measured, about that of a tracked patch."""
+
+GRID = (6, 8)
+"""Rows and columns of the image's cells, each of which gives at most one corner."""
+
+LEAST_GAIN, MOST_GAIN = 0.5, 4.0
+"""How much a light may change: a darker image has too few grey levels left to be tracked in, and one that is
+made much fainter to be like a blank wall shows as little as that."""
+
+BLACK, WHITE = 5, 250
+"""Grey levels beyond which a camera tells nothing any more."""
+
+
+class FrameOverlap(Enum):
+    """What an image shows, compared with one before it."""
+
+    SAME = auto()
+    """The same things; or nothing that could tell."""
+    STRANGE = auto()
+    """Other things."""
+    BLANK = auto()
+    """Nothing, where there should be something: it is dark, the lens is covered, or the camera dazzled."""
+
+
 LEAST = 8
 """Points that should be in the image; with fewer nothing is said."""
 SHARE = 0.45
@@ -45,31 +70,6 @@ LEAST_SPREAD = 8.0
 """And vary by more than this, grey levels: all blank walls are alike."""
 SAME_LIGHT = 10.0
 """And are equally bright on average, to within this, grey levels."""
-
-
-PATCH_PX = 11
-"""Side of the square in which texture is measured, about that of a tracked patch."""
-
-GRID = (6, 8)
-"""Rows and columns of the image's cells, each of which gives at most one corner."""
-
-LEAST_GAIN, MOST_GAIN = 0.5, 4.0
-"""How much a light may change: a darker image has too few grey levels left to be tracked in, and one that is
-made much fainter to be like a blank wall shows as little as that."""
-
-BLACK, WHITE = 5, 250
-"""Grey levels beyond which a camera tells nothing any more."""
-
-
-class FrameOverlap(Enum):
-    """What an image shows, compared with one before it."""
-
-    SAME = auto()
-    """The same things; or nothing that could tell."""
-    STRANGE = auto()
-    """Other things."""
-    BLANK = auto()
-    """Nothing, where there should be something: it is dark, the lens is covered, or the camera dazzled."""
 
 
 class KidnapDetector:

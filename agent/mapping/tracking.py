@@ -29,10 +29,21 @@ from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
 
+
+class LostTracks(NamedTuple):
+    """Landmarks of the filter that were not followed into an image.
+
+    Attributes:
+        ids: (N,) of the tracks.
+        templates: what they looked like.
+    """
+
+    ids: NDArray[np.int64]
+    templates: Templates
+
+
 LEAST_SPREAD = 0.2
 """Likewise if they cover less than this share of the image's width."""
-
-
 MOST_FILTERED = 54
 """Landmarks in the EKF, hidden ones and those that came in their stead included."""
 LEAST_FILTERED = 5
@@ -54,18 +65,6 @@ DROPPED = 3
 """Images that may be missing, one after the other, before the robot should wait for the next."""
 STALE = (0.4, 0.5)
 """M and rad; once the wheels have moved this much, nothing can be said of an image before."""
-
-
-class LostTracks(NamedTuple):
-    """Landmarks of the filter that were not followed into an image.
-
-    Attributes:
-        ids: (N,) of the tracks.
-        templates: what they looked like.
-    """
-
-    ids: NDArray[np.int64]
-    templates: Templates
 
 
 class Tracking:

@@ -31,16 +31,6 @@ from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
-TIGHT = 0.07
-"""Something nearer than this counts as what is in the way, m."""
-ANSWER_PATIENCE = 100
-"""Ticks that an answer may take before the question counts as lost."""
-PAUSE = 2.0
-"""Seconds that it waits before what is in its way, and before it asks again for a route."""
-TRUSTED = 1.0
-"""After a block it still knows where it is if it has driven less than this blindly, m."""
-
-
 HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
 NOTHING_NEAR = "it gets no further, though nothing is near"
 
@@ -53,6 +43,16 @@ class Stage(StrEnum):
     BLOCKED = "standing before something in the way"
     WAITING = "waiting for a way"
     ARRIVED = "parked at the goal"
+
+
+TIGHT = 0.07
+"""Something nearer than this counts as what is in the way, m."""
+ANSWER_PATIENCE = 100
+"""Ticks that an answer may take before the question counts as lost."""
+PAUSE = 2.0
+"""Seconds that it waits before what is in its way, and before it asks again for a route."""
+TRUSTED = 1.0
+"""After a block it still knows where it is if it has driven less than this blindly, m."""
 
 
 class Navigator:

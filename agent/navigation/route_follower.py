@@ -25,6 +25,20 @@ from mapweave.hybridmap.query import RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
+MOST_LOOKED_FOR = 8
+"""Nodes tried in one image: a route may put any number of them into one place."""
+
+
+class RouteProgress(StrEnum):
+    """How far a follower is."""
+
+    DRIVING = "driving along the route"
+    PARKING = "parking at the goal"
+    ARRIVED = "parked at the goal"
+    UNSURE = "no landmark in sight for a while"
+    BLOCKED = "not getting on"
+
+
 NEAR = 0.35
 """Within this distance of the goal the last, blind turns are made if it is not in sight, m."""
 PASSED = 0.22
@@ -49,20 +63,6 @@ STALLED_PARKING = 10.0
 """Likewise on the way to the goal's pose, which may take a manoeuvre."""
 BARRED = 5.0
 """How long it drives around then, s."""
-
-
-MOST_LOOKED_FOR = 8
-"""Nodes tried in one image: a route may put any number of them into one place."""
-
-
-class RouteProgress(StrEnum):
-    """How far a follower is."""
-
-    DRIVING = "driving along the route"
-    PARKING = "parking at the goal"
-    ARRIVED = "parked at the goal"
-    UNSURE = "no landmark in sight for a while"
-    BLOCKED = "not getting on"
 
 
 class RouteFollower:

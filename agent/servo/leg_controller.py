@@ -11,10 +11,6 @@ from mapweave.agent.servo.margins import TURN_GAIN
 from mapweave.agent.servo.plan import Leg
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
-FORWARD_GAIN = 1.5
-"""1/s, slows legs toward their end."""
-
-
 _ALIGNED = 0.04
 """rad, a turn on the spot ends here."""
 
@@ -31,6 +27,10 @@ class Limits:
 
     forward: float
     turn: float
+
+
+FORWARD_GAIN = 1.5
+"""1/s, slows legs toward their end."""
 
 
 class LegController:

@@ -16,15 +16,6 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
 
-HALF_PX = 7
-"""A patch reaches this far from its point in each direction."""
-SIGMA_PX = 4.0
-"""Of the Gaussian by which pixels far from the point count less: they are on another surface, or on a
-slanted one, more often than those near it."""
-MOST_SCALE = 1.7
-"""Once a patch has grown or shrunk by more than this it is cut anew from the present image."""
-
-
 Floats = NDArray[np.float32]
 
 FAINT = 0.5
@@ -100,6 +91,15 @@ class Match:
     raw: Array
     held: NDArray[np.bool_]
     templates: Templates
+
+
+HALF_PX = 7
+"""A patch reaches this far from its point in each direction."""
+SIGMA_PX = 4.0
+"""Of the Gaussian by which pixels far from the point count less: they are on another surface, or on a
+slanted one, more often than those near it."""
+MOST_SCALE = 1.7
+"""Once a patch has grown or shrunk by more than this it is cut anew from the present image."""
 
 
 class TemplateMatcher:

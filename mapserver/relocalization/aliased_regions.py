@@ -23,14 +23,6 @@ from mapweave.mapserver.relocalization.aliased_landmarks import between, same_pl
 from mapweave.mapserver.relocalization.place_hypotheses import THING_SIGMA, NodeMatch, extent
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
-NODES = 8
-"""Around a place that are asked at most."""
-REACH = 3.0
-"""Nodes farther from the robot are not asked, m."""
-BESIDE = 0.35
-"""A landmark nearer than this to one that a double shows is shown by it too, m."""
-
-
 WELL_INSIDE = 0.85
 """Of a camera's semi-aperture: of what is nearer to the edge of its image a node keeps little."""
 ALIKE_TURN, ALIKE_TIMES = math.radians(35.0), 1.6
@@ -100,6 +92,14 @@ class _Vote:
     there: Pose2
     robot: Pose2
     shown: Array
+
+
+NODES = 8
+"""Around a place that are asked at most."""
+REACH = 3.0
+"""Nodes farther from the robot are not asked, m."""
+BESIDE = 0.35
+"""A landmark nearer than this to one that a double shows is shown by it too, m."""
 
 
 class AliasedRegions:

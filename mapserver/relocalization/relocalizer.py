@@ -33,11 +33,6 @@ from mapweave.registration.matching import match
 from mapweave.registration.pose_refinement import look_closer
 from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
 
-RELOCALIZATION_CANDIDATES = 16
-"""Nodes that are compared with the view."""
-EXPLAINED_PX = 12.0
-"""A match nearer than this to where a pose found elsewhere expects it speaks for that."""
-
 
 @dataclass(frozen=True)
 class RelocalizationSettings:
@@ -52,6 +47,12 @@ class RelocalizationSettings:
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
     regions: AliasedRegionSettings = field(default_factory=AliasedRegionSettings)
     faint: float = 0.25
+
+
+RELOCALIZATION_CANDIDATES = 16
+"""Nodes that are compared with the view."""
+EXPLAINED_PX = 12.0
+"""A match nearer than this to where a pose found elsewhere expects it speaks for that."""
 
 
 class Relocalizer:

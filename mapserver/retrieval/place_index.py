@@ -16,10 +16,6 @@ from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_print
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
 
-REACH = 0.6
-"""Distance of two decoded descriptors at which a vote counts nothing."""
-
-
 SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
 FEW_GONE = 20
@@ -53,6 +49,10 @@ def bounded(node: Node) -> Node:
     if len(node.landmarks) <= MOST_LANDMARKS:
         return node
     return replace(node, landmarks=node.landmarks.take(np.arange(MOST_LANDMARKS)))
+
+
+REACH = 0.6
+"""Distance of two decoded descriptors at which a vote counts nothing."""
 
 
 class PlaceIndex:

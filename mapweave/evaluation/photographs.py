@@ -33,13 +33,6 @@ from mapweave.storage.image_file import read_grey
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
-CANDIDATES = 8
-"""Places that are compared with a question."""
-APART = 2
-"""Places further from each other than so many images are not neighbours."""
-COMPARABLE = 0.6
-"""And with this share of the best one's inliers the other one makes it ambiguous."""
-
 
 @dataclass(frozen=True)
 class Reference:
@@ -130,6 +123,14 @@ def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], com
         if enough and not any(together(name, other) for other in found):
             found.append(name)
     return found
+
+
+CANDIDATES = 8
+"""Places that are compared with a question."""
+APART = 2
+"""Places further from each other than so many images are not neighbours."""
+COMPARABLE = 0.6
+"""And with this share of the best one's inliers the other one makes it ambiguous."""
 
 
 class AppearanceMap:

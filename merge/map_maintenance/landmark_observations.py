@@ -21,16 +21,6 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.projected_view import ProjectedView
 from mapweave.registration.matching import squared_distances
 
-MARGIN_PX = 12.0
-"""It should be seen if it projects this far inside the image."""
-SCALE = 1.6
-"""And if its distance has changed by at most this factor."""
-ASIDE = math.radians(25.0)
-"""And if it is seen from a direction that differs by at most this, rad."""
-BEFORE_PX = 12.0
-"""Something hides it that is seen this near to it in the image."""
-BEFORE = 0.8
-"""At less than this share of its distance."""
 NEAR_PX = 25.0
 """It is found again this near to where it projects."""
 ALIKE = 0.3
@@ -83,6 +73,18 @@ class LandmarkObservations:
             unlike = squared_distances(decode(codes[0]), decode(codes[1])) - rounding_noise()
             found[sought] = ((apart < NEAR_PX) & (unlike < ALIKE**2)).any(axis=1)
         return LandmarkObservations(node, view, link, node_from_view, shown, found)
+
+
+MARGIN_PX = 12.0
+"""It should be seen if it projects this far inside the image."""
+SCALE = 1.6
+"""And if its distance has changed by at most this factor."""
+ASIDE = math.radians(25.0)
+"""And if it is seen from a direction that differs by at most this, rad."""
+BEFORE_PX = 12.0
+"""Something hides it that is seen this near to it in the image."""
+BEFORE = 0.8
+"""At less than this share of its distance."""
 
 
 def expected(old: Node, new: Node, old_from_new: Pose2) -> NDArray[np.bool_]:

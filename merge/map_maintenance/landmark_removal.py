@@ -38,32 +38,16 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
-USUAL = 0.1
-"""Share of what it should show that a view finds, as far as it tells nothing better."""
 MOVED = 0.05
 """M, by which two nodes may move to each other before their views are compared anew."""
 
 
-RATES = (0.1, 0.9)
-"""Within which the share is held that a view finds of what it should show."""
 LEAST_SHOWN = 15
 """A view that should show fewer landmarks tells nothing."""
 SURE = (0.05, 0.05, 0.03)
 """M, m and rad, nor does one that the merged map does not place within one sigma of this."""
-WEIGHT = 15.0
-"""With the weight of so many landmarks."""
 THING = 0.3
 """M, landmarks that are nearer than this to each other go together."""
-HIDDEN = 0.05
-"""Probability that a thing is hidden during a visit by what nobody knows of."""
-MISTAKEN = 0.01
-"""Probability that a landmark that is gone is found all the same."""
-GOES = 0.02
-"""Probability that a landmark has gone from one visit to the next."""
-COMES = 0.02
-"""That one that had gone is back."""
-AT_FIRST = 0.95
-"""Probability that it was really there when it was mapped."""
 FAINT = 0.2
 """A landmark that is there with less than this has faded."""
 NEAR = 2.5
@@ -214,6 +198,18 @@ def things(node: Node, size: float) -> NDArray[np.bool_]:
     return near
 
 
+HIDDEN = 0.05
+"""Probability that a thing is hidden during a visit by what nobody knows of."""
+MISTAKEN = 0.01
+"""Probability that a landmark that is gone is found all the same."""
+GOES = 0.02
+"""Probability that a landmark has gone from one visit to the next."""
+COMES = 0.02
+"""That one that had gone is back."""
+AT_FIRST = 0.95
+"""Probability that it was really there when it was mapped."""
+
+
 def presence(together: NDArray[np.bool_], looks: Sequence[LandmarkObservations]) -> Array:
     """(N,) probability that each landmark of a node is still there after some views.
 
@@ -258,6 +254,14 @@ def visits(looks: Sequence[LandmarkObservations], again: float) -> list[list[Lan
             found.append([])
         found[-1].append(look)
     return found
+
+
+USUAL = 0.1
+"""Share of what it should show that a view finds, as far as it tells nothing better."""
+RATES = (0.1, 0.9)
+"""Within which the share is held that a view finds of what it should show."""
+WEIGHT = 15.0
+"""With the weight of so many landmarks."""
 
 
 def found_again(together: NDArray[np.bool_], look: LandmarkObservations) -> float:

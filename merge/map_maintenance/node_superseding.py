@@ -33,24 +33,8 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
-FOUND = 20
-"""Landmarks that both show and that stay in view between them."""
-DETOUR = 1.5
-"""M, by which a way between neighbours may become longer."""
 NEAR = 0.5
 """M, nodes nearer than this to each other stand in one place, as for routes."""
-
-
-DEPTHS = 0.7
-"""It knows at least this share of the number of depths that the other one knows."""
-ENOUGH = 60
-"""Or at least this many."""
-AGAIN = 120.0
-"""S, that lie between them if both belong to one map: views of one visit complete each other."""
-GATE = 16.3
-"""Chi-square with 3 degrees of freedom within which such a comparison bears out the merged map."""
-FLOOR = (0.05, 0.05, 0.03)
-"""M, m and rad, error of both that no covariance tells of."""
 
 
 SECOND = 1_000_000_000
@@ -118,6 +102,22 @@ class NodeSuperseder:
             if id(graph) not in known
             for node in graph.nodes
         }
+
+
+FOUND = 20
+"""Landmarks that both show and that stay in view between them."""
+DETOUR = 1.5
+"""M, by which a way between neighbours may become longer."""
+DEPTHS = 0.7
+"""It knows at least this share of the number of depths that the other one knows."""
+ENOUGH = 60
+"""Or at least this many."""
+AGAIN = 120.0
+"""S, that lie between them if both belong to one map: views of one visit complete each other."""
+GATE = 16.3
+"""Chi-square with 3 degrees of freedom within which such a comparison bears out the merged map."""
+FLOOR = (0.05, 0.05, 0.03)
+"""M, m and rad, error of both that no covariance tells of."""
 
 
 class _Round:

@@ -38,8 +38,6 @@ from mapweave.merge.settings import ExclusionSettings
 SIGMAS = 2.0
 """The poses of the two are first moved apart by as many standard deviations, since what is wrong with them
 is wrong at all moments alike."""
-STEP = 0.5
-"""Moments between nodes are looked at as often as this, s."""
 
 
 def clash_of(
@@ -110,6 +108,10 @@ class _Met:
     odds: Array
     one: Stay
     two: Stay
+
+
+STEP = 0.5
+"""Moments between nodes are looked at as often as this, s."""
 
 
 def _met(

@@ -41,24 +41,6 @@ from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
-CORE = 0.8
-"""A ray surely meets a robot if it comes as near to its middle as this share of its radius: few robots are
-round, but a square hides this much to four of five sides."""
-FLOOR_XY = 0.03
-"""Error of how the two maps lie to each other that no covariance tells of, m."""
-
-
-MISSED = 0.1
-"""Share of looks, at most, in which the sensors miss a robot that stands in their way."""
-SCENERY = 0.2
-"""How often something else ends a ray where the robot would have been."""
-MARGIN = 0.1
-"""A ray went on if it is longer by more than this than where it would have met the robot, m."""
-MARGIN_SHARE = 0.05
-"""And by this share of it."""
-SIGMAS = (0.0, 1.0, 2.0, 3.0)
-"""The poses are moved by so many standard deviations, in every direction."""
-
 
 @dataclass(frozen=True, eq=False)
 class Errors:
@@ -82,6 +64,12 @@ MODES = 3
 def none_wrong(seen: VisibilityInterval) -> Errors:
     """All poses are what they are thought to be."""
     return Errors(np.zeros((1, len(seen), 2)), np.zeros((len(seen), 2, 2)), np.ones(1))
+
+
+FLOOR_XY = 0.03
+"""Error of how the two maps lie to each other that no covariance tells of, m."""
+SIGMAS = (0.0, 1.0, 2.0, 3.0)
+"""The poses are moved by so many standard deviations, in every direction."""
 
 
 def errors_in_common(graph: PoseGraph, seen: VisibilityInterval, floor_xy: float = FLOOR_XY) -> Errors:
@@ -171,6 +159,12 @@ def odds_against(
     return out
 
 
+MISSED = 0.1
+"""Share of looks, at most, in which the sensors miss a robot that stands in their way."""
+SCENERY = 0.2
+"""How often something else ends a ray where the robot would have been."""
+
+
 def _odds(seen: VisibilityInterval, places: Array, least_apart: float) -> Array:
     """(M,) odds against the merge if the other one was equally likely at each of (M, D, 2) places, m."""
     went_on, ended = _outcomes(seen, places)
@@ -182,6 +176,15 @@ def _odds(seen: VisibilityInterval, places: Array, least_apart: float) -> Array:
     without = unknown + (1.0 - SCENERY) * on + there
     out: Array = without / (unknown + MISSED * on + (1.0 - MISSED) / SCENERY * there)
     return out
+
+
+CORE = 0.8
+"""A ray surely meets a robot if it comes as near to its middle as this share of its radius: few robots are
+round, but a square hides this much to four of five sides."""
+MARGIN = 0.1
+"""A ray went on if it is longer by more than this than where it would have met the robot, m."""
+MARGIN_SHARE = 0.05
+"""And by this share of it."""
 
 
 def _outcomes(seen: VisibilityInterval, places: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

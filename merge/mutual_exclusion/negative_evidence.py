@@ -37,34 +37,6 @@ MOST = 100.0
 """Odds against a merge are never more: that all things changed is as probable as this."""
 
 
-NEAR = 1.5
-"""A view is held against nodes at most so far away, m."""
-TURN = math.radians(50.0)
-"""That look at most so much another way, rad."""
-LASTING = 3600.0
-"""And were made at most so much earlier or later, s."""
-MOST_NODES = 4
-"""Against the nearest ones if there are more."""
-MOST_VIEWS = 80
-"""Of each robot are looked at, evenly chosen."""
-SIGMA_XY = 0.15
-"""How the two stand is known as well as this at least, m."""
-SIGMA_HEADING = math.radians(3.0)
-"""And this, rad."""
-MARGIN = 0.04
-"""A landmark should be seen if it projects this far inside the image, rad."""
-SCALE = 1.4
-"""And if its distance has changed by at most this factor."""
-ASIDE = math.radians(15.0)
-"""And if it is seen from a direction that differs by at most this, rad."""
-AROUND = 0.1
-"""And if the view knows a depth this near to it in the image, rad."""
-BEFORE = 0.8
-"""And none there of less than this share of the landmark's distance."""
-WITHIN = 0.15
-"""It is found if what matches it is this near to where it should be, rad."""
-LEAST = 20
-"""Landmarks that a view should show before it says anything."""
 NOTHING = 0.03
 """A view shows nothing if it shows at most this share of them."""
 MISSED = 0.02
@@ -117,6 +89,12 @@ class Views:
         return min(float(np.log(means).sum()), math.log(MOST))
 
 
+MOST_VIEWS = 80
+"""Of each robot are looked at, evenly chosen."""
+LEAST = 20
+"""Landmarks that a view should show before it says anything."""
+
+
 def negative_evidence(
     graph: PoseGraph,
     first: BodyTrajectory,
@@ -145,6 +123,20 @@ def negative_evidence(
     )
 
 
+NEAR = 1.5
+"""A view is held against nodes at most so far away, m."""
+TURN = math.radians(50.0)
+"""That look at most so much another way, rad."""
+LASTING = 3600.0
+"""And were made at most so much earlier or later, s."""
+MOST_NODES = 4
+"""Against the nearest ones if there are more."""
+SIGMA_XY = 0.15
+"""How the two stand is known as well as this at least, m."""
+SIGMA_HEADING = math.radians(3.0)
+"""And this, rad."""
+
+
 def _near(
     graph: PoseGraph,
     looking: BodyTrajectory,
@@ -169,6 +161,10 @@ def _near(
     return out
 
 
+WITHIN = 0.15
+"""It is found if what matches it is this near to where it should be, rad."""
+
+
 def _look(graph: PoseGraph, node: Node, view: Node) -> tuple[Array, int]:
     """(K, 2) m, in merged, a node's landmarks that a view should show, and how many of them it shows."""
     merged_from_node = graph.pose(node.id)
@@ -182,6 +178,18 @@ def _look(graph: PoseGraph, node: Node, view: Node) -> tuple[Array, int]:
     one, other = seats[one[seats[one] >= 0]], other[seats[one] >= 0]
     off = np.linalg.norm(pixels[one] - view.landmarks.pixels[other], axis=1) / view.camera.fx
     return merged_from_node.apply(node.points_in_robot[shown][:, :2]), int((off < WITHIN).sum())
+
+
+MARGIN = 0.04
+"""A landmark should be seen if it projects this far inside the image, rad."""
+SCALE = 1.4
+"""And if its distance has changed by at most this factor."""
+ASIDE = math.radians(15.0)
+"""And if it is seen from a direction that differs by at most this, rad."""
+AROUND = 0.1
+"""And if the view knows a depth this near to it in the image, rad."""
+BEFORE = 0.8
+"""And none there of less than this share of the landmark's distance."""
 
 
 def should_show(node: Node, view: Node, node_from_view: Pose2) -> tuple[NDArray[np.int64], Array]:

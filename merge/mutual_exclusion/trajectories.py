@@ -13,20 +13,6 @@ from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.range_scans import RangeScans
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
-LONGEST_GAP = 5.2
-"""Between moments that are further apart nobody knows where the robot was, s."""
-LONGEST_WAY = 1.0
-"""Nor if they are further apart, m."""
-ALONG = 0.15
-"""How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
-standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a
-third of its length ahead or behind."""
-ASIDE = 0.05
-"""The same to the side of the line."""
-CLOCK_ERROR = 0.05
-"""Of two robots with the same clock, s."""
-
-
 NANOSECONDS = 1e9
 DRIFT = 0.02
 """How far a robot on its way is off beside its node, as a share of the way between them, one sigma."""
@@ -127,6 +113,20 @@ class Stay:
     places: Array
     spreads: Array
     nearest: NDArray[np.int64]
+
+
+LONGEST_GAP = 5.2
+"""Between moments that are further apart nobody knows where the robot was, s."""
+LONGEST_WAY = 1.0
+"""Nor if they are further apart, m."""
+ALONG = 0.15
+"""How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
+standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a
+third of its length ahead or behind."""
+ASIDE = 0.05
+"""The same to the side of the line."""
+CLOCK_ERROR = 0.05
+"""Of two robots with the same clock, s."""
 
 
 def stay(trail: BodyTrajectory, places: Array, times: Array) -> Stay:

@@ -34,12 +34,6 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 
-APART_XY = 0.5
-"""They contradict each other by more than this, m, or."""
-APART_HEADING = 0.26
-"""By more than this, rad. Less is how well places are measured, not another place."""
-
-
 FOLLOWED = (EdgeKind.MAPPED, EdgeKind.TURNED)
 """Edges whose two nodes share landmarks that were tracked from image to image."""
 
@@ -84,6 +78,12 @@ def weigh(
         if doubles:
             doubles = _followed(doubles, [known[k] for k in loops[~astray]], maps)
     return [_weighed(link, doubles) for link in links]
+
+
+APART_XY = 0.5
+"""They contradict each other by more than this, m, or."""
+APART_HEADING = 0.26
+"""By more than this, rad. Less is how well places are measured, not another place."""
 
 
 @dataclass(frozen=True, eq=False)

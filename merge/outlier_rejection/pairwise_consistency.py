@@ -33,12 +33,6 @@ from mapweave.merge.pose_graph.links import Link, RefusedLink, place_told, refus
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians
 
-OVERWHELMING_INLIERS = 45
-"""A single link with as many landmarks ..."""
-OVERWHELMING_SHARE = 0.7
-"""... and this share of its matches joins them alone."""
-PLACE = 2.0
-"""Nodes of a map that are nearer to each other see the same landmarks, m."""
 CHANCE = 0.01
 """So many false sets at most may be expected between two pieces that are as good as the one that is
 kept."""
@@ -139,6 +133,10 @@ def _loops(
     return out, spreads
 
 
+PLACE = 2.0
+"""Nodes of a map that are nearer to each other see the same landmarks, m."""
+
+
 def sort_links(
     links: Sequence[Link], first: Fragment, second: Fragment, settings: ConsistencySettings | None = None
 ) -> Sorted:
@@ -231,6 +229,12 @@ def _rival(
     others = others[agree[others][:, best].mean(axis=1) < 0.5] if best else others
     clique = best_clique(agree[np.ix_(others, others)], weights[others], EXACT)
     return [int(k) for k in others[clique]]
+
+
+OVERWHELMING_INLIERS = 45
+"""A single link with as many landmarks ..."""
+OVERWHELMING_SHARE = 0.7
+"""... and this share of its matches joins them alone."""
 
 
 def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:

@@ -17,14 +17,8 @@ from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.node import Edge, Node, NodeId
 from mapweave.registration.matching import squared_distances
 
-ALIKE = 0.5
-"""Distance of two decoded descriptors below which they may be the same landmark."""
 LEAST_OVERLAP = 3.0
 """Pairs whose nodes have less in common (see `overlap`) are not compared."""
-MOST_PER_MAP = 4
-"""Best pairs of one node with the nodes of any one map."""
-LEAST_HOPS = 3
-"""Nodes of one map that are fewer edges apart are neighbours, not loops."""
 
 
 Pair = tuple[NodeId, NodeId]
@@ -53,6 +47,10 @@ def overlap(
     return min(sums)
 
 
+ALIKE = 0.5
+"""Distance of two decoded descriptors below which they may be the same landmark."""
+
+
 def overlaps(nodes: Collection[Node]) -> dict[Pair, float]:
     """The table for nodes that are all there, by comparing every pair: exact, for some hundred nodes.
 
@@ -70,6 +68,12 @@ def overlaps(nodes: Collection[Node]) -> dict[Pair, float]:
             if value >= LEAST_OVERLAP:
                 table[ordered[j].id, a.id] = value
     return table
+
+
+MOST_PER_MAP = 4
+"""Best pairs of one node with the nodes of any one map."""
+LEAST_HOPS = 3
+"""Nodes of one map that are fewer edges apart are neighbours, not loops."""
 
 
 def choose_pairs(
