@@ -13,10 +13,10 @@ from mapweave.agent.observation import RobotDescription
 from mapweave.agent.settings import OccupancyGridSettings
 from mapweave.hybridmap.pose import Array, Pose2
 
-OCCUPANCY_GRID_HIT = 0.9
+HIT = 0.9
 """Log-odds that a cell gains when a ranger ends in it."""
 MISS = 0.35
-"""Log-odds that it loses when a ranger passes through."""
+"""Log-odds that a cell loses when a ranger passes through it."""
 MOST = 3.0
 """Log-odds are kept within plus and minus this, so that a thing that moved away is forgotten."""
 
@@ -80,7 +80,7 @@ class OccupancyGrid:
         hits = proximity < self._description.ranger_reach - 0.05
         ended = np.unique(self.cells(here + directions[hits] * ends[hits, None]), axis=0)
         self._odds[free[:, 0], free[:, 1]] -= MISS
-        self._odds[ended[:, 0], ended[:, 1]] += OCCUPANCY_GRID_HIT + MISS
+        self._odds[ended[:, 0], ended[:, 1]] += HIT + MISS
         # Where the robot stands there is nothing.
         own = self.cells(here + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
         self._odds[own[:, 0], own[:, 1]] = -MOST

@@ -43,14 +43,14 @@ class Reachability:
 
 
 FARTHEST = 2.5
-"""M, between two nodes."""
+"""Largest distance of two nodes between which the servo drives, m."""
 WIDEST = math.radians(45.0)
-"""Rad, between their headings."""
+"""Largest turn between their headings, rad."""
 LEAST = 7
 """Common landmarks that stay in view: as many as a look for the next node asks for; the servo itself holds
 on to four."""
 STOPS = 9
-"""Poses on the way at which is counted."""
+"""Poses on the way at which landmarks in view are counted."""
 
 
 def reachability_of(edge: Edge, a: Node, b: Node) -> Reachability:

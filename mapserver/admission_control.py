@@ -50,7 +50,7 @@ class AdmissionSettings:
 
 
 LONGEST_PAUSE = 10.0
-"""Nobody is sent away for longer, s."""
+"""Longest time after which a robot is told to ask again, s."""
 
 
 class AdmissionControl:

@@ -8,9 +8,10 @@ from collections.abc import Collection
 from mapweave.hybridmap.node import NodeId
 
 FORGET = 120.0
-"""After it was said last, s; infinite where only simulated time passes, which no server knows."""
+"""How long a blockage counts after it was reported last, s; infinite where only simulated time passes,
+which no server knows."""
 MOST = 256
-"""So many pairs are kept, those that were said last."""
+"""Blockages that are kept, those that were reported last."""
 
 
 Pair = tuple[NodeId, NodeId]

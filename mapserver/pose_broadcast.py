@@ -34,15 +34,15 @@ class _Told:
 
 
 EVERY = 2.0
-"""S between two news of one agent, at least."""
+"""Shortest time between two messages to one agent, s."""
 BEAT = 15.0
-"""S after which it is told the number of the last news again, so that lost ones are missed."""
+"""After this time the number of the last message is sent again, so that lost ones are missed, s."""
 MOST = 2048
 """Nodes in one message."""
 DISTANCE = 0.05
-"""A node that lies less far from where its agent was told that it lies is not told anew, m."""
+"""A node that has moved less than this since its agent was told is not sent again, m."""
 TURN = math.radians(1.0)
-"""And is turned by less, rad."""
+"""A node that has turned less than this since its agent was told is not sent again, rad."""
 
 
 class PoseBroadcast:

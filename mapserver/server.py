@@ -51,7 +51,7 @@ class ServerSettings:
 
 
 STATUS_EVERY = 0.5
-"""Seconds between two status messages."""
+"""Time between two status messages, s."""
 MERGE_SHARE = 0.4
 """At most this share of the time is spent making the merged map anew."""
 

@@ -21,8 +21,8 @@ from mapweave.registration.planar_ambiguity import mirrored
 from mapweave.registration.projection import Stack
 from mapweave.registration.sightings import Sightings
 
-PLANAR_POSE_ROUNDS = 8
-"""Of Gauss-Newton at most."""
+GAUSS_NEWTON_STEPS = 8
+"""Gauss-Newton steps, at most."""
 
 
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
@@ -129,7 +129,7 @@ def solve_sightings(
     if not kept:
         return None
     best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
-    fix = refine(stack, best, settings.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
+    fix = refine(stack, best, settings.scale_sigma, prior, rounds=GAUSS_NEWTON_STEPS)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return _weighed(fix, parts, stack, settings, prior)
@@ -151,13 +151,13 @@ def _weighed(
     if int(seen.sum()) < s.least_inliers:
         return fix
     mean = fix.node_from_robot.mean
-    other = improve(stack, mirrored(mean, stack.points[seen, :2]), prior, rounds=PLANAR_POSE_ROUNDS)
+    other = improve(stack, mirrored(mean, stack.points[seen, :2]), prior, rounds=GAUSS_NEWTON_STEPS)
     if other is None or other[0].distance(mean) < APART:
         return fix
     ours, theirs = _scores(parts, np.stack([mean.vector, other[0].vector])).tolist()
     if theirs <= ours:
         return replace(fix, rival=max(theirs, 0.0) / ours if ours > 0.0 else 1.0)
-    better = refine(stack, other[0], s.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
+    better = refine(stack, other[0], s.scale_sigma, prior, rounds=GAUSS_NEWTON_STEPS)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
         return replace(fix, rival=1.0)
     return replace(better, rival=max(ours, 0.0) / theirs)

@@ -268,9 +268,10 @@ def _sightings(
 
 
 LEAST_SHARE = 0.35
-"""Of the matches that could have been inliers."""
+"""Share of the matches that could have been inliers which must be inliers."""
 LEAST_DEPTHS = 0.5
-"""Of the landmarks that fit by their pixels and have a depth on both sides, how many agree in depth too."""
+"""Share of the landmarks that fit by their pixels and have a depth on both sides which must agree in depth
+too."""
 MOST_MEAN_SQUARE = 3.0
 """Largest mean squared normalised residual; 1 is expected."""
 

@@ -63,15 +63,15 @@ LEAST_TEXTURE = 1.5
 is that of noise alone: such a feature slides along the edge when it is tracked (aperture problem),
 unnoticed by a forward-backward check."""
 LEAST_ROUNDNESS = 0.04
-"""The same in the weakest direction as a share of that in the strongest."""
+"""The same mean squared gradient in the weakest direction, as a share of that in the strongest."""
 CONTRAST = 0.02
 """SIFT's contrast threshold; lower finds more and weaker features."""
 CELLS = 4
-"""The image is cut into cells x cells; each may give at most `crowding` times its even share."""
+"""The image is cut into CELLS x CELLS cells;"""
 CROWDING = 2.5
-"""See cells."""
+"""each may give at most this many times its even share of the features."""
 BORDER_PX = 6.0
-"""Features nearer to the image's border are left out, they cannot be tracked."""
+"""Features nearer to the image's border are left out, as they cannot be tracked, px."""
 
 
 class Sift:

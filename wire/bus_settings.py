@@ -11,7 +11,7 @@ from mapweave.hybridmap.errors import SettingsError
 RETRY_FIRST = 0.1
 """Pause before the second attempt to connect, s; doubled each time."""
 RETRY_LONGEST = 1.0
-"""Longest pause, s."""
+"""Longest pause between attempts to connect, s."""
 LEASE = 2.5
 """After what silence a participant counts as dead, s."""
 QUEUE_LIMIT = 16384

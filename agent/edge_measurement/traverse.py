@@ -44,14 +44,14 @@ WIDEST = 0.1
 SETTLED = 3
 """Images through which a node's landmarks must have been followed: fewer than lie between two looks for the
 next node."""
-TRAVERSE_GAP = 0.5
+MOST_BLIND = 0.5
 """What may lie between the landmarks of two nodes, as `Fix.blind` counts it, m."""
 REACH = 0.45
 """This near to a node the robot has passed it, m. It is twice the distance within which the follower takes
 a node for passed."""
 DETOUR = 1.3
-"""Nor is one on a way longer than the straight line by more than this factor, and `reach` at either end:
-something stands in between."""
+"""A traverse on a way longer than the straight line by more than this factor, and REACH at either end, is
+not worth telling: something stands in between."""
 
 
 class TraverseRecorder:
@@ -94,7 +94,7 @@ class TraverseRecorder:
         self._node_from_robot, self._gap = self._node_from_robot @ step, self._gap + blind
         self._way += abs(observation.odometry.forward)
         if not self._settled(fix):
-            if self._gap > TRAVERSE_GAP:
+            if self._gap > MOST_BLIND:
                 self._forget()
             return None
         assert fix.localizer is not None, "landmarks are in sight"

@@ -11,7 +11,8 @@ from mapweave.hybridmap.pose import Array
 SLIP = (0.1, 0.2)
 """Sigma of (forward m, turn rad) of a step whose wheels the landmarks refute."""
 DISTRUST = 10
-"""For so many steps after that, wheels that claim to stand are not believed."""
+"""Steps after one whose wheels the landmarks refute in which wheels that claim to stand are not
+believed."""
 
 
 class AdaptiveOdometryNoise:

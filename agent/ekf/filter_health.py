@@ -10,7 +10,7 @@ from mapweave.agent.ekf.update_report import Health
 from mapweave.hybridmap.pose import Array, Pose2
 
 PATIENCE = 2
-"""So many steps without an image are told."""
+"""Steps without an image after which the filter says so."""
 PARALLAX_PX = 5.0
 """Depths cannot be told before landmarks have moved by this much in the image, px."""
 

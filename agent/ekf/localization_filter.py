@@ -37,15 +37,15 @@ LEAST_FIXED = 4
 LEAST_REFOUND = 6
 """Landmarks that a static fix needs to replace a pose that was refuted."""
 LEAST_AGREEING = 3
-"""Fewer accepted landmarks than this are no good update."""
+"""An update with fewer accepted landmarks is bad."""
 LEAST_AGREEING_SHARE = 0.35
-"""Nor is a smaller share of those seen."""
+"""An update that accepts a smaller share of the landmarks seen is bad."""
 PATIENCE = 3
-"""So many bad updates in a row make the filter unhealthy."""
+"""Bad updates in a row that make the filter unhealthy."""
 WIDEST_SIGMA = 0.5
-"""So does a position less certain than this, m."""
+"""A position less certain than this makes the filter unhealthy, m."""
 NEAREST = 0.05
-"""Nor can those nearer to the node's optical centre, m."""
+"""Landmarks nearer than this to the node's optical centre cannot be anchored at it, m."""
 
 
 __all__ = ["LocalizationFilter", "NodeLandmarks"]

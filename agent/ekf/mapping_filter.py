@@ -29,14 +29,13 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, PoseGaussian
 
-POSE_NOISE = (0.0, 0.0, 0.0)
-"""Process noise of each step on (x m, y m, heading rad), standard deviations."""
 LEAST_AGREEING_SHARE = 0.4
-"""Nor is a smaller share of those seen."""
+"""An update that accepts a smaller share of the landmarks seen is not healthy."""
 CONVERGED_SIGMA = 0.05
 """Depth sigma under which a landmark has converged, m."""
 CONVERGED_SHARE = 0.05
-"""The same as a share of the depth; the larger of the two counts."""
+"""Depth sigma under which a landmark has converged, as a share of the depth; the larger of the two
+counts."""
 NEAREST = 0.05
 """Landmarks nearer than this to the optical centre are let go, m."""
 
@@ -85,7 +84,6 @@ class MappingFilter:
         )
         self._gate = pixel_gate(self.settings.gate_probability)
         self._noise = PixelNoise(self.settings.pixel_sigma, self._pinhole.focal, self.settings.adaptation)
-        self._pose_variances = np.square(np.array(POSE_NOISE, np.float64))
         self._settled = MappingState.at_anchor()
         self._step: Step | None = None
         self._watch = FilterHealth(camera.fx)
@@ -97,7 +95,7 @@ class MappingFilter:
         rays, scale = transform_rays(state.rays, odometry, mount)
         stays = (scale > 1e-3) & (rays[:, 2] * NEAREST <= 1.0) & (np.abs(rays[:, 0]) <= s.widest_slope)
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
-        taken = Step(state, odometry, root, aside, self._pose_variances, mount, odometry, pose_vector, rays)
+        taken = Step(state, odometry, root, aside, mount, odometry, pose_vector, rays)
         if not stays.all():
             self.lost += int(np.count_nonzero(~stays))
             self.ids = self.ids[stays]

@@ -110,7 +110,6 @@ class Step:
         measured: what the wheels say.
         wheel_root: (2, 2) root of the covariance S of (u1, u2).
         side_slip: sigma of u3, m.
-        pose_variances: (3,) process noise of the pose, the diagonal of Q.
         mount_forward: of the optical centre ahead of the axle, m.
         at: where the step is linearised: as measured, or a better guess.
         pose_vector: (3,) expected after the step.
@@ -121,7 +120,6 @@ class Step:
     measured: Odometry
     wheel_root: Array
     side_slip: float
-    pose_variances: Array
     mount_forward: float
     at: Odometry
     pose_vector: Array
@@ -137,7 +135,7 @@ class Step:
         """The same step linearised elsewhere, or with the wheels believed less."""
         step = Step(
             self.before, self.measured, self.wheel_root if wheel_root is None else wheel_root,
-            self.side_slip, self.pose_variances, self.mount_forward, at or self.at,
+            self.side_slip, self.mount_forward, at or self.at,
             self.pose_vector, self.rays,
         )  # fmt: skip
         # What is expected is another now as well.
@@ -198,7 +196,7 @@ class Step:
         by_input = np.concatenate([pose_by_input, moved.by_input.reshape(-1, 3)])
         input_root = np.zeros((3, 3))
         input_root[:2, :2], input_root[2, 2] = self.wheel_root, self.side_slip
-        covariance = propagate(before.covariance, by_state, by_input, input_root, self.pose_variances)
+        covariance = propagate(before.covariance, by_state, by_input, input_root)
         further = np.array([self.measured.forward - at.forward, self.measured.turn - at.turn])
         shift = by_input[:, :2] @ further
         self.pose_vector, self.rays = pose_vector + shift[:3], moved.rays + shift[3:].reshape(-1, 3)

@@ -8,17 +8,17 @@ from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation
 
 CONVERGED = 0.7
-"""The share of landmarks that must have converged."""
+"""Share of the landmarks that must have converged before a node is made."""
 DEPTH_STEP = 0.25
 """Converged landmarks make a node only after moving this share of their median depth."""
 
 
 LEAVING = 0.45
-"""Or the share of the view's features still tracked below which they are leaving the view."""
+"""With a smaller share of the view's features still tracked, the view is being left and a node is made."""
 LEAST_TRACKED = 16
-"""Or this few of them."""
+"""With fewer features still tracked, the view is being left and a node is made."""
 LEAST_TURN = 0.35
-"""Or after turning by this, rad."""
+"""Converged landmarks make a node after turning by this as well, rad."""
 
 
 class CarriedMapping:

@@ -82,9 +82,9 @@ def next_viewpoint(
 VIEW = 3.0
 """A look around shows floor up to this far, m."""
 LOOK_TIME = 60.0
-"""About what a look around takes, s."""
+"""How long a look around takes, about, s."""
 LEAST_AREA = 1.0
-"""New floor that is worth one, m^2."""
+"""New floor that is worth a look around, m^2."""
 
 
 def _new_floor(

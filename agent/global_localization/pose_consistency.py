@@ -37,9 +37,10 @@ class PoseHypothesis:
 OTHER_VIEW = (1.5, 0.9)
 """A view shows other things than another if the robot has driven or turned by this in between, m and rad."""
 WITHIN = (0.2, 0.1)
-"""Two recognitions agree within this, m and rad,"""
+"""Two recognitions agree if they are no further apart than this, m and rad, and DRIFT."""
 DRIFT = 0.03
-"""and this share of the way and of the turn in between: wheels are never quite round."""
+"""Share of the way and of the turn in between by which two recognitions may differ: wheels are never quite
+round."""
 
 
 def consistent(earlier: PoseHypothesis, now: PoseHypothesis) -> bool:

@@ -44,7 +44,7 @@ EXPECTED = RecognitionSettings(least_inliers=7, least_cells=2, least_seen=0.05, 
 PLAUSIBLE = 0.3
 """A recognition this far from where the robot believes to be is not believed, m."""
 PLAUSIBLE_TURN = 0.25
-"""Likewise, rad."""
+"""A recognition turned this much from where the robot believes to be is not believed, rad."""
 MORE = 1.3
 """What is tracked already is given up for a fresh look that finds this many times as many landmarks."""
 

@@ -32,20 +32,20 @@ LEAST_LANDMARKS = 6
 DEPTH_SHARE = 0.25
 """A landmark is kept if its depth's sigma is below this share of the depth."""
 DEPTH_FLOOR = (0.01, 0.015)
-"""What a depth is never better than: m, and share of the depth."""
+"""Smallest standard deviation of a depth: m, and share of the depth."""
 MOST_CHI2 = 4.0
 """A triangulated track fits if its mean squared residual is below this; 1 is expected."""
 EDGE_FLOOR = (0.002, 0.004)
-"""What an edge's pose is never better than, m and rad: tracks err alike for a while, which the filter, for
-which pixels err independently, does not know."""
+"""Smallest standard deviation of an edge's pose, m and rad: tracks err alike for a while, which the filter,
+for which pixels err independently, does not know."""
 EDGE_SHARE = (0.005, 0.01)
-"""Likewise as a share of the way and of the turn: wheels are never quite round."""
+"""What is added to that, as a share of the way and of the turn: wheels are never quite round."""
 LOOP_REACH = 1.2
 """Nodes of the own map nearer than this are tried for a loop closure, m."""
 LOOP_TURN = 0.7
-"""And turned by less than this, rad."""
+"""Nodes turned by less than this are tried for a loop closure, rad."""
 LOOP_TRIES = 4
-"""At most this many, nearest first."""
+"""Nodes that are tried for loop closures of a new node, nearest first."""
 LOOP_SIGMA = 0.12
 """A loop closure known no better than this is left to the server, m."""
 LOOP_GATE = 25.0

@@ -49,7 +49,7 @@ class FrameOverlap(Enum):
 LEAST = 8
 """Points that should be in the image; with fewer nothing is said."""
 SHARE = 0.45
-"""If fewer of them than this share are found, it shows something else."""
+"""If a smaller share of the expected points is found, the image shows something else."""
 BORDER_PX = 12.0
 """Points expected nearer to the border may well have left."""
 ASTRAY_PX = 20.0
@@ -59,17 +59,17 @@ LEAST_TEXTURE = 8.0
 LEAST_CORNERS = 6
 """An image with fewer corners shows nothing."""
 MOST_CLIPPED = 0.5
-"""And so does one of which a larger share is black or white."""
-KIDNAP_DETECTOR_FEW = 30
+"""An image of which a larger share is black or white shows nothing."""
+FEW_POINTS = 30
 """With fewer points than this in the image, all of it is compared besides."""
 COARSE = 8
-"""Side of the squares, px, over which images are averaged to be compared by and large."""
+"""Side of the squares over which images are averaged before they are compared as a whole, px."""
 ALIKE = 0.95
-"""They are the same if they then correlate by more than this."""
+"""Averaged images are the same if they correlate by more than this,"""
 LEAST_SPREAD = 8.0
-"""And vary by more than this, grey levels: all blank walls are alike."""
+"""vary by more than this, grey levels (all blank walls are alike),"""
 SAME_LIGHT = 10.0
-"""And are equally bright on average, to within this, grey levels."""
+"""and are equally bright on average to within this, grey levels."""
 
 
 class KidnapDetector:
@@ -109,7 +109,7 @@ class KidnapDetector:
             return FrameOverlap.SAME
         # A dozen tracks on smooth shapes can all be lost at once; then the whole image has its say.
         inside = int(self._camera.contains(expected, BORDER_PX).sum())
-        few = LEAST <= inside < KIDNAP_DETECTOR_FEW
+        few = LEAST <= inside < FEW_POINTS
         if few and self._alike(before, now, turn):
             return FrameOverlap.SAME
         clipped = float(((now <= BLACK) | (now >= WHITE)).mean())

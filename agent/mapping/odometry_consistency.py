@@ -13,9 +13,9 @@ from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 
 APART = (0.15, 0.15)
-"""M and rad that they may be apart after any way ..."""
+"""How far filter and wheels may be apart after any way, m and rad,"""
 SHARE = 0.1
-"""... and, besides, as a share of the way and of the turns: no wheel is quite round."""
+"""and besides as a share of the way and of the turns: no wheel is quite round."""
 
 
 class OdometryConsistency:

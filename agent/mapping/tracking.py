@@ -43,7 +43,7 @@ class LostTracks(NamedTuple):
 
 
 LEAST_SPREAD = 0.2
-"""Likewise if they cover less than this share of the image's width."""
+"""With landmarks that cover less than this share of the image's width the wheels are trusted alone."""
 MOST_FILTERED = 54
 """Landmarks in the EKF, hidden ones and those that came in their stead included."""
 LEAST_FILTERED = 5
@@ -53,18 +53,18 @@ ASSOCIATE_PX = 1.5
 STRIKES = 3
 """A track that the filter refuses this often in a row is given up."""
 PRIOR_SPREAD = 0.6
-"""Sigma of a new landmark's inverse depth, as a share of the expected one ..."""
+"""Sigma of a new landmark's inverse depth, as a share of the expected one."""
 PRIOR_NEAR = 0.45
-"""... but no less than this over the camera's height: a landmark may always be about as near as the floor.
-A robot before a bare wall would else take its nearness for a slip of the wheels."""
+"""The same sigma is at least this over the camera's height: a landmark may always be about as near as the
+floor. A robot before a bare wall would else take its nearness for a slip of the wheels."""
 DOUBT = 2.0
-"""Sigmas of triangulated depths are taken for so many times what they say."""
+"""Factor by which sigmas of triangulated depths are enlarged."""
 MOST_CHI2 = 4.0
-"""And depths of tracks whose mean squared residual is above this, not at all; 1 is expected."""
+"""Triangulated depths of tracks whose mean squared residual is above this are not used; 1 is expected."""
 DROPPED = 3
 """Images that may be missing, one after the other, before the robot should wait for the next."""
 STALE = (0.4, 0.5)
-"""M and rad; once the wheels have moved this much, nothing can be said of an image before."""
+"""Once the wheels have moved this much, nothing can be said of an image before, m and rad."""
 
 
 class Tracking:

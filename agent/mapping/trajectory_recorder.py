@@ -10,7 +10,7 @@ from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import FURTHEST, LONGEST, MOST, TrajectorySegment
 
 PERIOD = 1.0
-"""A moment each, s; twice as long whenever a wake grows too long."""
+"""Time between two kept moments, s; twice as long whenever a segment grows too long."""
 
 
 class TrajectoryRecorder:

@@ -50,7 +50,7 @@ TIGHT = 0.07
 ANSWER_PATIENCE = 100
 """Ticks that an answer may take before the question counts as lost."""
 PAUSE = 2.0
-"""Seconds that it waits before what is in its way, and before it asks again for a route."""
+"""How long it waits before what is in its way, and before it asks again for a route, s."""
 TRUSTED = 1.0
 """After a block it still knows where it is if it has driven less than this blindly, m."""
 

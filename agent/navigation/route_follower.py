@@ -46,7 +46,7 @@ PASSED = 0.22
 SIGHT_TURN = 0.6
 """A node's landmarks are looked for when the robot's heading is within this of it, rad."""
 SIGHT_REACH = 1.4
-"""And the robot within this distance of it, m."""
+"""A node's landmarks are looked for when the robot is within this distance of it, m."""
 LOOK_EVERY = 4
 """Ticks between two looks for the next nodes' landmarks."""
 SKIP = 2
@@ -54,15 +54,15 @@ SKIP = 2
 GOAL_LOOKS = 4
 """Fresh looks at the goal, averaged, that decide whether the robot stands there."""
 HIDDEN = 2.0
-"""Seconds at the goal without its landmarks in sight, or recognised, after which it is not there, s."""
+"""After this time at the goal without its landmarks in sight, or recognised, the robot is not there, s."""
 PATIENCE = 6.0
-"""Seconds without getting on before an edge counts as blocked."""
+"""Time without getting on before an edge counts as blocked, s."""
 STALLED = 3.0
-"""Seconds that the servo may take without getting nearer; then the robot drives around."""
+"""Time that the servo may take without getting nearer before the robot drives around, s."""
 STALLED_PARKING = 10.0
-"""Likewise on the way to the goal's pose, which may take a manoeuvre."""
+"""The same on the way to the goal's pose, which may take a manoeuvre, s."""
 BARRED = 5.0
-"""How long it drives around then, s."""
+"""How long the robot then drives around without the servo, s."""
 
 
 class RouteFollower:

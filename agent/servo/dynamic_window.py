@@ -25,11 +25,11 @@ SPEEDS = (1.0, 0.6, 0.3, 0.0, -0.3)
 TURNS = (1.0, 0.7, 0.45, 0.25, 0.1)
 """Shares of the largest rate that are tried, to either side."""
 FACING = 0.25
-"""M/rad, what it is worth to face the way."""
+"""What it is worth to face the way, m/rad."""
 ROOM = 0.05
-"""M, what it costs to have no room at all beyond the margin."""
+"""What it costs to have no room at all beyond the margin, m."""
 BACKWARD = 0.08
-"""M, what it costs to drive back: the rangers see as well there, the camera does not."""
+"""What it costs to drive back, m: the rangers see as well there, the camera does not."""
 
 
 class DynamicWindow:

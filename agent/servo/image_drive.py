@@ -12,25 +12,25 @@ from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.servo.leg_controller import clip
 
 ACCELERATION = 0.3
-"""M/s^2, of the speed profile at both ends."""
+"""Of the speed profile at both ends, m/s^2."""
 CENTRE_GAIN = 0.6
-"""1/s, turns toward the middle of the features."""
+"""Gain of turns toward the middle of the features, 1/s."""
 CENTRE_BAND = 0.06
-"""Rad, the middle may be this far off before it matters: the way stays almost straight."""
+"""The middle may be this far off before it matters, rad: the way stays almost straight."""
 HEADING_GAIN = 0.8
-"""1/s, holds the heading of the start."""
+"""Gain that holds the heading of the start, 1/s."""
 BORDER = 0.06
-"""Rad, features nearer to the border than this are about to be lost."""
+"""Features nearer to the border than this are about to be lost, rad."""
 MIN_VISIBLE = 6
 """The drive turns round before fewer features than this have room to the border."""
 SLOW = 0.35
-"""M, distance of an obstacle from the edge at which the drive slows."""
+"""Distance of an obstacle from the edge at which the drive slows, m."""
 STOP = 0.12
-"""M, distance at which it turns round."""
+"""Distance of an obstacle from the edge at which the drive turns round, m."""
 DEFLECT = 0.15
-"""Rad/s, largest deflection from an obstacle that is near on one side."""
+"""Largest deflection from an obstacle that is near on one side, rad/s."""
 CONE = 0.9
-"""Rad, rangers within this of the direction of travel matter."""
+"""Rangers within this of the direction of travel matter, rad."""
 
 
 class ImageDrive:

@@ -30,7 +30,7 @@ class Limits:
 
 
 FORWARD_GAIN = 1.5
-"""1/s, slows legs toward their end."""
+"""Gain that slows legs toward their end, 1/s."""
 
 
 class LegController:

@@ -5,11 +5,11 @@ from __future__ import annotations
 MIN_VISIBLE = 4
 """Landmarks that must stay in view."""
 FIELD_MARGIN = 0.05
-"""Rad, room that ways keep to the border of the field of view where they can."""
+"""Room that ways keep to the border of the field of view where they can, rad."""
 LEAST_MARGIN = 0.008
-"""Rad, room below which no way is taken."""
+"""Room below which no way is taken, rad."""
 TURN_GAIN = 2.5
-"""1/s, of turns on the spot and of the heading on legs."""
+"""Gain of turns on the spot and of the heading on legs, 1/s."""
 
 
 def margins() -> tuple[float, ...]:

@@ -13,7 +13,7 @@ from mapweave.agent.servo.servo_step import State
 from mapweave.hybridmap.pose import Pose2
 
 RETREAT = 0.6
-"""M, longest way back along the optical axis to find landmarks again."""
+"""Longest way back along the optical axis to find landmarks again, m."""
 
 
 _OFFSETS = np.linspace(-0.8, 0.8, 33)

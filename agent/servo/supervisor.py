@@ -25,27 +25,27 @@ from mapweave.hybridmap.pose import Pose2, wrap_angle
 LAMBDA = 2.0
 """Gain lambda of the laws; 2 is critically damped."""
 GAIN = 1.5
-"""1/s, how fast time runs in the laws; multiplies both speeds."""
+"""How fast time runs in the laws, 1/s; multiplies both speeds."""
 DEAD_ZONE = 0.004
-"""Rho_D, m: nearer than this only the heading is mended."""
+"""Distance rho_D within which only the heading is mended, m."""
 POSITION_TOLERANCE = 0.0075
-"""M, estimated distance at which the goal counts as reached. A centimetre of true distance less what a pose
+"""Estimated distance at which the goal counts as reached, m: a centimetre of true distance less what a pose
 filter may be off."""
 HEADING_TOLERANCE = 0.008
-"""Rad."""
+"""Estimated heading error at which the goal counts as reached, rad."""
 SETTLE_TICKS = 3
 """Ticks in a row inside both tolerances before the robot has arrived."""
 CLEARANCE = 0.04
-"""M, room between the footprint and obstacles."""
+"""Room between the footprint and obstacles, m."""
 LAW_REACH = 0.04
-"""M, nearer than this no law is taken up (one at work goes on): the direction to the goal is noise there,
+"""Nearer than this no law is taken up (one at work goes on), m: the direction to the goal is noise there,
 and short legs are surer."""
 LAW_BONUS = 0.15
 """A law is preferred to a plan up to this share of extra cost."""
 LAW_BONUS_M = 0.05
-"""And up to this extra cost, m."""
+"""And besides up to this extra cost, m."""
 HORIZON = 0.15
-"""S, look-ahead of the last check before a command leaves."""
+"""Look-ahead of the last check before a command leaves, s."""
 CRUISE = 1.0
 """Share of the robot's speed limits that is used."""
 

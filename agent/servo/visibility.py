@@ -13,7 +13,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 
 MIN_DEPTH = 0.1
-"""M, nearer landmarks do not count."""
+"""Nearer landmarks do not count, m."""
 MOST_LANDMARKS = 24
 """How many landmarks ways are checked against."""
 MISSED_TICKS = 10

@@ -94,12 +94,12 @@ class Match:
 
 
 HALF_PX = 7
-"""A patch reaches this far from its point in each direction."""
+"""A patch reaches this far from its point in each direction, px."""
 SIGMA_PX = 4.0
-"""Of the Gaussian by which pixels far from the point count less: they are on another surface, or on a
-slanted one, more often than those near it."""
+"""Standard deviation of the Gaussian by which pixels far from the point count less, px: they are on another
+surface, or on a slanted one, more often than those near it."""
 MOST_SCALE = 1.7
-"""Once a patch has grown or shrunk by more than this it is cut anew from the present image."""
+"""Once a patch has grown or shrunk by more than this factor it is cut anew from the present image."""
 
 
 class TemplateMatcher:

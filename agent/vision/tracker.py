@@ -19,9 +19,9 @@ from mapweave.vision.lens import Lens
 LEVELS = 2
 """Pyramid levels above the image."""
 BACKWARD_PX = 0.8
-"""A point that does not come back to where it was within this is lost."""
+"""A point that does not come back to where it was within this is lost, px."""
 BORDER_PX = 4.0
-"""Points nearer to the border are lost."""
+"""Points nearer to the border are lost, px."""
 LEAST_TEXTURE = 2.5
 """Mean squared gradient of a patch in its weakest direction, (grey/px)^2; with less (that of noise
 included, about 1 for a webcam) a point would slide along an edge, and is lost."""

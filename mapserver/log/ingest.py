@@ -61,7 +61,7 @@ class _Pulled:
 
 
 PULLS_AT_ONCE = 4
-"""Of different logs."""
+"""Logs that are pulled at once."""
 
 
 class Ingest:

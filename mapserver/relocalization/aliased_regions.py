@@ -95,7 +95,7 @@ class _Vote:
 
 
 NODES = 8
-"""Around a place that are asked at most."""
+"""Nodes around a place that are asked, at most."""
 REACH = 3.0
 """Nodes farther from the robot are not asked, m."""
 BESIDE = 0.35

@@ -49,7 +49,7 @@ class RelocalizationSettings:
     faint: float = 0.25
 
 
-RELOCALIZATION_CANDIDATES = 16
+MOST_COMPARED = 16
 """Nodes that are compared with the view."""
 EXPLAINED_PX = 12.0
 """A match nearer than this to where a pose found elsewhere expects it speaks for that."""
@@ -88,7 +88,7 @@ class Relocalizer:
         s = self._settings
         if len(view) < s.recognition.least_inliers:
             return unknown(f"the view has {len(view)} features; {s.recognition.least_inliers} are needed")
-        ranked = self._index.query(view, RELOCALIZATION_CANDIDATES)
+        ranked = self._index.query(view, MOST_COMPARED)
         if not ranked:
             return unknown("no node of any map has features like these")
         sightings, refusals = self.look(view, ranked)

@@ -24,7 +24,7 @@ GATE = 16.3
 FLOOR_XY = 0.05
 """Error between two estimates that no covariance tells of, m."""
 FLOOR_HEADING = 0.03
-"""The same, rad."""
+"""Heading error between two estimates that no covariance tells of, rad."""
 COMPARABLE = 0.6
 """A second place is a rival if it explains so much of what the best one explains, or if so much of what it
 should see is seen, as compared with the best one."""

@@ -130,7 +130,7 @@ CANDIDATES = 8
 APART = 2
 """Places further from each other than so many images are not neighbours."""
 COMPARABLE = 0.6
-"""And with this share of the best one's inliers the other one makes it ambiguous."""
+"""With this share of the best place's inliers another place makes the answer ambiguous."""
 
 
 class AppearanceMap:

@@ -22,9 +22,9 @@ from mapweave.merge.pose_graph.projected_view import ProjectedView
 from mapweave.registration.matching import squared_distances
 
 NEAR_PX = 25.0
-"""It is found again this near to where it projects."""
+"""A landmark is found again this near to where it projects, px,"""
 ALIKE = 0.3
-"""By a descriptor that is at most this far from its own; of two that have nothing to do with each other one
+"""by a descriptor that is at most this far from its own; of two that have nothing to do with each other one
 in a hundred is, in a whole image."""
 
 
@@ -76,15 +76,15 @@ class LandmarkObservations:
 
 
 MARGIN_PX = 12.0
-"""It should be seen if it projects this far inside the image."""
+"""A landmark should be seen if it projects this far inside the image, px,"""
 SCALE = 1.6
-"""And if its distance has changed by at most this factor."""
+"""if its distance has changed by at most this factor,"""
 ASIDE = math.radians(25.0)
-"""And if it is seen from a direction that differs by at most this, rad."""
+"""and if it is seen from a direction that differs by at most this, rad."""
 BEFORE_PX = 12.0
-"""Something hides it that is seen this near to it in the image."""
+"""A landmark of the view hides it that is this near to it in the image, px,"""
 BEFORE = 0.8
-"""At less than this share of its distance."""
+"""and at less than this share of its distance."""
 
 
 def expected(old: Node, new: Node, old_from_new: Pose2) -> NDArray[np.bool_]:

@@ -39,25 +39,25 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 MOVED = 0.05
-"""M, by which two nodes may move to each other before their views are compared anew."""
+"""Two nodes may move to each other by this before their views are compared anew, m."""
 
 
 LEAST_SHOWN = 15
 """A view that should show fewer landmarks tells nothing."""
 SURE = (0.05, 0.05, 0.03)
-"""M, m and rad, nor does one that the merged map does not place within one sigma of this."""
+"""A view tells nothing that the merged map does not place within one sigma of this, m, m and rad."""
 THING = 0.3
-"""M, landmarks that are nearer than this to each other go together."""
+"""Landmarks that are nearer than this to each other go together, m."""
 FAINT = 0.2
 """A landmark that is there with less than this has faded."""
 NEAR = 2.5
-"""M, views of a place that are not linked with it stand within this."""
+"""Views of a place that are not linked with it stand within this, m."""
 TURNED = math.radians(45.0)
-"""Rad, and are turned by at most this."""
+"""Views of a place that are not linked with it are turned by at most this, rad."""
 MOST = 12
-"""So many of them are looked at, the newest."""
+"""Views of a place that are looked at without a link, the newest."""
 AGAIN = 120.0
-"""S, views of one map that lie nearer in time are of one visit."""
+"""Views of one map that lie nearer in time are of one visit, s."""
 
 
 SECOND = 1_000_000_000
@@ -205,7 +205,7 @@ MISTAKEN = 0.01
 GOES = 0.02
 """Probability that a landmark has gone from one visit to the next."""
 COMES = 0.02
-"""That one that had gone is back."""
+"""Probability that a landmark that had gone is back at the next visit."""
 AT_FIRST = 0.95
 """Probability that it was really there when it was mapped."""
 
@@ -257,11 +257,11 @@ def visits(looks: Sequence[LandmarkObservations], again: float) -> list[list[Lan
 
 
 USUAL = 0.1
-"""Share of what it should show that a view finds, as far as it tells nothing better."""
+"""Prior share of the landmarks it should show that a view finds."""
 RATES = (0.1, 0.9)
-"""Within which the share is held that a view finds of what it should show."""
+"""Bounds of that share."""
 WEIGHT = 15.0
-"""With the weight of so many landmarks."""
+"""Landmarks that the prior share weighs as much as."""
 
 
 def found_again(together: NDArray[np.bool_], look: LandmarkObservations) -> float:

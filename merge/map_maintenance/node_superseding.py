@@ -34,7 +34,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 NEAR = 0.5
-"""M, nodes nearer than this to each other stand in one place, as for routes."""
+"""Nodes nearer than this to each other stand in one place, as for routes, m."""
 
 
 SECOND = 1_000_000_000
@@ -107,17 +107,18 @@ class NodeSuperseder:
 FOUND = 20
 """Landmarks that both show and that stay in view between them."""
 DETOUR = 1.5
-"""M, by which a way between neighbours may become longer."""
+"""A way between neighbours may become longer by this, m."""
 DEPTHS = 0.7
-"""It knows at least this share of the number of depths that the other one knows."""
+"""A node that stands for another knows at least this share of the number of depths that the other knows,"""
 ENOUGH = 60
-"""Or at least this many."""
+"""or at least this many."""
 AGAIN = 120.0
-"""S, that lie between them if both belong to one map: views of one visit complete each other."""
+"""Nodes of one map stand for each other only if this much time lies between them, s: views of one visit
+complete each other."""
 GATE = 16.3
-"""Chi-square with 3 degrees of freedom within which such a comparison bears out the merged map."""
+"""Chi-square with 3 degrees of freedom within which a comparison of two nodes bears out the merged map."""
 FLOOR = (0.05, 0.05, 0.03)
-"""M, m and rad, error of both that no covariance tells of."""
+"""Error of comparison and map that no covariance tells of, m, m and rad."""
 
 
 class _Round:

@@ -184,7 +184,7 @@ round, but a square hides this much to four of five sides."""
 MARGIN = 0.1
 """A ray went on if it is longer by more than this than where it would have met the robot, m."""
 MARGIN_SHARE = 0.05
-"""And by this share of it."""
+"""The same as a share of that distance."""
 
 
 def _outcomes(seen: VisibilityInterval, places: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

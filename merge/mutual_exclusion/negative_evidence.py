@@ -38,7 +38,7 @@ MOST = 100.0
 
 
 NOTHING = 0.03
-"""A view shows nothing if it shows at most this share of them."""
+"""A view shows nothing if it shows at most this share of the landmarks that it should show."""
 MISSED = 0.02
 """Share of such views, at most, that show nothing though the merge is true."""
 ALIKE = 0.85
@@ -90,7 +90,7 @@ class Views:
 
 
 MOST_VIEWS = 80
-"""Of each robot are looked at, evenly chosen."""
+"""Views of each robot that are looked at, evenly chosen."""
 LEAST = 20
 """Landmarks that a view should show before it says anything."""
 
@@ -126,15 +126,15 @@ def negative_evidence(
 NEAR = 1.5
 """A view is held against nodes at most so far away, m."""
 TURN = math.radians(50.0)
-"""That look at most so much another way, rad."""
+"""A view is held against nodes turned by at most this, rad."""
 LASTING = 3600.0
-"""And were made at most so much earlier or later, s."""
+"""A view is held against nodes made at most so much earlier or later, s."""
 MOST_NODES = 4
-"""Against the nearest ones if there are more."""
+"""A view is held against so many nodes at most, the nearest ones."""
 SIGMA_XY = 0.15
-"""How the two stand is known as well as this at least, m."""
+"""A view is held against nodes whose relative position is known as well as this, m."""
 SIGMA_HEADING = math.radians(3.0)
-"""And this, rad."""
+"""A view is held against nodes whose relative heading is known as well as this, rad."""
 
 
 def _near(
@@ -162,7 +162,7 @@ def _near(
 
 
 WITHIN = 0.15
-"""It is found if what matches it is this near to where it should be, rad."""
+"""A landmark is found if what matches it is this near to where it should be, rad."""
 
 
 def _look(graph: PoseGraph, node: Node, view: Node) -> tuple[Array, int]:
@@ -181,15 +181,15 @@ def _look(graph: PoseGraph, node: Node, view: Node) -> tuple[Array, int]:
 
 
 MARGIN = 0.04
-"""A landmark should be seen if it projects this far inside the image, rad."""
+"""A landmark should be seen if it projects this far inside the image, rad,"""
 SCALE = 1.4
-"""And if its distance has changed by at most this factor."""
+"""if its distance has changed by at most this factor,"""
 ASIDE = math.radians(15.0)
-"""And if it is seen from a direction that differs by at most this, rad."""
+"""if it is seen from a direction that differs by at most this, rad,"""
 AROUND = 0.1
-"""And if the view knows a depth this near to it in the image, rad."""
+"""if the view knows a depth this near to it in the image, rad,"""
 BEFORE = 0.8
-"""And none there of less than this share of the landmark's distance."""
+"""and none there of less than this share of the landmark's distance."""
 
 
 def should_show(node: Node, view: Node, node_from_view: Pose2) -> tuple[NDArray[np.int64], Array]:

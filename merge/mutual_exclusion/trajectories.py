@@ -116,17 +116,17 @@ class Stay:
 
 
 LONGEST_GAP = 5.2
-"""Between moments that are further apart nobody knows where the robot was, s."""
+"""Between moments that are further apart in time nobody knows where the robot was, s."""
 LONGEST_WAY = 1.0
-"""Nor if they are further apart, m."""
+"""Between moments that are further apart in space nobody knows where the robot was, m."""
 ALONG = 0.15
 """How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
 standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a
 third of its length ahead or behind."""
 ASIDE = 0.05
-"""The same to the side of the line."""
+"""Standard deviation to the side of the line midway, as a share of the line."""
 CLOCK_ERROR = 0.05
-"""Of two robots with the same clock, s."""
+"""Standard deviation between two robots with the same clock, s."""
 
 
 def stay(trail: BodyTrajectory, places: Array, times: Array) -> Stay:

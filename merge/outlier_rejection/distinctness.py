@@ -81,9 +81,9 @@ def weigh(
 
 
 APART_XY = 0.5
-"""They contradict each other by more than this, m, or."""
+"""Recognitions contradict each other if they are further apart than this, m,"""
 APART_HEADING = 0.26
-"""By more than this, rad. Less is how well places are measured, not another place."""
+"""or turned by more than this, rad. Less is how well places are measured, not another place."""
 
 
 @dataclass(frozen=True, eq=False)

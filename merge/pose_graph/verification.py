@@ -17,7 +17,7 @@ nothing that a robot could drive."""
 
 
 MOST_SIGMA_HEADING = 0.05
-"""Likewise of the heading, rad."""
+"""Largest standard deviation of their relative heading, rad."""
 
 
 def verify(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Link | RefusedLink:
