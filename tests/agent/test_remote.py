@@ -314,7 +314,7 @@ def test_an_impossible_observation_is_asked_once_more_and_then_refused_in_one_li
 
 def test_nobody_there_is_one_clear_line(bus: MemoryBus) -> None:
     begin = time.monotonic()
-    with pytest.raises(DeviceError, match=r"robot/r0/describe: nobody answers .*mapweave sim") as error:
+    with pytest.raises(DeviceError, match=r"robot/r0/describe: no answer .*mapweave sim") as error:
         RemoteRobot(bus, "test", "r0", patience=0.2).describe()
     assert 0.2 <= time.monotonic() - begin < 20
     assert "\n" not in str(error.value)
@@ -324,7 +324,7 @@ def test_who_is_stopped_while_it_waits_does_not_say_that_a_simulation_ended(bus:
     robot = RemoteRobot(bus, "test", "r0", patience=20.0)
     stop = threading.Timer(0.1, robot.close)
     stop.start()
-    with pytest.raises(DeviceError, match="robot/r0/describe: stopped before its body has answered"):
+    with pytest.raises(DeviceError, match="robot/r0/describe: stopped before its base has answered"):
         robot.describe()
     stop.join()
 
@@ -335,7 +335,7 @@ def test_nobody_gives_up_a_simulated_body_that_waits_for_another_robot() -> None
 
 def test_two_bodies_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus) -> None:
     second = Body(hub)
-    with pytest.raises(DeviceError, match="2 bodies answer"):
+    with pytest.raises(DeviceError, match="2 bases answer"):
         RemoteRobot(bus, "test", "r0").sense()
     second.bus.close()
 

@@ -233,7 +233,7 @@ WRONG = {
     "lens of four": (replaced("camera.toml", ", 0.0, 0.0]", ", 0.0]"), "camera.toml"),
     "lens is one": (replaced("camera.toml", "[-0.1, 0.02, 0.001, 0.0, 0.0]", "0.1"), "camera.toml"),
     "lens is no number": (replaced("camera.toml", "0.02", "nan"), "camera.toml"),
-    "no odometry": (gone("odometry.csv"), "without odometry nothing tells the map's scale"),
+    "no odometry": (gone("odometry.csv"), "without odometry the map has no scale"),
     "odometry is a folder": (folder_at("odometry.csv"), "odometry.csv"),
     "odometry is empty": (written("odometry.csv", ""), "0 rows for 14 images"),
     "odometry without a turn": (replaced("odometry.csv", "turn_rad", "turn"), "no column 'turn_rad'"),
@@ -254,7 +254,7 @@ WRONG = {
     "times after all clocks": (written("times.txt", " ".join(f"{k}e200" for k in range(1, 15))), "times.txt"),
 }  # fmt: skip
 WRONG_SPLITS = {
-    "no splits": (gone("splits.toml"), "without it there is no robot 'b'"),
+    "no splits": (gone("splits.toml"), "it must describe robot 'b'"),
     "splits are no TOML": (written("splits.toml", "[[robot"), "splits.toml"),
     "splits are no text": (written("splits.toml", b"\xff\xfe"), "splits.toml"),
     "splits are a folder": (folder_at("splits.toml"), "splits.toml"),

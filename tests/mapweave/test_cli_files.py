@@ -89,7 +89,7 @@ def test_settings(tmp_path, capfd, recording):
 
 def test_recordings(tmp_path, capfd, recording):
     assert "no such folder" in complaint(capfd, "replay", tmp_path / "nothing")
-    assert "without it there is no robot 'a'" in complaint(capfd, "replay", recording, "--robot", "a")
+    assert "it must describe robot 'a'" in complaint(capfd, "replay", recording, "--robot", "a")
     (recording / "camera.toml").unlink()
     assert "camera's intrinsics" in complaint(capfd, "replay", recording)
 

@@ -87,7 +87,7 @@ def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_p
         _, said = process.communicate()
         watchdog.cancel()
     *before, last = said.splitlines()
-    assert last.endswith("robot/r0/describe: stopped before its body has answered")
+    assert last.endswith("robot/r0/describe: stopped before its base has answered")
     assert all("waits for its body" in line or "finds no router" in line for line in before)
     assert process.returncode == 1
 

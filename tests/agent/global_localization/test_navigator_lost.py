@@ -66,7 +66,7 @@ def test_it_drives_elsewhere_to_tell_two_places_apart(home):
     trial = Trial(navigator(eyes, NOWHERE, C), eyes, fleet)
     trial.run(60.0, lambda: trial.navigator.fix is not None)
     assert trial.navigator.fix is not None and trial.navigator.fix.node == A
-    assert any("driving on to look from elsewhere" in detail for _, detail in trial.said)
+    assert any("driving on to search from elsewhere" in detail for _, detail in trial.said)
     assert trial.navigator.tally == DriveStatistics(relocalizations=1)
     turned = sum(abs(command.turn) for command in trial.commands) * BODY.tick
     assert turned > math.tau, "first it looked all around"

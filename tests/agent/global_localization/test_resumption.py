@@ -176,7 +176,7 @@ def test_where_nothing_is_recognised_it_looks_elsewhere_and_gives_up(elsewhere, 
         "cannot find itself on its own map of 7 nodes: nothing was recognised at 2 places"
     )
     assert "none of 7 nodes is recognised" in body.said
-    assert "nothing here is known: driving on to look from elsewhere" in body.said
+    assert "nothing here is known: driving on to search from elsewhere" in body.said
     assert turned(body) > 2 * math.tau
     assert sum(c.forward for c in body.commands) * BODY.tick == pytest.approx(MOVE, abs=0.05)
 
@@ -187,7 +187,7 @@ def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
     readings[1:8] = 2.0
     body = Body(elsewhere, PLACE)
     assert search(own_map, body, proximity=readings).lost
-    assert "nothing here is known: driving on to look from elsewhere" in body.said
+    assert "nothing here is known: driving on to search from elsewhere" in body.said
     to_the_way = -sum(min(command.turn, 0.0) for command in body.commands) * BODY.tick
     assert to_the_way == pytest.approx(-BEARINGS[4], abs=0.1)
     assert all(command.forward == 0.0 for command in body.commands)
