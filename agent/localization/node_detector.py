@@ -14,7 +14,7 @@ from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.registration.levelling import level
-from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
@@ -108,7 +108,7 @@ class NodeDetector:
             if recognition.inliers > MORE * candidate.tracked:
                 node, node_from_robot = (
                     candidate.node,
-                    look_closer(candidate.node, view, recognition, s.recognition.pose),
+                    refine_pose(candidate.node, view, recognition, s.recognition.pose),
                 )
                 if node.landmarks.scale_share:
                     levelled = level(node, view, recognition)

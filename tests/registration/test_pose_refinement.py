@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged
 from mapweave.registration.planar_pose import PlanarPoseSettings
-from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import recognise
 from synthetic.world import Sensing, room, take_node, take_view
 
@@ -32,7 +32,7 @@ def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, 
         found = recognise(node, view, None, rng)
         if found is None:
             continue
-        best, true = look_closer(node, view, found, PlanarPoseSettings()), a.inverse() @ b
+        best, true = refine_pose(node, view, found, PlanarPoseSettings()), a.inverse() @ b
         first.append(found.node_from_robot.mean.distance(true))
         closer.append(best.mean.distance(true))
         squared.append(best.mahalanobis2(true))

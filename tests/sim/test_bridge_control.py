@@ -82,7 +82,7 @@ def test_stop_ends_the_run_and_tells_every_agent(stage: Stage) -> None:
         driver.join(30.0)
         assert driver.ended
     assert simulation.tick == 5
-    with pytest.raises(NotConnected, match=r"sim/ground_truth_client: nobody answers; .*mapweave sim"):
+    with pytest.raises(NotConnected, match=r"sim/ground_truth_client: no answer; .*mapweave sim"):
         SimControl(stage.join(), "test", timeout=0.5).status()
 
 

@@ -123,7 +123,7 @@ def test_a_file_tells_what_is_superseded_and_why(merger: Merger) -> None:
     assert again.superseded == merged.superseded
     node, fate = next(iter(again.superseded.items()))
     told = explain_nodes(again, node, fate.by)
-    assert any(f"{node} is superseded: {fate.by} stands for it" in claim for claim in told.claims)
+    assert any(f"{node} is superseded: {fate.by} replaces it" in claim for claim in told.claims)
     assert any("stay in view" in claim for claim in told.claims)
 
 
