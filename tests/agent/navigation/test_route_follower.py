@@ -9,7 +9,7 @@ from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_detector import Expected, NodeDetector, NodeDetectorSettings
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.progress_monitor import ProgressMonitor
-from mapweave.agent.navigation.route_follower import MOST_LOOKED_FOR, RouteFollower, RouteProgress
+from mapweave.agent.navigation.route_follower import MOST_CANDIDATES, RouteFollower, RouteProgress
 from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.servo.servo_step import ServoStep
@@ -175,4 +175,4 @@ def test_a_route_with_a_thousand_nodes_in_one_place_costs_a_few_looks(node, monk
     for tick in range(8):
         follower.step(Observation(tick, Odometry(0.0, 0.0), np.zeros((240, 320), np.uint8)))
     assert tried
-    assert max(tried) <= MOST_LOOKED_FOR + 1
+    assert max(tried) <= MOST_CANDIDATES + 1
