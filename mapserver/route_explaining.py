@@ -151,8 +151,8 @@ def _apart(merged: MergedMap, start: NodeId, goal: NodeId, missing: str) -> Rout
     return RouteExplanation(start, goal, False, missing, apart=apart)
 
 
-def _pieces(merged: MergedMap, one: MapId) -> int:
-    return sum(any(node.map == one for node in component) for component in merged.components)
+def _pieces(merged: MergedMap, hybrid_map: MapId) -> int:
+    return sum(any(node.map == hybrid_map for node in component) for component in merged.components)
 
 
 def _nearest_maps(

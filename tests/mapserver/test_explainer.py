@@ -200,7 +200,7 @@ def test_what_is_undone_stays_undone_when_the_server_is_started_again(
         assert "apart already" in asker.rule((A, B)).error
         assert not asker.rule((A, B), apart=False).error
         assert asker.maps().joined and len(asker.maps().rulings) == 2
-        assert "nothing that people have ruled keeps" in asker.rule((A, B), apart=False).error
+        assert "no manual constraint keeps" in asker.rule((A, B), apart=False).error
     with serving(path) as asker:
         assert asker.maps().joined
 

@@ -232,7 +232,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
         (["retire", "r0.1.1"], "r0.1.1 is a node: give its map, r0.1"),
         (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
         (["retire", "r0.1", "--undo"], "map r0.1 is not retired"),
-        (["unmerge", "r0.1", "r1.1", "--undo"], "nothing that people have ruled keeps r0.1 and r1.1 apart"),
+        (["unmerge", "r0.1", "r1.1", "--undo"], "no manual constraint keeps r0.1 and r1.1 apart"),
         (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line"),
     ],
 )

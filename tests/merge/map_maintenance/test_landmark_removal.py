@@ -19,7 +19,7 @@ from mapweave.merge.map_maintenance.landmark_observations import LandmarkObserva
 from mapweave.merge.map_maintenance.landmark_removal import (
     LandmarkRemovalSettings,
     LandmarkRemover,
-    found_again,
+    detection_rate,
     presence,
     things,
 )
@@ -54,7 +54,7 @@ def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]
     """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
     looks = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
     weights = {True: 0.0, False: 0.0}
-    told = [(seen, found_again(ALONE, one, S)) for seen, one in zip(story, looks, strict=True)]
+    told = [(seen, detection_rate(ALONE, one, S)) for seen, one in zip(story, looks, strict=True)]
     told = [(seen, rate) for seen, rate in told if seen is not None]
     for states in product([True, False], repeat=len(told) + 1):
         for veils in product([True, False], repeat=len(told)):

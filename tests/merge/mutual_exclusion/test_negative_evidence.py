@@ -106,5 +106,5 @@ def test_places_and_not_the_order_of_views_make_witnesses() -> None:
     views = Views(places + rng.uniform(-0.2, 0.2, (20, 2)), np.full(20, 30), rng.integers(0, 3, 20) * 10)
     order = rng.permutation(20)
     other = Views(views.places[order], views.expected[order], views.found[order])
-    assert len(set(views.witnesses(S))) == 3
+    assert len(set(views.place_numbers(S))) == 3
     assert views.evidence(S) == pytest.approx(other.evidence(S))

@@ -45,12 +45,12 @@ def test_neighbours_at_both_ends_are_one_witness() -> None:
     assert crowds(np.ones((5, 5), bool), near).tolist() == [3, 3, 3, 1, 1]
     assert crowds(np.eye(5, dtype=bool), near).tolist() == [1] * 5
     found = support_of([0, 1, 2, 4], np.ones(5, bool), np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
-    assert found.witnesses == pytest.approx(2.0) and found.coincidence == pytest.approx(0.01)
+    assert found.places == pytest.approx(2.0) and found.coincidence == pytest.approx(0.01)
     assert found.others.tolist() == [1]
     # What is found at other places too is no witness, on either side.
     telling = np.array([True, True, True, False, False])
     found = support_of([0, 1, 2, 4], telling, np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
-    assert found.witnesses == pytest.approx(1.0) and found.others.tolist() == []
+    assert found.places == pytest.approx(1.0) and found.others.tolist() == []
 
 
 def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
@@ -89,13 +89,13 @@ def test_links_that_witnesses_bring_in_all_against_draws() -> None:
         rng.geometric(0.5, (200_000, 3)),
         rng.choice([1, 2, 4], p=[0.6, 0.3, 0.1], size=(200_000, 3)),
     )
-    for witnesses, links in ((1, 2), (1, 5), (2, 3), (2, 6), (3, 4), (3, 9), (3, 3), (2, 1)):
-        share = (brought[:, :witnesses].sum(axis=1) >= links).mean()
-        assert false.bringing(witnesses, links) == pytest.approx(share, abs=0.003)
+    for places, links in ((1, 2), (1, 5), (2, 3), (2, 6), (3, 4), (3, 9), (3, 3), (2, 1)):
+        share = (brought[:, :places].sum(axis=1) >= links).mean()
+        assert false.at_least_links(places, links) == pytest.approx(share, abs=0.003)
     # Two places that bring three links each are rarer than two that bring one each.
     pair = Support(np.array([1, 1]), np.ones(9, np.int64), 0.03)
     rich = Support(np.array([3, 3, 3, 3, 3, 3]), np.ones(9, np.int64), 0.03)
-    assert rich.witnesses == pytest.approx(pair.witnesses)
+    assert rich.places == pytest.approx(pair.places)
     assert rich.by_chance(false) < 0.2 * pair.by_chance(false)
 
 

@@ -200,7 +200,7 @@ def test_a_view_is_believed_where_a_drive_contradicts_it() -> None:
     seen, driven = aisles.loop(2, 26), aisles.drive(2, 26, shift=0.5)
     [piece] = fragments_of({A: aisles.map})
     [refusal] = piece.refused
-    assert refusal.edge == driven and refusal.reason == f"contradicts what was recognised, which {seen} tells"
+    assert refusal.edge == driven and refusal.reason == f"contradicts what was recognised, see {seen}"
     assert sum(m.robust for m in piece.measurements) == 1
 
 
