@@ -33,9 +33,8 @@ class VerificationSettings:
 def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Link | RefusedLink:
     """Compare two nodes.
 
-    The answer depends on the two nodes alone: they are put in the order of their ids, and the estimator's
-        random
-    numbers are seeded by the ids, so neither order of arrival nor other nodes matter.
+    The answer depends on the two nodes alone: they are put in the order of their ids, and the ids seed the
+    estimator's random numbers, so neither order of arrival nor other nodes matter.
 
     Args:
         a: one node.

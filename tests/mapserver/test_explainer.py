@@ -310,5 +310,5 @@ def test_a_ruling_that_cannot_be_read_costs_only_itself(path: Path, caplog: pyte
     store.add_ruling(b"rubbish")
     RulingBook(store).add(ManualConstraint((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
     assert [ruling.who for ruling in RulingBook(store).rulings.made] == ["anna"]
-    assert "a ruling cannot be read" in caplog.text
+    assert "a manual constraint cannot be read" in caplog.text
     store.close()

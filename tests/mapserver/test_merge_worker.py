@@ -133,7 +133,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
 def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     world, tour, changes = mapped_room(("a", "b"))
     view, _ = take_view(world, tour[1], np.random.default_rng(3))
-    go, real = threading.Event(), Merger.look_around
+    go, real = threading.Event(), Merger.search_pairs
 
     def held(merger: Merger, most: int | None = None) -> None:
         assert go.wait(20)

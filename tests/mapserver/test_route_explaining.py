@@ -108,11 +108,11 @@ def test_what_is_blocked_is_told_whether_there_is_another_way_or_none(router: Ro
     told = explain_route(router, one, three, blocked=[(two, one)])
     legs = router.route(one, three, blocked=[(two, one)]).legs
     assert told.found is bool(legs)
-    assert all("said to be blocked" in gap.words for gap in told.gaps)
+    assert all("reported as blocked" in gap.words for gap in told.gaps)
     whole = [(one, other) for other in router.merged.poses if other != one]
     told = explain_route(router, one, three, blocked=whole)
     assert not told.found and not router.route(one, three, blocked=whole).legs
-    assert "is blocked" in told.reason and "said to be blocked" in told.gaps[0].words
+    assert "is blocked" in told.reason and "reported as blocked" in told.gaps[0].words
 
 
 def test_where_a_robot_did_not_get_through_of_late_is_told(router: Router) -> None:

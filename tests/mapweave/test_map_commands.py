@@ -141,7 +141,7 @@ def test_a_route_is_explained(
     assert image is not None and (np.abs(image.astype(int) - [0, 215, 255]).max(axis=2) < 8).sum() > 100
     barred = [word for one in links(files[3]) for word in ("--blocked", *map(str, one))]
     others = json.loads(said("map", "route", start, goal, *barred, "--json", "--map", files[3]))
-    assert others["gaps"] and "said to be blocked" in others["gaps"][0]["words"]
+    assert others["gaps"] and "reported as blocked" in others["gaps"][0]["words"]
     none = tmp_path / "none.png"
     assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3]), "--draw", str(none)]) == 2
     out, err = capfd.readouterr()

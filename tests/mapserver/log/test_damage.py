@@ -363,7 +363,7 @@ def test_rulings_are_no_more_than_can_be_read_again(fleet: Fleet, monkeypatch: p
     ruling = book.rulings.made[0]
     for k in range(2):
         book.add(replace(ruling, stamp_ns=100 + k))
-    with pytest.raises(InvalidValue, match="the record of rulings is full: 7"):
+    with pytest.raises(InvalidValue, match="the record of manual constraints is full: 7"):
         book.add(ruling)
     assert len(book.rulings.made) == 7
     store.close()
