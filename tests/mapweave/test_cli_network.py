@@ -88,14 +88,14 @@ def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_p
         watchdog.cancel()
     *before, last = said.splitlines()
     assert last.endswith("robot/r0/describe: stopped before its base has answered")
-    assert all("waits for its body" in line or "finds no router" in line for line in before)
+    assert all("waits for its robot" in line or "finds no router" in line for line in before)
     assert process.returncode == 1
 
 
 @pytest.mark.parametrize(
     ("command", "hints"),
     [
-        (["agent", "r0"], {"r0: waits for its body", "r0 finds no router: start `mapweave server`"}),
+        (["agent", "r0"], {"r0: waits for its robot", "r0 finds no router: start `mapweave server`"}),
         pytest.param(
             ["sim", "serve", "office"], {"the simulator finds no router: start `mapweave server`"},
             marks=needs_simulator,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.drawing.link_picture import draw_link
-from mapweave.explanation_text import MOST_WITNESSES, WIDTH, pair_words
+from mapweave.explanation_text import MOST_LINKS, WIDTH, pair_words
 from mapweave.hybridmap.explanation import PairExplanation, Witness
 from mapweave.hybridmap.node import NodeId
 from mapweave.merge.explanation.node_explanation import explain_nodes
@@ -32,9 +32,9 @@ def test_links_that_contradict_are_told_however_many_agree(
     witnesses = tuple(Witness(*nodes, d, d < 50.0, True) for d in distances)
     lines = pair_words(replace(told, witnesses=witnesses))
     counts = [sum(f": {word}, " in line for line in lines) for word in ("agrees", "contradicts")]
-    assert sum(counts) == min(agree + against, MOST_WITNESSES)
-    assert counts[1] >= min(against, MOST_WITNESSES // 2) and counts[0] >= min(agree, MOST_WITNESSES // 2)
-    assert ("--json tells all" in "\n".join(lines)) == (agree + against > MOST_WITNESSES)
+    assert sum(counts) == min(agree + against, MOST_LINKS)
+    assert counts[1] >= min(against, MOST_LINKS // 2) and counts[0] >= min(agree, MOST_LINKS // 2)
+    assert ("--json lists all" in "\n".join(lines)) == (agree + against > MOST_LINKS)
     nearest = [line for line in lines if "contradicts" in line][:1]
     assert not nearest or "10.0 standard deviations" in nearest[0]
 

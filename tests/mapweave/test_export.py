@@ -256,7 +256,10 @@ LINE = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\n"
         ("VERTEX_SE2 0 0 zero 0\n", "line 1: a word is no number"),
         ("VERTEX_SE2 0 nan 0 0\n", "line 1: a number is not finite"),
         (LINE + "EDGE_SE2 0 1 0 0 0 1 2 0 1 0 1\n", "line 3: the information must be positive definite"),
-        (LINE + "EDGE_SE2 4 5 0 0 0 1 0 0 1 0 1\n", "no vertex and no way along edges says where 4 is"),
+        (
+            LINE + "EDGE_SE2 4 5 0 0 0 1 0 0 1 0 1\n",
+            "neither a vertex nor a chain of edges gives the pose of 4",
+        ),
         ("\x89PNG", "is none of"),
     ],
 )

@@ -43,7 +43,7 @@ CASES: list[tuple[str, str, str]] = [
     ("sim batch", "office --out {tmp}", TRIAL),
     ("sim serve", "office --connect {nobody}", SIM),
     ("server", "--listen {nobody} --data {tmp}", SERVER),
-    ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its body
+    ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its robot
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
     ("relocalize", "{recording}/images/0.png --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),

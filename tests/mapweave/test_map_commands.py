@@ -131,7 +131,7 @@ def test_a_route_is_explained(
     told = json.loads(said("map", "route", start, goal, "--json", "--map", files[3]))
     assert told["found"] and told["hops"][0]["a"] == str(start) and told["hops"][-1]["b"] == str(goal)
     out = said("map", "route", start, goal, "--map", files[3])
-    assert out.startswith(f"{start} to {goal}: the way leads so: {told['reason']}")
+    assert out.startswith(f"{start} to {goal}: the route is: {told['reason']}")
     assert len(out.splitlines()) == 1 + len(told["hops"])
     drawn = tmp_path / "pictures" / "way.png"
     out = said("map", "route", start, goal, "--map", files[3], "--draw", drawn)
@@ -173,7 +173,7 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     out = said("map", "unmerge", "r1.1", "r0.1", "--undo", "--by", "bob", "--map", path)
     assert "are one map" in out and links(path) == links(files[3])
     out = said("map", "explain", "r0.1", "r1.1", "--map", path)
-    assert "anna ruled that they shall not" in out and "bob ruled that they may be linked again" in out
+    assert "anna decided that they shall not" in out and "bob decided that they may be linked again" in out
     lines = said("map", "history", "--map", path).splitlines()
     kinds = [line.split("UTC  ")[1][:10].strip() for line in lines]
     assert kinds == ["ruled", "parted", "ruled", "joined"]
@@ -205,7 +205,9 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     assert not links(path)
     said("map", "retire", "r1.1", "--undo", "--map", path)
     assert links(path) == links(files[3])
-    assert "ruled that it is in use again (map r1.1)" in said("map", "explain", "r0.1", "r1.1", "--map", path)
+    assert "decided that it is in use again (map r1.1)" in said(
+        "map", "explain", "r0.1", "r1.1", "--map", path
+    )
 
 
 @pytest.mark.parametrize(
@@ -272,7 +274,7 @@ def test_of_an_older_and_a_newer_file_the_newer_counts(
     less = replace(content, changes=tuple(body for body in content.changes if body is not nodes[0]))
     write_map_file(other, less)
     assert main(["map", "merge", str(files[0]), str(other), "-o", str(tmp_path / "none")]) == 1
-    assert "nobody can tell which is newer" in capfd.readouterr().err
+    assert "it cannot be decided which is newer" in capfd.readouterr().err
     assert not (tmp_path / "none").exists()
 
 
