@@ -281,7 +281,7 @@ WRONG_SPLITS = {
 WRONG_IMAGES = {
     "an image of another size": (
         lambda folder: cv2.imwrite(str(folder / "images" / "frame2.png"), np.zeros((120, 160), np.uint8)),
-        "160x120 px, but camera.toml says 320x240",
+        "160x120 px, but camera.toml gives 320x240",
     ),
     "an image that is none": (written("images/frame2.png", "no image"), "not an image that can be read"),
     "an empty image": (written("images/frame2.png", b""), "not an image that can be read"),

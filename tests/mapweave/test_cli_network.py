@@ -72,7 +72,7 @@ def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
     assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)
     assert "not an image" in complaint(capfd, "relocalize", tmp_path, *camera, *rest)
     cv2.imwrite(str(lonely), np.zeros((10, 20), np.uint8))
-    assert f"{lonely}: 20x10 px, but {camera[1]} says 64x48" in complaint(
+    assert f"{lonely}: 20x10 px, but {camera[1]} gives 64x48" in complaint(
         capfd, "relocalize", lonely, *camera, *rest
     )
 

@@ -53,7 +53,7 @@ def test_an_image_of_another_camera_is_refused(tmp_path):
     path = tmp_path / "1.png"
     cv2.imwrite(str(path), np.zeros((48, 60), np.uint8))
     assert read_grey(path).shape == (48, 60)
-    with pytest.raises(DeviceError, match=re.escape(f"{path}: 60x48 px, but camera.toml says 64x48")):
+    with pytest.raises(DeviceError, match=re.escape(f"{path}: 60x48 px, but camera.toml gives 64x48")):
         read_grey(path, CAMERA, "camera.toml")
 
 
