@@ -37,7 +37,7 @@ def test_map_files(tmp_path, capfd):
 
 
 @pytest.mark.parametrize("pipe", [False, True])
-def test_what_has_no_end_is_not_read(tmp_path, capfd, pipe):
+def test_endless_input_is_not_read(tmp_path, capfd, pipe):
     path = tmp_path / "pipe" if pipe else Path("/dev/zero")
     if pipe:
         os.mkfifo(path)

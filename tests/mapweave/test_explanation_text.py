@@ -24,7 +24,7 @@ def told() -> PairExplanation:
 
 
 @pytest.mark.parametrize(("agree", "against"), [(40, 3), (40, 40), (2, 40), (40, 0), (3, 4), (0, 0)])
-def test_links_that_contradict_are_told_however_many_agree(
+def test_contradicting_links_are_listed_among_many_that_agree(
     told: PairExplanation, agree: int, against: int
 ) -> None:
     distances = [*(0.1 + 0.1 * k for k in range(agree)), *(100.0 + k for k in range(against))]
@@ -39,7 +39,7 @@ def test_links_that_contradict_are_told_however_many_agree(
     assert not nearest or "10.0 standard deviations" in nearest[0]
 
 
-def test_every_number_of_the_evidence_stands_beside_its_name(told: PairExplanation) -> None:
+def test_every_number_of_the_evidence_is_next_to_its_name(told: PairExplanation) -> None:
     lines = pair_words(told)
     begin = next(k for k, line in enumerate(lines) if line.startswith("  evidence "))
     rest = [line for line in lines[begin:] if line.startswith(("  evidence ", " " * 16))]

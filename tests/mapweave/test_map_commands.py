@@ -76,7 +76,7 @@ def links(path: Path) -> list[tuple[NodeId, NodeId]]:
     return [link.pair for link in merged_of(read_map_file(path)).links if not link.within]
 
 
-def test_merging_says_what_is_one_and_what_is_not(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_merging_prints_joined_and_separate_maps(files: list[Path], said: Said, tmp_path: Path) -> None:
     out = said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave")
     assert "12 nodes, 3 maps, 2 components" in out and "r0.1 and r1.1 are one map now, by " in out
     assert "r0.1 and r2.1 are not one map: " in out
@@ -238,7 +238,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
         (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line"),
     ],
 )
-def test_bad_input_is_one_line(
+def test_bad_input_is_reported_in_one_line(
     files: list[Path], capfd: pytest.CaptureFixture[str], arguments: list[str], words: str
 ) -> None:
     before = files[3].read_bytes()
@@ -278,7 +278,7 @@ def test_of_an_older_and_a_newer_file_the_newer_counts(
     assert not (tmp_path / "none").exists()
 
 
-def test_files_that_do_not_fit_are_one_line(
+def test_mismatched_files_are_reported_in_one_line(
     files: list[Path], capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     capfd.readouterr()
@@ -308,9 +308,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
         children.end("server")
 
 
-def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_again(
-    files: list[Path], said: Said, tmp_path: Path
-) -> None:
+def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
     store = Store(tmp_path / "s0.sqlite")
     for map_id, bodies in logs().items():
         entries = [

@@ -40,14 +40,14 @@ def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, 
     return np.array(first), np.array(closer), np.array(squared)
 
 
-def test_sharp_pixels_tell_more_and_the_covariance_knows() -> None:
+def test_sharp_pixels_give_a_smaller_covariance() -> None:
     first, closer, squared = looks(0.12)
     assert np.median(closer) < 0.9 * np.median(first)
     assert np.median(closer) < 0.003
     assert 0.5 < np.mean(squared) < 4.5, "3 is expected"
 
 
-def test_blunt_pixels_are_taken_for_what_they_are() -> None:
+def test_the_noise_of_blurred_pixels_is_estimated() -> None:
     first, closer, squared = looks(1.0)
     assert np.median(closer) < 1.15 * np.median(first)
     assert np.mean(squared) < 4.5

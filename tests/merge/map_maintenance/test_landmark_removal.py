@@ -98,7 +98,7 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     assert presence(together, nobody, S)[0] == S.at_first, "nobody could have seen it"
 
 
-def test_landmarks_near_each_other_may_be_of_one_thing() -> None:
+def test_near_landmarks_may_be_of_one_thing() -> None:
     together = things(NODE, 0.5)
     points = NODE.points_in_robot
     for i, j in product(range(len(points)), repeat=2):
@@ -107,7 +107,7 @@ def test_landmarks_near_each_other_may_be_of_one_thing() -> None:
     assert together.any(axis=1).all() and not together.all()
 
 
-def test_expected_is_what_is_in_view_near_enough_and_not_hidden() -> None:
+def test_expected_landmarks_are_visible_near_and_unoccluded() -> None:
     """One landmark after the other, from the definition."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 6, 4, 1200, rng)
@@ -196,7 +196,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     assert shares[-1][0].mean() < 0.2
 
 
-def test_only_what_is_new_is_looked_at_and_tells_what_all_would(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """From drive to drive, nodes that others stand for included, as a fader that sees the last map alone."""
     rng = np.random.default_rng(4)
     world = room(0, 0, 8, 4, 950, rng)

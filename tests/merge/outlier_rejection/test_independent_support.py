@@ -35,7 +35,7 @@ def along(agent: str, places: list[tuple[float, float]]) -> Fragment:
     return Fragment(ids[0], solve_graph(ids[0], Pose2(*places[0]), steps), tuple(steps))
 
 
-def test_neighbours_at_both_ends_are_one_witness() -> None:
+def test_neighbours_at_both_ends_count_as_one_place() -> None:
     """Three links between two places, one from the same place to another, and one apart."""
     a = along("a", [(0.0, 0.0), (0.7, 0.0), (1.4, 0.0), (8.0, 0.0)])
     b = along("b", [(0.0, 0.0), (0.7, 0.0), (1.4, 0.0), (9.0, 0.0)])
@@ -68,7 +68,7 @@ def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
         assert told[0, 0] == pytest.approx((distances2 < reach2).mean(), rel=0.05)
 
 
-def test_sets_that_chance_makes_are_as_many_as_told() -> None:
+def test_the_number_of_chance_sets_agrees_with_the_prediction() -> None:
     """Pairs of false witnesses that agree, against drawing them."""
     rng = np.random.default_rng(2)
     n, coincidence = 12, 0.03
@@ -80,7 +80,7 @@ def test_sets_that_chance_makes_are_as_many_as_told() -> None:
     assert two.by_chance(false) == pytest.approx(count, rel=0.05)
 
 
-def test_links_that_witnesses_bring_in_all_against_draws() -> None:
+def test_links_of_false_places_agree_with_monte_carlo() -> None:
     """As if one more had been heard that brings one link, or with half the chance another one, and so on."""
     rng = np.random.default_rng(3)
     false = ChanceSupport(5.0, np.array([6.0, 3.0, 0.0, 1.0]))
@@ -99,7 +99,7 @@ def test_links_that_witnesses_bring_in_all_against_draws() -> None:
     assert rich.by_chance(false) < 0.2 * pair.by_chance(false)
 
 
-def test_who_is_judged_is_not_the_measure_of_it() -> None:
+def test_a_pair_is_not_judged_by_itself() -> None:
     one = Support(np.array([1, 1, 1]), np.array([2, 2]), 0.1)
     other = Support(np.array([1]), np.array([1, 1, 1, 4, 4, 4, 4]), 0.1)
     every = ChanceSupport.of([one, other])
@@ -111,7 +111,7 @@ def test_who_is_judged_is_not_the_measure_of_it() -> None:
 
 
 @pytest.mark.parametrize("alike", [1, 4])
-def test_fleets_with_nine_false_links_of_ten_become_one_map_or_stay_apart(alike: int) -> None:
+def test_fleets_with_90_percent_false_links_are_joined_correctly_or_not_at_all(alike: int) -> None:
     """Most are as good as with the true links known, and none is joined by false links alone."""
     good = 0
     for seed in range(3):
