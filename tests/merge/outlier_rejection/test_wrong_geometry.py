@@ -44,7 +44,7 @@ def facing_a_wall(map_id: MapId, number: int, distance: float, at: Pose2, count:
         (-1.5, "hidden", "refuted"),
     ],
 )
-def test_a_wall_before_another_one_is_looked_through(ahead: float, first: str, second: str) -> None:
+def test_a_view_through_a_wall_is_detected(ahead: float, first: str, second: str) -> None:
     one, other = (facing_a_wall(MapId("a", 1), k, 3.0, Pose2(), 500) for k in (1, 2))
     there = Pose2(ahead, 0.0, 0.0)
     for node, view, moved, expected in ((one, other, there.inverse(), first), (other, one, there, second)):
