@@ -40,7 +40,7 @@ def facing_a_wall(map_id: MapId, number: int, distance: float, at: Pose2, count:
         # How far the second robot is said to stand ahead of the first; both see a wall 3 m away.
         (0.0, "confirmed", "confirmed"),
         (0.3, "confirmed", "confirmed"),  # Within three sigmas and 0.2 m.
-        (1.5, "refuted", "hidden"),  # The first one's wall is 1.5 m before the second, which sees nothing there.
+        (1.5, "refuted", "hidden"),  # The first wall is 1.5 m before the second one.
         (-1.5, "hidden", "refuted"),
     ],
 )
