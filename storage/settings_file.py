@@ -1,4 +1,4 @@
-"""Tables of TOML or MessagePack into frozen dataclasses; a wrong name or value says so at once."""
+"""Tables of TOML or MessagePack into frozen dataclasses; a wrong name or value is an error."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise SettingsError(f"{path}: is not text in UTF-8, as TOML must be") from None
     except (ValueError, RecursionError) as error:
-        # Besides what is no TOML: numbers of thousands of digits, tables nested a thousand deep.
+        # In addition to invalid TOML: numbers of thousands of digits, tables nested a thousand deep.
         raise SettingsError(f"{path}: {error}") from None
 
 

@@ -15,16 +15,16 @@ from mapweave.hybridmap.quantization import snap
 
 
 class LandmarkRefinement:
-    """Watches a drive, and says how the landmarks of the robot's own nodes are known after it.
+    """Watches a drive and refines the landmarks of the robot's own nodes.
 
-    Each node is put anew once a drive at most: when the robot leaves it, or has arrived.
+    Each node is written again once a drive at most: when the robot leaves it, or has arrived.
     """
 
     def __init__(self, own_map: HybridMap) -> None:
         """Take the robot's own map; nodes of others are theirs to mend."""
         self._map = own_map
         self._localizer: NodeLocalizer | None = None
-        self._told: set[NodeId] = set()
+        self._refined_nodes: set[NodeId] = set()
 
     def see(self, fix: Fix | None) -> Node | None:
         """Take in where the robot is now; returns a node of the map with better landmarks.
@@ -38,13 +38,17 @@ class LandmarkRefinement:
 
     def _refined(self, localizer: NodeLocalizer) -> Node | None:
         node = self._map.nodes.get(localizer.node.id)
-        if node is None or node.id in self._told or len(node.landmarks) != len(localizer.node.landmarks):
+        if (
+            node is None
+            or node.id in self._refined_nodes
+            or len(node.landmarks) != len(localizer.node.landmarks)
+        ):
             return None
         landmarks = refined(node.landmarks, *localizer.depths())
         if landmarks is None:
             return None
-        self._told.add(node.id)
-        # Rounded now, the robot works with the same numbers as everybody who gets the node.
+        self._refined_nodes.add(node.id)
+        # Rounded now, the robot works with the same numbers as all receivers of the node.
         return replace(node, landmarks=snap(landmarks, node.camera))
 
 
@@ -60,7 +64,7 @@ followed may be something else."""
 
 
 def refined(mapped: Landmarks, depths: Array, sigmas: Array) -> Landmarks | None:
-    """Take over the depths that are known better; None if these are too few to tell.
+    """Take over the depths that are known better; None if they are too few.
 
     Args:
         mapped: N landmarks as the map has them.
@@ -68,12 +72,12 @@ def refined(mapped: Landmarks, depths: Array, sigmas: Array) -> Landmarks | None
         sigmas: (N,) m, of independent errors.
         s: what counts as better.
     """
-    sober = np.hypot(sigmas, FLOOR[0] + FLOOR[1] * depths)
+    sigmas_with_floor = np.hypot(sigmas, FLOOR[0] + FLOOR[1] * depths)
     with np.errstate(invalid="ignore"):
-        better = sober < SHARE * mapped.depth_sigmas
+        better = sigmas_with_floor < SHARE * mapped.depth_sigmas
         better &= np.abs(depths - mapped.depths) < DOUBT * mapped.depth_sigmas
     if np.count_nonzero(better) < LEAST:
         return None
-    new = [np.where(better, one, old).astype(np.float32) for one, old in
-           ((depths, mapped.depths), (sober, mapped.depth_sigmas))]  # fmt: skip
+    new = [np.where(better, measured, old).astype(np.float32) for measured, old in
+           ((depths, mapped.depths), (sigmas_with_floor, mapped.depth_sigmas))]  # fmt: skip
     return replace(mapped, depths=new[0], depth_sigmas=new[1])

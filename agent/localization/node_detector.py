@@ -15,7 +15,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.registration.levelling import level
-from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
@@ -25,10 +25,10 @@ class Expected(NamedTuple):
     """A node that may be in view.
 
     Attributes:
-        leg: whatever the caller knows it by.
+        leg: number by which the caller knows it.
         node: with its landmarks.
-        node_from_robot: where the robot believes to be.
-        doubt: how many times further than usual it may be off.
+        node_from_robot: expected pose.
+        doubt: factor on the tolerances.
         tracked: landmarks of the node that are tracked already.
     """
 
@@ -87,27 +87,30 @@ class NodeDetector:
         """
         features = self._sift.extract(image)
         view = features.view(self._description.camera)
-        for one in wanted:
-            found = recognise(one.node, view, EXPECTED, self._rng)
-            if found is None or not self._plausible(found.node_from_robot.mean, one):
+        for candidate in wanted:
+            recognition = recognise(candidate.node, view, EXPECTED, self._rng)
+            if recognition is None or not self._plausible(recognition.node_from_robot.mean, candidate):
                 continue
-            if found.inliers > MORE * one.tracked:
-                node, closer = one.node, look_closer(one.node, view, found, EXPECTED.pose)
+            if recognition.inliers > MORE * candidate.tracked:
+                node, node_from_robot = (
+                    candidate.node,
+                    refine_pose(candidate.node, view, recognition, EXPECTED.pose),
+                )
                 if node.landmarks.scale_share:
-                    levelled = level(node, view, found)
-                    if self._plausible(levelled.node_from_robot.mean, one):
-                        node, closer = levelled.node, levelled.node_from_robot
-                found = replace(found, node_from_robot=closer)
-                return one.leg, NodeLocalizer(
-                    self._description, self._lens, node, image, features, found, self._settings
+                    levelled = level(node, view, recognition)
+                    if self._plausible(levelled.node_from_robot.mean, candidate):
+                        node, node_from_robot = levelled.node, levelled.node_from_robot
+                recognition = replace(recognition, node_from_robot=node_from_robot)
+                return candidate.leg, NodeLocalizer(
+                    self._description, self._lens, node, image, features, recognition, self._settings
                 )
         return None
 
-    def _plausible(self, found: Pose2, expected: Expected) -> bool:
-        """Whether the robot may be there, by what it believes."""
-        believed = expected.node_from_robot
-        turned = abs(wrap_angle(found.heading - believed.heading))
+    def _plausible(self, measured: Pose2, expected: Expected) -> bool:
+        """Whether the robot may be there, given the expected pose."""
+        predicted = expected.node_from_robot
+        turned = abs(wrap_angle(measured.heading - predicted.heading))
         return (
-            found.distance(believed) <= PLAUSIBLE * expected.doubt
+            measured.distance(predicted) <= PLAUSIBLE * expected.doubt
             and turned <= PLAUSIBLE_TURN * expected.doubt
         )

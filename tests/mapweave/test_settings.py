@@ -37,7 +37,7 @@ def test_without_a_file_all_is_default(tmp_path):
     assert load_settings(None) == Settings() == load(tmp_path, "")
 
 
-def test_what_is_given_lies_over_the_defaults(tmp_path):
+def test_given_values_replace_the_defaults(tmp_path):
     given_settings = load(
         tmp_path,
         """
@@ -129,11 +129,11 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[agent]\nseed = 1979-05-27", "agent.seed: expected int"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(tmp_path, text, said):
+def test_errors_are_reported_in_one_line(tmp_path, text, said):
     assert said in refused(tmp_path, text)
 
 
-def test_a_robot_reads_the_file_without_what_a_merge_needs():
+def test_a_robot_reads_the_file_without_the_merges_libraries():
     """gtsam, faiss and scipy are the server's; a robot may not have them."""
     code = (
         "import sys; from mapweave.settings import load_settings; load_settings(None); "
@@ -162,7 +162,7 @@ class Strict:
             raise ValueError(f"share {self.share} is not in 0..1")
 
 
-def test_what_a_part_refuses_is_said_with_its_place():
+def test_errors_of_a_part_name_its_place():
     assert build(Strict, {"share": 1, "name": "x"}, "here") == Strict(1.0, "x")
     with pytest.raises(SettingsError, match=r"^here: share 2\.0 is not in 0\.\.1$"):
         build(Strict, {"share": 2}, "here")
