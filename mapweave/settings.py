@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mapweave.agent.settings import AgentSettings
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.settings_file import build, read_toml
@@ -51,4 +52,7 @@ def load_settings(path: Path | None) -> Settings:
     """
     if path is None:
         return Settings()
-    return build(Settings, read_toml(path), str(path))
+    try:
+        return build(Settings, read_toml(path), str(path))
+    except InvalidValue as error:
+        raise SettingsError(f"{path}: {error}") from None

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.errors import SettingsError
 from mapweave.storage.atomic_file import read_whole
 
 T = TypeVar("T")
@@ -53,7 +53,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
 
     Raises:
         SettingsError: a name that does not exist or is missing, or a value of the wrong kind or out of range.
-        InvalidValue: values that a dataclass itself refuses.
+        InvalidValue: values that a dataclass itself refuses, in its own words.
     """
     for problem in _problems(cls, values, ""):
         raise SettingsError(f"{where}: {problem}")
@@ -61,8 +61,8 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         return msgspec.convert(values, cls)
     except msgspec.ValidationError as error:
         raise SettingsError(f"{where}: {_told(str(error), values)}") from None
-    except (InvalidValue, SettingsError) as error:
-        raise type(error)(f"{where}: {error}") from None
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from None
 
 
 def _problems(kind: Any, value: Any, path: str) -> Iterator[str]:

@@ -11,7 +11,9 @@ from typing import Any
 from rich.console import Console
 from rich.progress import track
 
-from mapweave.agent.drivers.replay import Replay, images_of, read_camera
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.recordings.camera_file import read_camera
+from mapweave.agent.recordings.image_folder import images_of
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.drive import DriveMap, Truth
 from mapweave.evaluation.photographs import AppearanceMap, Photographs

@@ -119,6 +119,7 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[agent.tracker]\nwindow_px = 2", "agent.tracker.window_px: expected int >= 3; it is 2"),
         ("[agent.filter]\nadaptation = 1.5", "agent.filter.adaptation: expected float <= 1.0; it is 1.5"),
         ("[admission_control]\nworkers = 65", "admission_control.workers: expected int <= 64; it is 65"),
+        ("[agent.landmarks]\nmost_bytes = 100", "robot.toml: most_bytes: a node needs 660 at least, not 100"),
         ("[merge]\nstrains = 9.0", "merge: no setting 'strains'; did you mean 'strain'?"),
         ("[merge]\nstrain = 'much'", "merge.strain: expected float, got str"),
         ("[merge.consistency]\nleast_links = 1.5", "merge.consistency.least_links: expected int, got float"),

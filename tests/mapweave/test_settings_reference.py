@@ -58,5 +58,5 @@ def test_no_number_may_be_anything(name: str) -> None:
     table: dict[str, Any] = {last: -(10**9)}
     for part in reversed(path):
         table = {part: table}
-    with pytest.raises(MapweaveError, match=f"^file: .*{last}"):
+    with pytest.raises(MapweaveError, match=last):
         build(Settings, table, "file")
