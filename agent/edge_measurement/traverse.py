@@ -107,7 +107,7 @@ class TraverseRecorder:
             if self._gap > TRAVERSE_GAP:
                 self._forget()
             return None
-        assert fix.localizer is not None, "landmarks are in sight"
+        assert fix.localizer is not None, "landmarks are visible"
         self._set_reference_node(fix.node, self._with_floor(fix.node_from_robot), len(fix.localizer.visible))
         mean = self._node_from_robot.mean
         return self._arrive() if mean.distance(Pose2()) <= REACH else None

@@ -59,7 +59,7 @@ class RouteProgress(StrEnum):
     DRIVING = "driving along the route"
     PARKING = "parking at the goal"
     ARRIVED = "parked at the goal"
-    UNSURE = "no landmark in sight for a while"
+    UNSURE = "no landmark visible for a while"
     BLOCKED = "not getting on"
 
 
