@@ -26,9 +26,9 @@ class SimulatedRobot:
         setup: what was ordered.
         description: the description that its agent gets.
         body: in the physics.
-        rangers: distances at the last call of `look`.
+        rangers: distances at the last call of `measure`.
         faults: what is broken.
-        pose: world_from_robot, true, at the last call of `look`.
+        pose: world_from_robot, true, at the last call of `measure`.
         image: that it took last; None if the last observation had none.
         render_seconds: wall time that its pictures took.
     """
@@ -61,7 +61,7 @@ class SimulatedRobot:
         self._frame: Image | None = None
         self._dropped = (-1, False)
 
-    def look(self, tick: int) -> RigidPose:
+    def measure(self, tick: int) -> RigidPose:
         """Read the true pose out of the physics; call after anything that may have moved the robot."""
         self._placement = placement = self.body.position_and_rotation()
         position, rotation = placement

@@ -203,7 +203,7 @@ class Simulation:
         """Read poses and rangers of all robots: PyBullet serves one thread at a time."""
         start = time.perf_counter()
         robots = tuple(self._robots.values())
-        self._stage.place_robots([robot.look(self.tick) for robot in robots])
+        self._stage.place_robots([robot.measure(self.tick) for robot in robots])
         rangers.cast(self._stage.physics, [r.rangers for r in robots], [r.pose for r in robots])
         self._wall["rangers"] += time.perf_counter() - start
 

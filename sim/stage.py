@@ -30,7 +30,7 @@ class _Cast:
 
     actor: Actor
     number: int
-    looks: PanelSet
+    panels: PanelSet
 
 
 class Stage:
@@ -143,7 +143,7 @@ class Stage:
         return int(p.createMultiBody(0, shape, -1, place, p.getQuaternionFromEuler(turn)))
 
     def _assemble(self) -> Scene:
-        scene = self.scene = Scene([*self._panels, self._still, *(member.looks for member in self._cast)])
+        scene = self.scene = Scene([*self._panels, self._still, *(member.panels for member in self._cast)])
         self.place_robots(self._poses)
         for number in range(len(self._cast)):
             self._place(number)
