@@ -164,7 +164,7 @@ def test_a_twin_of_one_wall_is_not_enough(home, elsewhere, own_map):
     assert resumption.found is None
     assert resumption.lost
     assert any("landmarks agree; another view must, too" in said for said in body.said)
-    assert body.said[-1] == ("cannot find itself on its own map of 7 nodes: no two views agreed at 2 places")
+    assert body.said[-1] == ("cannot localize on its own map of 7 nodes: no two views agreed at 2 places")
 
 
 def test_without_recognition_it_searches_elsewhere_and_gives_up(elsewhere, own_map):
@@ -173,7 +173,7 @@ def test_without_recognition_it_searches_elsewhere_and_gives_up(elsewhere, own_m
     assert resumption.lost
     assert resumption.found is None
     assert body.said[-1] == (
-        "cannot find itself on its own map of 7 nodes: nothing was recognised at 2 places"
+        "cannot localize on its own map of 7 nodes: nothing was recognised at 2 places"
     )
     assert "none of 7 nodes is recognised" in body.said
     assert "nothing here is known: driving on to search from elsewhere" in body.said
