@@ -60,7 +60,7 @@ class RouteProgress(StrEnum):
     PARKING = "parking at the goal"
     ARRIVED = "parked at the goal"
     UNSURE = "no landmark visible for a while"
-    BLOCKED = "not getting on"
+    BLOCKED = "no progress"
 
 
 class RouteFollower:
