@@ -23,11 +23,11 @@ class SimulatedRobot:
     """A robot on the stage.
 
     Attributes:
-        setup: what was ordered.
+        setup: of the robot.
         description: the description that its agent gets.
         body: in the physics.
         rangers: distances at the last call of `measure`.
-        faults: what is broken.
+        faults: of its sensors.
         pose: world_from_robot, true, at the last call of `measure`.
         image: that it took last; None if the last observation had none.
         render_seconds: wall time that its pictures took.
@@ -37,8 +37,8 @@ class SimulatedRobot:
         """Put a robot on the floor.
 
         Args:
-            setup: what it is like.
-            stage: where it lives.
+            setup: of the robot.
+            stage: of the simulation.
             place: world_from_robot.
             seed: of the simulation, and the robot's number.
         """

@@ -73,7 +73,7 @@ class Stage:
 
     @property
     def actors(self) -> tuple[Actor, ...]:
-        """Who is there now."""
+        """The actors present now."""
         return tuple(member.actor for member in self._cast)
 
     def place_robots(self, poses: Sequence[RigidPose]) -> None:
@@ -104,7 +104,7 @@ class Stage:
             self._place(number)
 
     def change_light(self, factor: float, tick: int, ticks: int) -> None:
-        """Let all lamps go to a brightness, from a tick on, over some ticks."""
+        """Change all lamps to a brightness, from a tick on, over some ticks."""
         self._light = (self.lamps, factor, tick, tick + ticks)
         if ticks == 0:
             self.lamps = factor
@@ -113,7 +113,7 @@ class Stage:
         """Add an actor.
 
         Args:
-            actor: who.
+            actor: to add.
             seed: of the appearance.
         """
         p, figure = self.physics, actor.figure
@@ -133,7 +133,7 @@ class Stage:
         self.scene = self._assemble()
 
     def close(self) -> None:
-        """Let the physics go. Twice is no error."""
+        """Release the physics. Idempotent."""
         self.physics.close()
 
     def _solid(self, block: Block) -> int:

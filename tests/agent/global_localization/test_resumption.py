@@ -172,9 +172,7 @@ def test_without_recognition_it_searches_elsewhere_and_gives_up(elsewhere, own_m
     resumption = search(own_map, body)
     assert resumption.lost
     assert resumption.found is None
-    assert body.said[-1] == (
-        "cannot localize on its own map of 7 nodes: nothing was recognised at 2 places"
-    )
+    assert body.said[-1] == ("cannot localize on its own map of 7 nodes: nothing was recognised at 2 places")
     assert "none of 7 nodes is recognised" in body.said
     assert "nothing here is known: driving on to search from elsewhere" in body.said
     assert turned(body) > 2 * math.tau
