@@ -91,7 +91,7 @@ class Navigator:
         stage: what it is doing, in words.
         detail: why.
         fix: where the robot is, or None while lost.
-        goal: where it shall be.
+        goal: the node to reach.
         legs: nodes on the first route that was given.
         tally: statistics of the drive so far.
         traverse: from one node to another, if the last step has ended one.

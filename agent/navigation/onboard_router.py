@@ -29,7 +29,7 @@ def onboard_route(
     Args:
         own_map: of this robot.
         start: node by which the robot is localized.
-        goal: where it shall be.
+        goal: the node to reach.
         blocked: pairs of nodes, in either order, between which the robot cannot drive.
     """
     route = find_route(own_map, start, goal, blocked=blocked, closed=closed_edges(own_map))
