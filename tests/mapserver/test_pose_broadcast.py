@@ -1,4 +1,4 @@
-"""Agents are told where their nodes lie in the merged map: what moved noticeably; all on request."""
+"""Merged poses are published to agents: those that moved noticeably, and all on request."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def merged(*graphs: PoseGraph) -> MergedMap:
 
 
 class Recorder:
-    """A herald, and what it publishes."""
+    """A pose broadcast, and what it publishes."""
 
     def __init__(self, fleet: Fleet, settings: PoseBroadcastSettings | None = None) -> None:
         self.heard: list[PoseNews] = []
@@ -88,7 +88,7 @@ def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) 
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
     assert told.tell(graph(A, 0.049)) == []
     assert told.tell(graph(A, 0.0, math.radians(0.9))) == []
-    # Each step is small; what counts is how far it is from what was told.
+    # Each step is small; the distance from the published pose counts.
     steps = [told.tell(graph(A, 0.03 * k)) for k in range(1, 5)]
     assert [len(news) for news in steps] == [0, 1, 0, 1]
     (turned,) = told.tell(graph(A, 0.12, math.radians(1.1)))

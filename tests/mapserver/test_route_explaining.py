@@ -57,7 +57,7 @@ def sent(request: pytest.FixtureRequest) -> bool:
 
 
 def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
-    """Fewest pairs on any way between which nobody could drive, by trying all ways of up to five steps."""
+    """Fewest pairs on any way between which no robot could drive, by trying all ways of up to five steps."""
     merged = router.merged
     whole = merged.union()
     graph: nx.Graph = nx.Graph()

@@ -56,7 +56,7 @@ def own_map(home: World) -> HybridMap:
 
 @dataclass
 class Body:
-    """A body that does what it is told, and the features that it sees: takes the place of Sift.
+    """A robot base that executes its commands, and the features that it sees: replaces Sift.
 
     Attributes:
         world: that it is in; None if its lens is covered.

@@ -1,4 +1,4 @@
-"""A robot with wrong geometry and true views takes nobody's answers, and two rooms alike stay two."""
+"""A map with wrong geometry and true views changes no answers, and two similar rooms stay two."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     assert (
         with_it[AnswerOutcome.RIGHT] >= 0.9 * alone[AnswerOutcome.RIGHT] and not with_it[AnswerOutcome.WRONG]
     )
-    # Told once, and the map counts again when a person has retired those that it contradicts.
+    # Reported once, and the map counts again when a person has retired those that it contradicts.
     before = chronicle.happenings
     chronicle.follow(merged)
     assert chronicle.happenings == before
