@@ -89,7 +89,7 @@ def test_mismatched_comparisons_are_reported() -> None:
     told = notes({"line": seen, "person": unseen}, {"line": "carried off", "person": ""})
     assert [line.split(":")[0] for line in told] == ["line", "person", "person"]
     assert "carried off" in told[0]
-    assert "nobody came into view" in told[1]
+    assert "no person came into view" in told[1]
     assert "no landmark was left" in told[2]
 
 

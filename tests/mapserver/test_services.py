@@ -192,11 +192,11 @@ def test_a_merge_that_fails_is_logged_and_the_next_one_succeeds(
         served.server._upkeep._dirty = True
         assert served.server.settle(20)
     assert "merging failed" in caplog.text
-    assert "could not be made anew" in str(served.server.status()["event"])
+    assert "merging failed" in str(served.server.status()["event"])
     served.quick_ones()
     served.server._upkeep._dirty = True
     assert served.server.settle(20)
-    assert "could not be made anew" not in str(served.server.status()["event"])
+    assert "merging failed" not in str(served.server.status()["event"])
     assert not served.where().error
 
 
