@@ -1,4 +1,4 @@
-"""What drives teach of a node's landmarks: their depths, better known each time the robot drives by them."""
+"""Refinement of a node's landmarks: drives past them measure their depths more precisely."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def refined(mapped: Landmarks, depths: Array, sigmas: Array) -> Landmarks | None
         mapped: N landmarks as the map has them.
         depths: (N,) m, NaN where nothing was learned.
         sigmas: (N,) m, of independent errors.
-        s: what counts as better.
+        s: when a depth is refined.
     """
     sigmas_with_floor = np.hypot(sigmas, FLOOR[0] + FLOOR[1] * depths)
     with np.errstate(invalid="ignore"):

@@ -30,11 +30,11 @@ MOST_TURN = 1.0
 TRAVEL_STEP = 0.8
 """Longest way between two nodes on the way to the next place, m."""
 PATIENCE = 4.0
-"""Time without getting on before a way is given up, s."""
+"""Time without progress before a way is given up, s."""
 
 
 class ExplorationBehaviours:
-    """What an exploring robot can do, one generator a move: each `yield` is a command for one tick.
+    """The behaviours of exploration, one generator each: each `yield` is a command for one tick.
 
     Attributes:
         phase: what it is doing.
@@ -200,9 +200,9 @@ class ExplorationBehaviours:
         return clearance(self._description, self._now.proximity, direction, DRIVE)
 
     def _ticks(self, most: float) -> range:
-        """A bound on the length of a behaviour: nothing may last forever."""
+        """A bound on the duration of a behaviour."""
         return range(int(most))
 
     def finish(self) -> None:
-        """End the episode: what was seen becomes nodes."""
+        """End the episode: its views become nodes."""
         self._mapper.finish(self._now)

@@ -1,4 +1,4 @@
-"""Two recognitions that agree where the robot is.
+"""Consistency of two recognitions: whether they give the same pose.
 
 One image may show something that occurs in another room or on every shelf, too. So a robot that wants to map
 on needs a second view of other things, because it has turned or driven on in between, that gives the same
@@ -17,7 +17,7 @@ from mapweave.hybridmap.pose import Pose2
 
 @dataclass(frozen=True)
 class PoseHypothesis:
-    """Where a recognised node puts the robot.
+    """The robot's pose by a recognised node.
 
     Attributes:
         map_from_robot: by the node.
@@ -44,7 +44,7 @@ round."""
 
 
 def consistent(earlier: PoseHypothesis, now: PoseHypothesis) -> bool:
-    """Whether two recognitions come of different views and put the robot at the same place."""
+    """Whether two recognitions are of different views and give the same pose."""
     moved = earlier.odom_from_robot.inverse() @ now.odom_from_robot
     if abs(moved.heading) < OTHER_VIEW[1] and math.hypot(moved.x, moved.y) < OTHER_VIEW[0]:
         return False

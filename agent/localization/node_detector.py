@@ -1,4 +1,4 @@
-"""Looking for nodes whose landmarks should be in view."""
+"""Detection of nodes whose landmarks should be in view."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class NodeDetector:
         self._rng = rng
 
     def find(self, image: NDArray[np.uint8], wanted: Iterable[Expected]) -> tuple[int, NodeLocalizer] | None:
-        """Look for nodes, in their order.
+        """Search for nodes, in their order.
 
         Args:
             image: (H, W) grey.

@@ -9,16 +9,16 @@ Pair = tuple[NodeId, NodeId]
 
 
 class BlockedEdges:
-    """What was in the way, in the order in which it was met last."""
+    """Blocked pairs, in the order of their last block."""
 
     def __init__(self, settings: NavigatorSettings | None = None) -> None:
-        """Nothing is in the way."""
+        """Start without blocks."""
         self._settings = settings or NavigatorSettings()
         self._until: dict[Pair, float] = {}
         self._times: dict[Pair, int] = {}
 
     def add(self, a: NodeId, b: NodeId, now: float) -> None:
-        """The robot could not get from one node to the other, nor would it the other way round.
+        """Add a pair between which the robot could not drive, in either direction.
 
         Args:
             a: one node.
@@ -37,5 +37,5 @@ class BlockedEdges:
         return tuple(pair for pair, until in self._until.items() if now < until)
 
     def next_change(self, now: float) -> float:
-        """Seconds until something is forgotten; 0 if nothing is blocked."""
+        """Seconds until a block is forgotten; 0 without blocks."""
         return min((until - now for until in self._until.values() if now < until), default=0.0)
