@@ -33,7 +33,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from mapweave.mapserver.relocalization.relocalizer import RELOCALIZATION_CANDIDATES
+from mapweave.mapserver.relocalization.candidates import RELOCALIZATION_CANDIDATES
 
 # Small matrices gain nothing from more threads, and wait for each other where other programs run.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -14,10 +14,9 @@ from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import MapId, Node
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty
+from mapweave.hybridmap.query import NO_COMPONENT, Certainty
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.relocalization.verdict import NOWHERE
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -122,7 +121,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
     answer = upkeep.answers.relocalizer.answer(view)
     assert time.monotonic() - began < 1.0 and answer.certainty is Certainty.FOUND
     best = answer.candidates[0]
-    assert best.component == NOWHERE and best.merged_from_robot is None
+    assert best.component == NO_COMPONENT and best.merged_from_robot is None
     go.set()
     assert upkeep.settle(20)
     merged = upkeep.answers.relocalizer.answer(view).candidates[0]

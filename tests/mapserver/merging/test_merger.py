@@ -201,7 +201,7 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
         examined.append(node.id)
         return examine_matches(node, *others)
 
-    monkeypatch.setattr("mapweave.mapserver.relocalization.relocalizer.examine_matches", counted)
+    monkeypatch.setattr("mapweave.mapserver.relocalization.view_registration.examine_matches", counted)
     # Nobody suffices alone and nothing is faint: then every node that looks alike is examined.
     thorough = Relocalizer(
         merger.index,
