@@ -34,6 +34,6 @@ class Answers:
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
         """Answers from a merged map; nodes that are newer, of which `node_of` knows, lie nowhere yet."""
         set_apart = [node for one in merged.set_apart for node in merger.maps[one].nodes]
-        places = ActiveNodes(merger.index, node_of, merged, set_apart)
+        places = ActiveNodes(merger.places, node_of, merged, set_apart)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Coverage(merged))

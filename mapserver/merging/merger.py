@@ -17,14 +17,14 @@ from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merger_counters import MergerCounters
-from mapweave.mapserver.merging.superseded_nodes import SupersededNodes
 from mapweave.mapserver.merging.verification_cache import (
     CachedVerifications,
     VerificationCache,
     fingerprint_of,
 )
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
-from mapweave.mapserver.retrieval.place_index import PlaceIndex, bounded
+from mapweave.mapserver.retrieval.compared_landmarks import bounded
+from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemovalSettings, LandmarkRemover
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, NodeSupersedingSettings
@@ -99,15 +99,15 @@ class Merger:
     what the maps hold, not on the order in which it came.
     """
 
-    def __init__(self, index: PlaceIndex | None = None, settings: MergerSettings | None = None) -> None:
+    def __init__(self, places: PlaceDatabase | None = None, settings: MergerSettings | None = None) -> None:
         """Start with no maps.
 
         Args:
-            index: is filled with the nodes that come; give it to a Relocalizer too.
+            places: is filled with the nodes that come; give it to a Relocalizer too.
             settings: how.
         """
-        # An index in which there is nothing yet is one.
-        self.index = PlaceIndex() if index is None else index
+        # A database in which there is nothing yet is one.
+        self.places = PlaceDatabase() if places is None else places
         self.alike = AliasCache(RecognitionSettings())
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
@@ -116,7 +116,6 @@ class Merger:
         self._before: CachedVerifications | None = None
         self._prints: dict[NodeId, tuple[Node, bytes]] = {}
         self._pairs = PairTable(self.settings.candidates)
-        self._succession = SupersededNodes(self.index, self._pairs, self.node)
         self._uncompared: dict[NodeId, None] = {}
         self._known: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._verdicts = Verdicts()
@@ -183,8 +182,8 @@ class Merger:
         before = self._pairs.of(body.node.id) if isinstance(body, NodePut) else []
         self._replay(map_id, body)
         if isinstance(body, NodePut):
-            self.index.add(body.node)
-            self._pairs.put(body.node.id, self._succession.overlaps(body.node, before))
+            self.places.put([body.node])
+            self._pairs.put(body.node.id, self.places.overlaps(body.node, self.node, before))
 
     def read(
         self,
@@ -206,9 +205,9 @@ class Merger:
             self._replay(map_id, body)
             if isinstance(body, NodePut):
                 put[body.node.id] = None
-        # What the index has already, just so, it leaves as it is.
+        # What the database has already, just so, it leaves as it is.
         fresh = [node for node_id in put if (node := self.node(node_id)) is not None]
-        self.index.extend(fresh)
+        self.places.put(fresh)
         if overlaps is None:
             self._uncompared.update((node.id, None) for node in fresh)
         for (a, b), value in (overlaps or {}).items():
@@ -266,7 +265,8 @@ class Merger:
             except Exception as error:  # whatever it is, it is one map's or a few maps' and not everybody's
                 log.exception("the merge fails; looking for the map with which it does")
                 merged = self._made_without_bad(maps, error, use)
-            self._succession.follow(merged.superseded)
+            for node_id, overlaps in self.places.leave_out(merged.superseded, self.node).items():
+                self._pairs.put(node_id, overlaps)
             self._merged = merged
             self.counters.merges += 1
             self._touched, self._changed = set(), set()
@@ -345,7 +345,7 @@ class Merger:
             del self._uncompared[node_id]
             if (node := self.node(node_id)) is not None:
                 before = self._before
-                source = before if before is not None and before.knows(node) else self.index
+                source = before if before is not None and before.knows(node) else self.places
                 try:
                     self._pairs.put(node_id, source.overlaps(node, self.node))
                 except Exception:  # a defect with one node must not hold up all others
@@ -391,10 +391,10 @@ class Merger:
         match body:
             case NodePut(node):
                 self._forget(node.id)
-                self._succession.put(node)
+                self.places.observe(node)
             case NodeRetired(node_id):
                 self._forget(node_id)
-                self.index.remove(node_id, None if gone is None else gone.landmarks.codes)
+                self.places.remove(gone, node_id)
             case EdgePut(edge):
                 if _makes_neighbours(edge):
                     self._pairs.connect(edge.a, edge.b)
@@ -422,7 +422,6 @@ class Merger:
         """Drop what was found out about a node: it is gone, or is known better."""
         self._pairs.forget(node_id)
         self._uncompared.pop(node_id, None)
-        self._succession.drop(node_id)
         for other in self._known.pop(node_id, {}):
             del self._known[other][node_id]
 

@@ -17,7 +17,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.world import World, room, take_map, take_view
@@ -157,23 +157,23 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
 
 def test_in_lockstep_all_that_has_come_is_merged_when_somebody_asks() -> None:
     _, _, changes = mapped_room(("a",))
-    index, schedule = PlaceIndex(), LockstepSchedule()
-    upkeep = MergeWorker(schedule, 1.0, index=index)
+    places, schedule = PlaceDatabase(), LockstepSchedule()
+    upkeep = MergeWorker(schedule, 1.0, places=places)
     upkeep.start()
     for change in changes:
         upkeep.take(replace(change, stamp_ns=change.sequence))
     assert len(upkeep.answers.merged.poses) == 0
-    assert len(upkeep.current().merged.poses) == len(index) == 4 and upkeep.settled
+    assert len(upkeep.current().merged.poses) == len(places) == 4 and upkeep.settled
     assert schedule.time_ns() == len(changes)
     upkeep.close()
 
 
-def test_an_index_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
+def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
     """Whoever gave it saves it: a server's first start must leave a saved index, too."""
     _, _, changes = mapped_room(("a",))
-    index = PlaceIndex()
-    upkeep = MergeWorker(LiveSchedule(), 1.0, index=index)
+    places = PlaceDatabase()
+    upkeep = MergeWorker(LiveSchedule(), 1.0, places=places)
     upkeep.start()
     upkeep.read(iter(changes))
-    assert len(index) == 4
+    assert len(places) == 4
     upkeep.close()

@@ -260,14 +260,14 @@ def test_a_node_of_which_nobody_can_say_what_is_like_it_holds_up_nobody(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     merger = merger_of(told, BAD, R0, R1)
-    real = merger.index.overlaps
+    real = merger.places.overlaps
 
     def fails(node: Any, *more: Any) -> Any:
         if node.id.map == BAD:
             raise IndexError("no such cell")
         return real(node, *more)
 
-    monkeypatch.setattr(merger.index, "overlaps", fails)
+    monkeypatch.setattr(merger.places, "overlaps", fails)
     merged = merger.merged()
     assert merger.uncompared == 0
     assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)

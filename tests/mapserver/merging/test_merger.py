@@ -165,7 +165,7 @@ def test_robots_that_would_walk_through_each_other_are_not_joined(clock: str, jo
 
 
 def relocalizer(merger: Merger) -> Relocalizer:
-    return Relocalizer(merger.index, merger.node, merger.merged())
+    return Relocalizer(merger.places, merger.node, merger.merged())
 
 
 def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -> None:
@@ -204,7 +204,7 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
     monkeypatch.setattr("mapweave.mapserver.relocalization.view_registration.examine_matches", counted)
     # Nobody suffices alone and nothing is faint: then every node that looks alike is examined.
     thorough = Relocalizer(
-        merger.index,
+        merger.places,
         merger.node,
         merger.merged(),
         RelocalizationSettings(judgement=HypothesisSelectionSettings(alone=1000), faint=0.0),
@@ -266,7 +266,7 @@ def test_maps_that_nothing_joins_are_not_silently_confused(scene: Scene) -> None
     for map_id in (A, B):
         nodes, _ = take_map(scene.world, map_id, [stop], rng)
         merger.apply(map_id, NodePut(nodes[0]))
-    service = Relocalizer(merger.index, merger.node, MergedMap.empty())
+    service = Relocalizer(merger.places, merger.node, MergedMap.empty())
     view, _ = take_view(scene.world, stop, rng)
     answer = service.answer(view)
     assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
