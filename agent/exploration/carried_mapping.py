@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Observation
+from mapweave.agent.mapping.episode import Episode, EpisodeRequest, Move
+from mapweave.agent.observation import Command
 
 LEAVING = 0.45
 """Or the share of the view's features still tracked below which they are leaving the view."""
@@ -30,24 +31,34 @@ class CarriedMappingSettings:
 
 
 class CarriedMapping:
-    """Makes nodes of a drive that it does not control.
+    """Says when nodes are made of a drive that it does not control.
 
     Attributes:
         detail: in words, for the status line.
     """
 
-    def __init__(self, mapper: Mapper, settings: CarriedMappingSettings | None = None) -> None:
+    def __init__(self, mapper: Episode, settings: CarriedMappingSettings | None = None) -> None:
         """Take the mapper that the pipeline keeps up to date."""
         self.detail = "no image yet"
         self._mapper = mapper
         self._settings = settings or CarriedMappingSettings()
+        self._behaviour = self._watch()
 
-    def step(self, observation: Observation) -> None:
-        """One tick. The mapper has seen the observation already."""
+    def next_move(self) -> Move:
+        """What to do next; a command, always to stand still, ends the tick. The mapper has seen the tick."""
+        return next(self._behaviour)
+
+    def _watch(self) -> Iterator[Move]:
+        while True:
+            if not self._mapper.started:
+                yield EpisodeRequest.BEGIN
+            elif self._is_complete():
+                yield EpisodeRequest.FINISH
+            yield Command()
+
+    def _is_complete(self) -> bool:
+        """Whether the view is known well, or about to be lost."""
         s, mapper = self._settings, self._mapper
-        if not mapper.started:
-            mapper.begin(observation)
-            return
         moved = mapper.anchor_from_robot
         way = math.hypot(moved.x, moved.y)
         left = mapper.anchored
@@ -57,5 +68,4 @@ class CarriedMapping:
         if mapper.anchor_features < LEAST_TRACKED:
             self.detail = f"only {mapper.anchor_features} features in view"
         moving = way > 0.02 * mapper.typical_depth or abs(moved.heading) > 0.1
-        if (leaving and moving) or (far and mapper.converged_share >= s.converged):
-            mapper.finish(observation)
+        return (leaving and moving) or (far and mapper.converged_share >= s.converged)

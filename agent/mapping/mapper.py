@@ -10,6 +10,7 @@ import numpy as np
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
+from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder, KeyframeBuilderSettings
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.tracking_settings import TrackingSettings
@@ -80,7 +81,7 @@ class Mapper:
         self._anchor: View | None = None
         self._leaves: list[View] = []
 
-    # What an explorer or a passenger needs to know
+    # What behaviours read, see `Episode`
 
     @property
     def map(self) -> HybridMap:
@@ -178,6 +179,16 @@ class Mapper:
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
+
+    def meet(self, request: EpisodeRequest, observation: Observation) -> None:
+        """Do what a behaviour asks for, with the observation of the last step."""
+        match request:
+            case EpisodeRequest.BEGIN:
+                self.begin(observation)
+            case EpisodeRequest.ADD_VIEW:
+                self.leaf(observation)
+            case EpisodeRequest.FINISH:
+                self.finish(observation)
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
