@@ -101,14 +101,15 @@ class Mapper:
     @property
     def doubtful(self) -> bool:
         """Whether the last image shows nothing of what it should, or none comes: no time to map."""
-        return self._tracking.doubtful
+        return self._tracking.acceptance.doubtful
 
     @property
     def doubt(self) -> str:
         """Why, in words."""
-        if self._tracking.strange:
+        images = self._tracking.acceptance
+        if images.strange:
             return "the image shows something else than a moment ago"
-        if self._tracking.blank:
+        if images.blank:
             return "the image shows nothing: is it dark, or the lens covered?"
         return "the camera gives no new image" if self.doubtful else ""
 
@@ -174,7 +175,7 @@ class Mapper:
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
         self._tracking.step(observation)
-        if self._tracking.carried_off or self._tracking.disputed:
+        if self._tracking.acceptance.carried_off or self._tracking.disputed:
             self.lose()
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
