@@ -239,7 +239,7 @@ def test_before_maps_are_compared_the_bad_one_is_left_out(
 def test_nodes_that_cannot_be_compared_are_not_linked(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    import mapweave.mapserver.merging.merger as module
+    import mapweave.mapserver.merging.node_comparisons as module
 
     real = module.verify
 
