@@ -147,7 +147,7 @@ class Merger:
     ) -> None:
         """Take in many changes at once: a store at the start. Places can be found as soon as this returns.
 
-        Which are alike is looked for by `look_around`, or when they are merged; then they are compared.
+        Which are alike is looked for by `search_pairs`, or when they are merged; then they are compared.
 
         Args:
             log: what each map tells, in its order.
@@ -169,14 +169,14 @@ class Merger:
         for pair, link in (links or {}).items():
             self._comparisons.judge(pair, link)
 
-    def rule(self, rulings: ManualConstraints) -> None:
+    def rule(self, constraints: ManualConstraints) -> None:
         """Heed these rulings of people from now on, and no others."""
-        ruled = {*rulings.in_force} ^ {*self._rulings.in_force}
+        ruled = {*constraints.in_force} ^ {*self._rulings.in_force}
         # A map that is retired harms nobody, and is no longer set apart.
         self._isolation.release(one.retires for one in ruled if one.retires is not None)
-        if self._rulings.retired.keys() - rulings.retired.keys():
+        if self._rulings.retired.keys() - constraints.retired.keys():
             self.alike.forget()
-        self._rulings = rulings
+        self._rulings = constraints
         self._stale |= self._verdicts.at(self.maps.keys())
         self._dirty = True
 
@@ -193,7 +193,7 @@ class Merger:
             use: what is made of a merged map that is new; a map with which that fails is set apart as well.
         """
         if self._dirty:
-            self.look_around()
+            self.search_pairs()
             # A server merges before it has read its store if people's rulings come first.
             if self.maps:
                 self._comparisons.take_over()
@@ -293,9 +293,9 @@ class Merger:
     def _suspicion(self, one: MapId) -> int:
         return self._isolation.suspicion(one) + (one in self._suspects)
 
-    def look_around(self, most: int | None = None) -> None:
+    def search_pairs(self, most: int | None = None) -> None:
         """Look for what is like the nodes that were read, or like so many of them."""
-        self._comparisons.look_around(most)
+        self._comparisons.search_pairs(most)
 
     def apart(self) -> MergedMap:
         """The merged map if nobody had compared any two maps: a component for each part of each map.

@@ -93,7 +93,7 @@ class NodeComparisons:
         self._pairs.put(node_id, dict(overlaps))
 
     def postpone(self, nodes: Iterable[Node]) -> None:
-        """Nodes for which `look_around` shall look which others are like them."""
+        """Nodes for which `search_pairs` shall look which others are like them."""
         self._uncompared.update((node.id, None) for node in nodes)
 
     def forget(self, node_id: NodeId) -> None:
@@ -115,7 +115,7 @@ class NodeComparisons:
 
     # Pairs are compared.
 
-    def look_around(self, most: int | None = None) -> None:
+    def search_pairs(self, most: int | None = None) -> None:
         """Look for what is like the nodes that were read, or like so many of them."""
         for node_id in list(islice(self._uncompared, most)):
             del self._uncompared[node_id]

@@ -16,7 +16,7 @@ from mapweave.mapserver.relocalization.candidates import Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import SLIGHT, NodeMatch, is_lonely
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import match
-from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
 
 
@@ -86,7 +86,7 @@ class ViewRegistration:
         ordered = sorted(matches, key=lambda one: (-one.recognition.inliers, one.node))
         for first in ordered[:1]:
             if (node := self._node_of(first.node)) is not None:
-                pose = look_closer(node, view, first.recognition, self._settings.pose)
+                pose = refine_pose(node, view, first.recognition, self._settings.pose)
                 ordered[0] = replace(first, recognition=replace(first.recognition, node_from_robot=pose))
         return ordered
 
