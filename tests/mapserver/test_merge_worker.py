@@ -138,7 +138,7 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
         assert go.wait(20)
         real(merger, most)
 
-    monkeypatch.setattr(Merger, "look_around", held)
+    monkeypatch.setattr(Merger, "search_pairs", held)
     upkeep = MergeWorker(LiveSchedule(), 1.0)
     upkeep.start()
     upkeep.read(iter(changes))
