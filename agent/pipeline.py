@@ -71,6 +71,7 @@ class Status:
         legs: nodes on the first route of the drive, beginning and goal included.
         lost: whether it has given up to find itself on its own map: a fresh map must be begun.
         astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
+        located: whether `map_from_robot` comes from this observation.
         tally: what the drive was made of so far.
     """
 
@@ -86,6 +87,7 @@ class Status:
     legs: int = 0
     lost: bool = False
     astray: bool = False
+    located: bool = False
     tally: DriveStatistics = NOTHING_DRIVEN
 
 
@@ -317,5 +319,6 @@ class Pipeline:
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
             astray=self._resumption is not None,
+            located=mapping and self._mapper.started and not self._mapper.astray,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )
