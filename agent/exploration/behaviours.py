@@ -29,12 +29,12 @@ MOST_TURN = 1.0
 TRAVEL_STEP = 0.8
 """A new node at least this often on the way, m."""
 PATIENCE = 4.0
-"""Seconds without getting on before a way is given up."""
+"""Seconds without progress before a way is given up."""
 
 
 class ExplorationBehaviours:
-    """What an exploring robot can do, one generator a behaviour: each `yield` is a command for one tick, or a
-    request to the mapper that is met before the generator goes on.
+    """The behaviours of exploration, one generator each: each `yield` is a command for one tick, or a request
+    to the mapper that is met before the generator goes on.
 
     Attributes:
         phase: what it is doing.
@@ -200,5 +200,5 @@ class ExplorationBehaviours:
         return clearance(self._description, self._now.proximity, direction, DRIVE)
 
     def _ticks(self, most: float) -> range:
-        """A bound on the length of a behaviour: nothing may last forever."""
+        """A bound on the duration of a behaviour."""
         return range(int(most))
