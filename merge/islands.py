@@ -15,10 +15,11 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.manual_constraints import apply_constraints
-from mapweave.merge.merging import MergeCache, MergeSettings, decide
+from mapweave.merge.merging import MergeCache, decide
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
+from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
 
 EXACT = 600

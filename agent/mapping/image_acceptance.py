@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
 from mapweave.agent.observation import Observation
+from mapweave.agent.settings import TrackingSettings
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.pose import Array, Pose2
 
 DROPPED = 3
 """Images that may be missing, one after the other, before the robot should wait for the next."""
 STALE = (0.4, 0.5)
-"""M and rad; once the wheels have moved this much, nothing can be said of an image before."""
+"""Once the wheels have moved this much, nothing can be said of an image before, m and rad."""
 
 
 class ImageAcceptance:

@@ -11,14 +11,14 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
 
 PRIOR_SPREAD = 0.6
-"""Sigma of a new landmark's inverse depth, as a share of the expected one ..."""
+"""Sigma of a new landmark's inverse depth, as a share of the expected one."""
 PRIOR_NEAR = 0.45
-"""... but no less than this over the camera's height: a landmark may always be about as near as the floor.
-A robot before a bare wall would else take its nearness for a slip of the wheels."""
+"""The same sigma is at least this over the camera's height: a landmark may always be about as near as the
+floor. A robot before a bare wall would else take its nearness for a slip of the wheels."""
 DOUBT = 2.0
-"""Sigmas of triangulated depths are taken for so many times what they say."""
+"""Factor by which sigmas of triangulated depths are enlarged."""
 MOST_CHI2 = 4.0
-"""And depths of tracks whose mean squared residual is above this, not at all; 1 is expected."""
+"""Triangulated depths of tracks whose mean squared residual is above this are not used; 1 is expected."""
 
 
 def initial_inverse_depths(

@@ -17,9 +17,9 @@ from mapweave.agent.mapping.kidnap_detection import KidnapDetector, turned
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.agent.mapping.prediction_offset import PredictionOffset
 from mapweave.agent.mapping.track_history import TrackHistory
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
 from mapweave.agent.mapping.view import View, associate, even_choice
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.occluded_tracks import OccludedTracks
 from mapweave.agent.vision.rejection_counter import RejectionCounter
 from mapweave.agent.vision.template import HALF_PX, Templates
@@ -28,16 +28,6 @@ from mapweave.agent.vision.tracker import BORDER_PX, Tracker
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
-
-MOST_FILTERED = 54
-"""Landmarks in the EKF, hidden ones and those that came in their stead included."""
-LEAST_FILTERED = 5
-"""With fewer landmarks in view the wheels are trusted alone."""
-ASSOCIATE_PX = 1.5
-"""A feature this near to a track is the same point."""
-STRIKES = 3
-"""A track that the filter refuses this often in a row is given up."""
-
 
 # What each stage of a step gives to the next. A stage takes the value that only the one before makes.
 
@@ -93,6 +83,18 @@ class Correction(NamedTuple):
 NO_CORRECTION = Correction(np.zeros((0, 2)), None)
 
 
+LEAST_SPREAD = 0.2
+"""With landmarks that cover less than this share of the image's width the wheels are trusted alone."""
+MOST_FILTERED = 54
+"""Landmarks in the EKF, hidden ones and those that came in their stead included."""
+LEAST_FILTERED = 5
+"""With fewer landmarks in view the wheels are trusted alone."""
+ASSOCIATE_PX = 1.5
+"""A feature this near to a track is the same point."""
+STRIKES = 3
+"""A track that the filter refuses this often in a row is given up."""
+
+
 class Tracking:
     """Follows image points and filters an even choice of them.
 
@@ -101,21 +103,23 @@ class Tracking:
         acceptance: which images are believed.
     """
 
-    def __init__(self, description: RobotDescription, lens: Lens, settings: TrackingSettings) -> None:
+    def __init__(self, description: RobotDescription, lens: Lens, settings: AgentSettings) -> None:
         """Start with nothing in view."""
         self.history = TrackHistory()
         self._camera, self._lens = description.camera, lens
-        self._settings = settings
+        self._settings = settings.tracking
+        self._pixel_sigma = settings.filter.pixel_sigma
+        self._anchored = settings.tracker.anchored
         self._tracker = Tracker(lens, settings.tracker)
-        self._hidden = OccludedTracks(settings.hidden)
+        self._hidden = OccludedTracks()
         self._unheld = PredictionOffset()
-        own = replace(settings.filter, side_slip=description.side_slip)
-        self._filter = MappingFilter(description.camera, description.axle, description.wheel_noise, own)
+        d = description
+        self._filter = MappingFilter(d.camera, d.axle, d.wheel_noise, settings.filter, d.side_slip)
         # Two images are compared by points that live for one step: nothing to hold them to.
         once = replace(settings.tracker, anchored=False)
-        detector = KidnapDetector(lens, description.camera, once, settings.continuity)
-        self.acceptance = ImageAcceptance(detector, settings)
-        self._dispute = OdometryConsistency(settings.dispute)
+        detector = KidnapDetector(lens, description.camera, once)
+        self.acceptance = ImageAcceptance(detector, settings.tracking)
+        self._dispute = OdometryConsistency()
         self._strikes = RejectionCounter(STRIKES)
         self._correction = NO_CORRECTION
         self._expected_depth = 1.0
@@ -239,7 +243,7 @@ class Tracking:
 
     def _seek_hidden(self, followed: FollowedImage) -> LiveTracks:
         """Hide landmarks just lost, and find others again."""
-        if self._settings.tracker.anchored:
+        if self._anchored:
             self._hidden.take(followed.lost, followed.templates)
         self._hidden.keep(np.isin(self._hidden.ids, self._filter.ids))
         if len(self._hidden.ids):
@@ -303,7 +307,7 @@ class Tracking:
             self._camera,
             self.pose.mean,
             self._expected_depth,
-            s.filter.pixel_sigma,
+            self._pixel_sigma,
         )
         self._filter.add(ids[chosen], pixels[chosen], inverse_depths, sigmas)
 
@@ -324,6 +328,5 @@ class Tracking:
 
         A few points in one corner may all lie on the same edge, slide along it together and agree.
         """
-        s = self._settings
         spread = float(np.ptp(pixels[:, 0])) if len(pixels) else 0.0
-        return len(pixels) >= LEAST_FILTERED and spread >= s.least_spread * self._camera.width
+        return len(pixels) >= LEAST_FILTERED and spread >= LEAST_SPREAD * self._camera.width

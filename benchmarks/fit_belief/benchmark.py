@@ -25,7 +25,7 @@ from benchmarks.relocalize.score import RIGHT_DEG, RIGHT_M, errors
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.mapserver.relocalization.calibration import COEFFICIENTS, HypothesisSupport, probabilities
-from mapweave.mapserver.relocalization.candidates import RELOCALIZATION_CANDIDATES, Candidates
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import supported
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
@@ -58,7 +58,7 @@ def gather(seed: int, nodes: int, queries: int, bar: Progress) -> Seen:
     relocalizer = Relocalizer(index, lambda node: truth[node].node, joined(places, seed))
     found: Seen = []
     for query in asked:
-        ranked = index.query(query.picture.view, RELOCALIZATION_CANDIDATES)
+        ranked = index.query(query.picture.view, MOST_COMPARED)
         registration = relocalizer.registration.register(Candidates(query.picture.view, ranked))
         seen = relocalizer.selection.places(registration)
         off = [errors(query, truth.get(place.best.node), place.best_from_robot) for place in seen]

@@ -12,30 +12,22 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.merge.islands import Islands
-from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemovalSettings, LandmarkRemover
-from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, NodeSupersedingSettings
-from mapweave.merge.merging import MergeSettings
+from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
+from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdicts
-from mapweave.merge.pose_graph.verification import VerificationSettings
+from mapweave.merge.settings import MergeSettings
 from mapweave.wire.pose_codec import MAX_POSITION
 
 
 class MergePipeline:
     """The merge, superseding of nodes and removal of landmarks."""
 
-    def __init__(
-        self,
-        merging: MergeSettings,
-        superseding: NodeSupersedingSettings,
-        verification: VerificationSettings,
-        removal: LandmarkRemovalSettings,
-        reaches: ReachabilityCache,
-    ) -> None:
+    def __init__(self, settings: MergeSettings, reaches: ReachabilityCache) -> None:
         """Nothing is merged yet."""
-        self._islands = Islands(merging)
-        self._superseder = NodeSuperseder(superseding, verification, reaches)
-        self._remover = LandmarkRemover(removal)
+        self._islands = Islands(settings)
+        self._superseder = NodeSuperseder(reaches)
+        self._remover = LandmarkRemover()
 
     def merged(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -19,37 +19,15 @@ from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
-from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemovalSettings
-from mapweave.merge.map_maintenance.node_superseding import NodeSupersedingSettings
-from mapweave.merge.merging import MergeSettings
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
-from mapweave.merge.pose_graph.candidates import CandidateSettings, Pair
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap, WrongGeometry
 from mapweave.merge.pose_graph.verdicts import MapPair, Verdict, Verdicts
-from mapweave.merge.pose_graph.verification import VerificationSettings
+from mapweave.merge.settings import MergeSettings
 from mapweave.registration.recognition import RecognitionSettings
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class MergerSettings:
-    """How maps are merged as they come.
-
-    Attributes:
-        candidates: which pairs are looked at; the place index must have the same.
-        verification: when two nodes are linked.
-        merging: which links are believed.
-        renewal: when newer nodes stand for older ones.
-        fading: when landmarks are thought to be gone.
-    """
-
-    candidates: CandidateSettings = field(default_factory=CandidateSettings)
-    verification: VerificationSettings = field(default_factory=VerificationSettings)
-    merging: MergeSettings = field(default_factory=MergeSettings)
-    renewal: NodeSupersedingSettings = field(default_factory=NodeSupersedingSettings)
-    fading: LandmarkRemovalSettings = field(default_factory=LandmarkRemovalSettings)
 
 
 class Merger:
@@ -61,7 +39,7 @@ class Merger:
     what the maps hold, not on the order in which it came.
     """
 
-    def __init__(self, places: PlaceDatabase | None = None, settings: MergerSettings | None = None) -> None:
+    def __init__(self, places: PlaceDatabase | None = None, settings: MergeSettings | None = None) -> None:
         """Start with no maps.
 
         Args:
@@ -74,16 +52,13 @@ class Merger:
         self.maps: dict[MapId, HybridMap] = {}
         self.counters = MergerCounters()
         self.reaches = ReachabilityCache()
-        self.settings = settings or MergerSettings()
-        self._comparisons = NodeComparisons(
-            self.places, self.node, self.settings.candidates, self.settings.verification, self.counters
-        )
+        self.settings = settings or MergeSettings()
+        self._comparisons = NodeComparisons(self.places, self.node, self.counters)
         self._verdicts = Verdicts()
         self._pipeline = self._new_pipeline()
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
-        merging = self.settings.merging
-        self._contradictions = WrongGeometrySearch(merging.consistency, merging.strain)
+        self._contradictions = WrongGeometrySearch(self.settings.consistency, self.settings.strain)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}
@@ -306,7 +281,7 @@ class Merger:
 
         def attempt(some: Collection[MapId]) -> MergedMap:
             inside = {one: kept[one] for one in some}
-            return Islands(self.settings.merging).merge(inside, Verdicts(), set(inside), self._rulings)
+            return Islands(self.settings).merge(inside, Verdicts(), set(inside), self._rulings)
 
         return leave_out(sorted(kept), attempt)[0]
 
@@ -335,5 +310,4 @@ class Merger:
                 self._comparisons.connect(edge)
 
     def _new_pipeline(self) -> MergePipeline:
-        s = self.settings
-        return MergePipeline(s.merging, s.renewal, s.verification, s.fading, self.reaches)
+        return MergePipeline(self.settings, self.reaches)

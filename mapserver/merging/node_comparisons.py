@@ -15,11 +15,11 @@ from mapweave.mapserver.merging.verification_cache import (
 )
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
-from mapweave.merge.pose_graph.candidates import CandidateSettings, Pair
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.pairs import PairTable
 from mapweave.merge.pose_graph.verdicts import Verdict
-from mapweave.merge.pose_graph.verification import VerificationSettings, verify
+from mapweave.merge.pose_graph.verification import verify
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +35,6 @@ class NodeComparisons:
         self,
         places: PlaceDatabase,
         node_of: Callable[[NodeId], Node | None],
-        candidates: CandidateSettings,
-        verification: VerificationSettings,
         counters: MergerCounters,
     ) -> None:
         """Begin with no nodes.
@@ -44,13 +42,11 @@ class NodeComparisons:
         Args:
             places: says which nodes look alike.
             node_of: gives a node by its id.
-            candidates: which pairs are compared.
-            verification: when two nodes are linked.
             counters: of what is done.
         """
         self._places, self._node_of = places, node_of
-        self._verification, self._counters = verification, counters
-        self._pairs = PairTable(candidates)
+        self._counters = counters
+        self._pairs = PairTable()
         self._uncompared: dict[NodeId, None] = {}
         self._verdicts: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._cached: CachedVerifications | None = None
@@ -145,7 +141,7 @@ class NodeComparisons:
                 continue
             verdict: Verdict
             try:
-                verdict = verify(bounded(a), bounded(b), self._verification)
+                verdict = verify(bounded(a), bounded(b))
             except Exception as error:  # a defect with two nodes must not hold up all others
                 log.exception("%s and %s cannot be compared", a.id, b.id)
                 verdict = RefusedLink(a.id, b.id, f"cannot be compared ({type(error).__name__})")

@@ -9,7 +9,7 @@ from typing import Protocol
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import View
 
-RELOCALIZATION_CANDIDATES = 16
+MOST_COMPARED = 16
 """Nodes that are compared with the view."""
 
 
@@ -38,4 +38,4 @@ def retrieve(view: View, index: Retrieval, least_features: int) -> Candidates:
     """Find candidates; none for a view with fewer features than registration needs."""
     if len(view) < least_features:
         return Candidates(view)
-    return Candidates(view, index.query(view, RELOCALIZATION_CANDIDATES))
+    return Candidates(view, index.query(view, MOST_COMPARED))

@@ -17,7 +17,7 @@ from mapweave.mapserver.relocalization.aliased_regions import AliasedRegionSetti
 from mapweave.mapserver.relocalization.candidates import Retrieval, retrieve
 from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
 from mapweave.mapserver.relocalization.relocalize_answer import answer_of
-from mapweave.mapserver.relocalization.verdict import HypothesisSelectionSettings, HypothesisSelector
+from mapweave.mapserver.relocalization.verdict import HypothesisSelector
 from mapweave.mapserver.relocalization.view_registration import Registration, ViewRegistration
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.recognition import RecognitionSettings
@@ -29,13 +29,11 @@ class RelocalizationSettings:
 
     Attributes:
         recognition: when a view counts as recognised.
-        judgement: when a place that was recognised is told.
         regions: when a place counts as being there twice, by its surroundings.
         faint: a node that looks so much less like the view than one that was recognised is not looked at.
     """
 
     recognition: RecognitionSettings = field(default_factory=RecognitionSettings)
-    judgement: HypothesisSelectionSettings = field(default_factory=HypothesisSelectionSettings)
     regions: AliasedRegionSettings = field(default_factory=AliasedRegionSettings)
     faint: float = 0.25
 
@@ -70,11 +68,11 @@ class Relocalizer:
         self._index, self._node_of, self._merged = index, node_of, merged
         self._least_features = least = s.recognition.least_inliers
         self.alike = alike or AliasCache(s.recognition)
-        self.registration = ViewRegistration(node_of, merged, s.recognition, s.judgement.alone, s.faint)
+        self.registration = ViewRegistration(node_of, merged, s.recognition, s.faint)
         self.aliasing = PerceptualAliasing(
             index, node_of, merged, self.alike, s.recognition, s.regions, s.faint
         )
-        self.selection = HypothesisSelector(merged, self.aliasing, s.judgement, least)
+        self.selection = HypothesisSelector(merged, self.aliasing, least)
 
     def answer(self, view: View) -> RelocalizeAnswer:
         """Say where a view was taken, or that it is not known, with the reason in words."""

@@ -12,6 +12,7 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
 from mapweave.mapserver.relocalization.place_hypotheses import (
+    ALONE,
     SLIGHT,
     NodeMatch,
     PlaceHypothesis,
@@ -26,7 +27,7 @@ GATE = 16.3
 FLOOR_XY = 0.05
 """Error between two estimates that no covariance tells of, m."""
 FLOOR_HEADING = 0.03
-"""The same, rad."""
+"""Heading error between two estimates that no covariance tells of, rad."""
 COMPARABLE = 0.6
 """A second place is a rival if it explains so much of what the best one explains, or if so much of what it
 should see is seen, as compared with the best one."""
@@ -63,38 +64,20 @@ class Verdict:
     rivals: Sequence[PlaceHypothesis] = ()
 
 
-@dataclass(frozen=True)
-class HypothesisSelectionSettings:
-    """When a place is told.
-
-    Attributes:
-        alone: landmarks that must agree if one node speaks alone. Two nodes that say the same, found each
-            by its own, are much better evidence than one: parts of unlike places look alike.
-    """
-
-    alone: int = 18
-
-
 class HypothesisSelector:
     """Groups what was recognised into places, and decides between them. It stands for one merged map."""
 
-    def __init__(
-        self,
-        merged: MergedMap,
-        aliasing: PerceptualAliasing,
-        settings: HypothesisSelectionSettings,
-        least_features: int,
-    ) -> None:
-        """Take where nodes are, which places look alike, and how strict to be.
+    def __init__(self, merged: MergedMap, aliasing: PerceptualAliasing, least_features: int) -> None:
+        """Take where nodes are, and which places look alike.
+
 
         Args:
             merged: where nodes are.
             aliasing: which other places look like one that was recognised.
-            settings: how strict.
             least_features: a view with fewer has no candidates.
         """
         self._merged, self._aliasing = merged, aliasing
-        self._settings, self._least_features = settings, least_features
+        self._least_features = least_features
 
     def decide(self, registration: Registration) -> Verdict:
         """Say where the robot is if only one place comes into question, or why not."""
@@ -126,7 +109,7 @@ class HypothesisSelector:
             (Outcome.AMBIGUOUS, len(rivals) > 1),
             (
                 Outcome.ONE_WEAK_NODE,
-                len(matches) == 1 and matches[0].recognition.inliers < self._settings.alone,
+                len(matches) == 1 and matches[0].recognition.inliers < ALONE,
             ),
             (Outcome.ONE_THING, all(one.lonely for one in matches)),
         )

@@ -13,7 +13,7 @@ from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.aliased_landmarks import EXPLAINED_PX, between, unexplained
 from mapweave.mapserver.relocalization.candidates import Candidates
-from mapweave.mapserver.relocalization.place_hypotheses import SLIGHT, NodeMatch, is_lonely
+from mapweave.mapserver.relocalization.place_hypotheses import ALONE, SLIGHT, NodeMatch, is_lonely
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import match
 from mapweave.registration.pose_refinement import refine_pose
@@ -43,7 +43,6 @@ class ViewRegistration:
         node_of: Callable[[NodeId], Node | None],
         merged: MergedMap,
         recognition: RecognitionSettings,
-        alone: int,
         faint: float,
     ) -> None:
         """Take what is known.
@@ -52,11 +51,10 @@ class ViewRegistration:
             node_of: gives a node by its id.
             merged: where nodes are.
             recognition: when a view counts as recognised.
-            alone: landmarks that must agree for a node to suffice by itself.
             faint: once a node suffices, candidates that look less alike than this share of it are left out.
         """
         self._node_of, self._merged = node_of, merged
-        self._settings, self._alone, self._faint = recognition, alone, faint
+        self._settings, self._faint = recognition, faint
 
     def register(self, candidates: Candidates) -> Registration:
         """Compare a view with its candidates, as far as it can matter."""
@@ -65,7 +63,7 @@ class ViewRegistration:
         refusals: list[tuple[NodeId, Refusal]] = []
         best_score = 0.0
         for node_id, score in candidates.ranked:
-            sure = any(one.recognition.inliers >= self._alone for one in matches)
+            sure = any(one.recognition.inliers >= ALONE for one in matches)
             node = self._node_of(node_id)
             if node is None or (sure and score < self._faint * best_score):
                 continue

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from mapweave.agent.exploration.carried_mapping import CarriedMapping, CarriedMappingSettings
+from mapweave.agent.exploration import carried_mapping
+from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command
@@ -57,10 +58,12 @@ def test_a_node_is_made_when_the_view_is_known_or_leaving(stage, node):
     assert tick(CarriedMapping(stage)) == [EpisodeRequest.FINISH] * node
 
 
-def test_settings_are_heeded():
+def test_limits_are_heeded(monkeypatch):
     stage = Stage(Pose2(0.3), converged_share=0.5)
     assert not tick(CarriedMapping(stage))
-    assert tick(CarriedMapping(stage, CarriedMappingSettings(converged=0.4, depth_step=0.1)))
+    monkeypatch.setattr(carried_mapping, "CONVERGED", 0.4)
+    monkeypatch.setattr(carried_mapping, "DEPTH_STEP", 0.1)
+    assert tick(CarriedMapping(stage))
 
 
 def test_without_an_image_it_waits():

@@ -1,16 +1,15 @@
 """The verdict names its outcome, and the answer says it in words."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, View
+from mapweave.mapserver.relocalization import verdict
 from mapweave.mapserver.relocalization.candidates import retrieve
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
-from mapweave.mapserver.relocalization.verdict import HypothesisSelectionSettings, Outcome
+from mapweave.mapserver.relocalization.verdict import Outcome
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.world import room, take_node, take_view
 
@@ -62,13 +61,19 @@ OTHER_WAY = take_view(WORLD, ASIDE, np.random.default_rng(5))[0]
     ids=["few features", "no candidate", "gone", "not recognised", "one weak node", "found"],
 )
 def test_each_outcome(
-    view: View, index: Ranked, nodes: dict[NodeId, Node], alone: int, outcome: Outcome, words: str
+    view: View,
+    index: Ranked,
+    nodes: dict[NodeId, Node],
+    alone: int,
+    outcome: Outcome,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    settings = replace(RelocalizationSettings(), judgement=HypothesisSelectionSettings(alone=alone))
-    service = Relocalizer(index, nodes.get, MergedMap.empty(), settings)
+    monkeypatch.setattr(verdict, "ALONE", alone)
+    service = Relocalizer(index, nodes.get, MergedMap.empty())
     candidates = retrieve(view, index, LEAST)
-    verdict = service.selection.decide(service.registration.register(candidates))
-    assert verdict.outcome is outcome
+    decided = service.selection.decide(service.registration.register(candidates))
+    assert decided.outcome is outcome
     answer = service.answer(view)
     assert words in answer.reason
     assert (answer.certainty is Certainty.FOUND) == (outcome is Outcome.FOUND) == bool(answer.candidates)
