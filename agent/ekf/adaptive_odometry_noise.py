@@ -11,8 +11,7 @@ from mapweave.hybridmap.pose import Array
 SLIP = (0.1, 0.2)
 """Sigma of (forward m, turn rad) of a step whose wheels the landmarks refute."""
 DISTRUST = 10
-"""Steps after one whose wheels the landmarks refute in which wheels that claim to stand are not
-believed."""
+"""Steps after one whose wheels the landmarks refute in which wheels that claim to stand are not trusted."""
 
 
 class AdaptiveOdometryNoise:
@@ -27,7 +26,7 @@ class AdaptiveOdometryNoise:
         """
         self._noise = noise
         self._side_slip = side_slip
-        self._steps_doubted = 0
+        self._steps_left = 0
 
     @property
     def increased(self) -> bool:
@@ -39,7 +38,7 @@ class AdaptiveOdometryNoise:
         if not self._steps_left:
             return self._noise.root(odometry)
         # Slip and lost encoders last for more than one step.
-        self._steps_doubted -= 1
+        self._steps_left -= 1
         return self._noise.refuted_root(odometry, 1.0, SLIP[0])
 
     def side_slip(self, odometry: Odometry) -> float:
@@ -49,7 +48,7 @@ class AdaptiveOdometryNoise:
 
     def refuted(self, odometry: Odometry, surprise: float) -> Array:
         """The root for a step that its image refutes by so many sigmas; the next ones get more noise, too."""
-        self.doubt()
+        self.increase()
         return self._noise.refuted_root(odometry, surprise, SLIP[0])
 
     def slipped(self) -> Array:
@@ -58,4 +57,4 @@ class AdaptiveOdometryNoise:
 
     def increase(self) -> None:
         """From now on, for a while."""
-        self._steps_doubted = DISTRUST
+        self._steps_left = DISTRUST

@@ -249,7 +249,7 @@ class MappingFilter:
         innovations, whitening, worst, median = examined
         inliers = np.ones(len(slots), np.bool_)
         if not worst <= self._gate:
-            believed, whitening, median = believe_some(innovations, self._spread(slots), self._gate)
+            inliers, whitening, median = remove_outliers(innovations, self._spread(slots), self._gate)
         agreeing, least = len(whitening) // 2, LEAST_AGREEING_SHARE * len(slots)
         if agreeing < least:
             if self._step is not None:
@@ -260,7 +260,7 @@ class MappingFilter:
                 )
                 still_agreeing = len(still_whitening) // 2
                 if still_agreeing >= max(LEAST_AGREEING, least):
-                    self._wheels.doubt()
+                    self._wheels.increase()
                     reason = f"the wheels are refuted by {still_agreeing} of {len(slots)} landmarks"
                     return Judgement(innovations, still_inliers, still_whitening, Health.SLIP, reason)
                 self._step = step
@@ -271,8 +271,8 @@ class MappingFilter:
             self._noise.learn(median / MEDIAN)
         elif agreeing < LEAST_AGREEING:
             reason = f"{agreeing} of {len(slots)} landmarks in view agree, {LEAST_AGREEING} are needed"
-            return Judgement(innovations, believed, whitening, Health.FEW, reason)
-        return Judgement(innovations, believed, whitening)
+            return Judgement(innovations, inliers, whitening, Health.FEW, reason)
+        return Judgement(innovations, inliers, whitening)
 
     def _correct(self, measurement: ImageMeasurement, judged: Judgement) -> tuple[float, str]:
         """Update with the accepted measurements.

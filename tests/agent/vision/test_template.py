@@ -20,7 +20,7 @@ def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return (1 - v) * upper + v * lower
 
 
-def looks(image: np.ndarray, at: np.ndarray, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def patches(image: np.ndarray, at: np.ndarray, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """A patch of mean 0 and deviation 1, and its weights, as the product's."""
     side = np.arange(-HALF_PX, HALF_PX + 1.0)
     x, y = (grid.ravel() for grid in np.meshgrid(side, side))
