@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Amount, Key, Number, Probability, Words
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, PoseGaussian
@@ -32,6 +36,10 @@ DOUBLES = "doubles"
 is known (see mapweave.merge.outlier_rejection.distinctness)."""
 
 
+MAX_MAPS_TOLD = 256
+"""Pairs of maps in one answer."""
+
+
 @dataclass(frozen=True, slots=True)
 class Witness:
     """Another link between the same two pieces of map.
@@ -46,7 +54,7 @@ class Witness:
 
     a: NodeId
     b: NodeId
-    distance2: float
+    distance2: Amount
     agrees: bool
     kept: bool
 
@@ -64,8 +72,13 @@ class Misfit:
 
     merged_a_from_b: PoseGaussian
     off: Array
-    strain2: float
+    strain2: Amount
     alone: bool
+
+    def __post_init__(self) -> None:
+        """Refuse what is no difference of poses (InvalidValue)."""
+        if self.off.shape != (3,) or not np.isfinite(self.off).all():
+            raise InvalidValue("a misfit must be three finite numbers")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +107,30 @@ class PairExplanation:
     a: Node
     b: Node
     standing: Standing
-    reason: str
+    reason: Words
     matches: NDArray[np.int64]
     shared: NDArray[np.int64]
     residuals_px: Array
     a_from_b: PoseGaussian | None = None
-    evidence: dict[str, float] = field(default_factory=dict)
-    probability: float | None = None
+    evidence: dict[Key, float] = field(default_factory=dict)
+    probability: Probability | None = None
     misfit: Misfit | None = None
     witnesses: tuple[Witness, ...] = ()
-    claims: tuple[str, ...] = ()
+    claims: tuple[Words, ...] = ()
     rulings: tuple[ManualConstraint, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse what does not belong together.
+
+        Raises:
+            InvalidValue: pairs of landmarks that the nodes do not have, or residuals of others.
+        """
+        counts = [len(self.a.landmarks), len(self.b.landmarks)]
+        for pairs in (self.matches, self.shared):
+            if pairs.shape != (len(pairs), 2) or not ((pairs >= 0) & (pairs < counts)).all():
+                raise InvalidValue("a landmark is named that the node does not have")
+        if self.residuals_px.shape != (len(self.shared),) or (self.residuals_px < 0.0).any():
+            raise InvalidValue(f"residuals {self.residuals_px.shape} of {len(self.shared)} landmarks")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +147,9 @@ class NearMiss:
 
     a: NodeId
     b: NodeId
-    matches: int
-    inliers: int
-    lacks: str
+    matches: Number
+    inliers: Number
+    lacks: Words
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +173,20 @@ class MapsExplanation:
     first: MapId
     second: MapId
     joined: bool
-    reason: str
-    links: int
-    landmarks: int
-    refused: int
-    unverified: int
+    reason: Words
+    links: Number
+    landmarks: Number
+    refused: Number
+    unverified: Number
     nearest: tuple[NearMiss, ...] = ()
     rulings: tuple[ManualConstraint, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FleetExplanation:
+    """Of some two maps each, why they are one or are not."""
+
+    maps: Annotated[tuple[MapsExplanation, ...], Meta(max_length=MAX_MAPS_TOLD)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +206,11 @@ class Hop:
 
     a: NodeId
     b: NodeId
-    kind: str
-    distance: float
+    kind: Key
+    distance: Amount
     turn: float
-    cost: float
-    words: str
+    cost: Amount
+    words: Words
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,11 +232,11 @@ class RouteExplanation:
     start: NodeId
     goal: NodeId
     found: bool
-    reason: str
+    reason: Words
     hops: tuple[Hop, ...] = ()
     gaps: tuple[Hop, ...] = ()
     apart: MapsExplanation | None = None
 
 
-Explanation = PairExplanation | tuple[MapsExplanation, ...] | RouteExplanation
+Explanation = PairExplanation | FleetExplanation | RouteExplanation
 """Of two nodes, of some two maps each, or of a route."""

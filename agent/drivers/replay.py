@@ -19,9 +19,9 @@ import numpy as np
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.image_file import read_grey
-from mapweave.wire.packing import MAX_STAMP_NS
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 AXLE_PER_HEIGHT = 0.9

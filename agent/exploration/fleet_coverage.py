@@ -39,7 +39,7 @@ class FleetCoverage:
     def take(self, answer: Answer) -> None:
         """Take what came back. Nothing new is no reason to forget what was said before."""
         if isinstance(answer.content, KnownAnswer):
-            self.views = answer.content.views
+            self.views = answer.content.views.astype(np.float64)
 
     def places(self, views: Array, reach: float, known: float) -> Array:
         """Where others have looked around, so that this robot need not: (M, 2) m, in map.

@@ -12,6 +12,7 @@ import numpy as np
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
@@ -37,7 +38,6 @@ from mapweave.merge.pose_graph.pairs import PairTable
 from mapweave.merge.pose_graph.verdicts import MapPair, Verdict, Verdicts
 from mapweave.merge.pose_graph.verification import VerificationSettings, verify
 from mapweave.registration.recognition import RecognitionSettings
-from mapweave.wire.pose_codec import MAX_POSITION
 
 log = logging.getLogger(__name__)
 

@@ -15,14 +15,13 @@ from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
+from mapweave.hybridmap.query import Certainty, ExplainRequest, RelocalizeAnswer, View, Whereabouts
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.log_messages import Scalar
 from synthetic.world import room, take_map
 
