@@ -1,6 +1,6 @@
 """Truth and intervention, for whoever scores a run: robots and servers never ask here.
 
-The questions that `mapweave.sim.ground_truth_service` answers, as methods.
+The questions of `mapweave.sim.ground_truth_messages`, as methods.
 """
 
 from __future__ import annotations

@@ -97,7 +97,9 @@ class MapFile:
             return
         sizes = {body.node.id: len(body.node.landmarks) for body in self.changes if isinstance(body, NodePut)}
         for node, gone in self.faded.items():
-            if gone.shape != (sizes.get(node),):
+            if node not in sizes:
+                raise InvalidValue(f"landmarks of {node} have faded, which is not there")
+            if gone.shape != (sizes[node],):
                 raise InvalidValue(f"faded landmarks of shape {gone.shape} do not fit node {node}")
 
 

@@ -84,14 +84,14 @@ class PoseNews:
         placed = []
         for (frame, epoch), nodes in sorted(groups.items()):
             places = np.array([self.placed[node].merged_from_node.vector for node in nodes])
-            packed = places.astype(NUMBERS).tobytes()
-            placed.append([list(frame), epoch, [node.number for node in nodes], packed])
+            numbers = [node.number for node in nodes]
+            placed.append(_Placed(frame, epoch, numbers, places.astype(NUMBERS).tobytes()))
         lost: dict[int, list[int]] = {}
         for node in self.gone:
             lost.setdefault(node.epoch, []).append(node.number)
-        gone = [[epoch, numbers] for epoch, numbers in sorted(lost.items())]
-        numbers = {"l": self.run, "p": self.after, "q": self.sequence}
-        data = pack({"a": check_name(agent), **numbers, "w": placed, "g": gone})
+        gone = [_Gone(epoch, numbers) for epoch, numbers in sorted(lost.items())]
+        told = _Poses(check_name(agent), self.run, self.after, self.sequence, placed, gone)
+        data = pack(msgspec.to_builtins(told, builtin_types=(bytes,)))
         try:
             PoseNews.decode(data, agent)
         except InvalidMessage as error:

@@ -362,7 +362,7 @@ def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
     got: list[Answer] = []
     eventually(lambda: got.extend(link.answers()) or len(got) == 2)
     assert got[0].content is None
-    assert "at most 256" in got[0].error
+    assert "length <= 256 - at `$.blocked`" in got[0].error
     assert isinstance(got[1].content, RouteAnswer)
 
 

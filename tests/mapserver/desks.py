@@ -11,7 +11,7 @@ import numpy as np
 
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import Busy
-from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.explanation import Explanation, FleetExplanation
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -82,13 +82,13 @@ class Desk:
 def _explained(request: ExplainRequest) -> Explanation:
     merged = two_maps()
     if request.ends is None:
-        return explain_fleet(merged, 10)
+        return FleetExplanation(explain_fleet(merged, 10))
     first, second = request.ends
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         if request.route:
             return explain_route(Router(merged), first, second)
         return explain_nodes(merged, first, second)
-    return (explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),)
+    return FleetExplanation((explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),))
 
 
 @cache

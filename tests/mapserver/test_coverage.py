@@ -65,7 +65,7 @@ def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
         nearest = min(told, key=pose.distance)
         assert pose.distance(nearest) < 0.3
         assert abs(wrap_angle(nearest.heading - pose.heading)) < 0.2
-    assert set(answer.views[:, 3]) == {beside.camera.semi_aperture}
+    assert set(answer.views[:, 3]) == {np.float32(beside.camera.semi_aperture)}
     assert "14 of 14 views" in answer.reason
 
 

@@ -96,7 +96,7 @@ class Asker:
 
     def maps(self) -> MapsExplanation:
         request = encode(ExplainRequest((A, B)))
-        (told,) = decode(self.ask(KEYS.explain("s0"), request).payload, FleetExplanation)
+        (told,) = decode(self.ask(KEYS.explain("s0"), request).payload, FleetExplanation).maps
         return told
 
     def rule(self, ends: Ends, apart: bool = True) -> Reply:
@@ -153,7 +153,9 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
         assert told.standing is Standing.LINKED and (told.a.id, told.b.id) == pair
         assert len(told.shared) == told.evidence["inliers"] and told.witnesses
         assert asker.maps().joined
-        everything = decode(asker.ask(KEYS.explain("s0"), encode(ExplainRequest())).payload, FleetExplanation)
+        everything = decode(
+            asker.ask(KEYS.explain("s0"), encode(ExplainRequest())).payload, FleetExplanation
+        ).maps
         assert everything == (asker.maps(),)
         unknown = ExplainRequest((NodeId("z", 1, 1), pair[0]))
         reply = asker.ask(KEYS.explain("s0"), encode(unknown))
@@ -278,10 +280,10 @@ def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
     for request in (*map(ExplainRequest, ((A, B), pair, None)), ExplainRequest(pair, route=True)):
         settled = False
         told = explainer.explain(request)
-        early = told[0] if isinstance(told, tuple) else told
+        early = told.maps[0] if isinstance(told, FleetExplanation) else told
         settled = True
         told = explainer.explain(request)
-        late = told[0] if isinstance(told, tuple) else told
+        late = told.maps[0] if isinstance(told, FleetExplanation) else told
         assert early.reason == f"{late.reason} (still merging: ask again)"
     explainer.close()
     desk.close()

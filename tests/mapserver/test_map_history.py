@@ -213,12 +213,22 @@ def test_rulings_stand_among_what_happened() -> None:
 
 def test_it_comes_through_bytes() -> None:
     happenings = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
-    assert decode(encode(happenings), History) == happenings
+    assert decode(encode(History(happenings)), History).history == happenings
     kept = KeptHistory(happenings, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
     assert decode(encode(kept), KeptHistory) == kept
     with pytest.raises(InvalidValue, match="printable"):
-        encode([MapEvent(5, MapEventKind.PARTED, "two\nlines")])
-    assert decode(pack({"h": [[1, "danced", "x"], [6, "failed", "no"]]}), History) == happenings[1:]
-    for fields in ({"h": [[1, "joined"]]}, {"h": [[1, 2, "x"]]}, {"h": 5}, {}):
+        encode(History((MapEvent(5, MapEventKind.PARTED, "two\nlines"),)))
+    newer = [
+        {"stamp_ns": 1, "kind": "danced", "words": "x"},
+        {"stamp_ns": 6, "kind": "failed", "words": "no"},
+    ]
+    assert decode(pack({"history": newer}), History).history == happenings[1:]
+    wrong: list[object] = [
+        [{"stamp_ns": 1, "kind": "joined"}],
+        [{**newer[1], "kind": 2}],
+        5,
+        [[1, "joined", "x"]],
+    ]
+    for fields in ({}, *({"history": one} for one in wrong)):
         with pytest.raises(InvalidMessage):
             decode(pack(fields), History)
