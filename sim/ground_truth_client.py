@@ -1,4 +1,4 @@
-"""Truth and intervention, for whoever scores a run: robots and servers never ask here.
+"""Ground truth and intervention, for scoring a run: robots and servers never use it.
 
 The questions of `mapweave.sim.ground_truth_messages`, as methods.
 """
@@ -82,15 +82,15 @@ class SimControl:
         return driven.stamps_ns, driven.world_from_robot
 
     def plan(self) -> FloorPlan:
-        """What stands where."""
+        """The floor plan."""
         return self._ask(AskPlan(), FloorPlan)
 
     def apply(self, event: Mapping[str, object]) -> str:
-        """Let something happen, as a scenario's table says it; returns what has happened, in words."""
+        """Execute an event given as a scenario's table; returns what has happened, in words."""
         return self._ask(Apply(dict(event)), Done).said
 
     def advance(self, tick: int, patience: float) -> bool:
-        """Let time pass until a tick is over and every robot has finished with it; then time stands still.
+        """Let time pass until a tick is over and every robot has finished with it; then time stops.
 
         From the first call on time passes only so. Asking again for the same tick is no error.
 
@@ -111,14 +111,14 @@ class SimControl:
         return self._ask(AskSnapshot(), Snapshot)
 
     def stop(self) -> None:
-        """End the simulation; its agents are told."""
+        """End the simulation and notify its agents."""
         self._ask(Stop(), Done)
 
     def _ask(self, question: Question, answer: type[Answer]) -> Answer:
         fields: dict[str, Any] = packed(question)
         replies = self._bus.ask(self._key, pack(fields), self._timeout)
         if not replies:
-            raise NotConnected(f"{self._key}: nobody answers; start the simulator with: mapweave sim serve")
+            raise NotConnected(f"{self._key}: no answer; start the simulator with: mapweave sim serve")
         if replies[0].error:
             raise InvalidValue(f"the simulator refuses {fields['op']}: {replies[0].error}")
         return decode(replies[0].payload, answer, ANSWER)

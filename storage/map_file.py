@@ -9,7 +9,7 @@
 Fields that an older program does not know it leaves alone; a file of an older program lacks them. The version
 is raised only when an older program would misread a file.
 
-Poses and landmarks have the wire's precision. A file is written beside its place and then moved there, so
+Poses and landmarks have the wire's precision. A file is written under another name and then renamed, so
 that a reader, or a loss of power, finds either the old file or the new one.
 """
 
@@ -50,13 +50,13 @@ Kind = Literal["agent", "merged"]
 
 @dataclass(frozen=True, eq=False)
 class RefusedPair:
-    """Two nodes that looked alike and were not linked.
+    """Two similar nodes that were not linked.
 
     Attributes:
         a: one node.
         b: another one.
         reason: in words.
-        edge: the link that was found, or what the robot itself said, as an edge; None if not even that.
+        edge: the refused link, or the robot's own edge; None if there is neither.
     """
 
     a: NodeId
@@ -75,9 +75,9 @@ class MapFile:
         changes: the map is their replay; a merged map's links are edges among them.
         poses: of a merged map's nodes: number of the component, pose in that component's frame.
         refused: of a merged map: pairs that were not linked. Edges of robots that are refused are only here.
-        rulings: of people on what shall not be linked, in order.
-        superseded: of a merged map: nodes that newer ones stand for.
-        faded: of a merged map: (N,) which of a node's N landmarks are thought to be gone.
+        rulings: manual constraints, in order.
+        superseded: of a merged map: superseded nodes.
+        faded: of a merged map: (N,) which of a node's N landmarks are faded.
         history: of a merged map: what has become of its maps by itself, in order.
     """
 
@@ -121,7 +121,7 @@ def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
         kind: refuse files of another kind.
 
     Raises:
-        InvalidFile: it cannot be read, is truncated, altered or of another kind; one line says which.
+        InvalidFile: it cannot be read, is truncated, altered or of another kind; one line gives the reason.
     """
     try:
         data = read_whole(path)

@@ -126,7 +126,7 @@ def test_maps_come_back(told: FleetExplanation) -> None:
 
 
 @given(rulings)
-def test_rulings_and_questions_come_back(ruling: ManualConstraint) -> None:
+def test_constraints_and_questions_round_trip(ruling: ManualConstraint) -> None:
     assert decode(encode(ruling), ManualConstraint) == ruling
     request = ExplainRequest(ruling.ends)
     assert decode(encode(request), ExplainRequest) == request
@@ -150,7 +150,7 @@ def test_rulings_and_questions_come_back(ruling: ManualConstraint) -> None:
         ("a", b"no node"), ("a", encode_body(NodeRetired(NODE_A))), ("claims", [7]),
     ],
 )  # fmt: skip
-def test_a_damaged_explanation_is_refused_with_one_line(field: str, value: Any) -> None:
+def test_a_damaged_explanation_is_refused_in_one_line(field: str, value: Any) -> None:
     fields = msgpack.unpackb(encode(explanation()))
     with pytest.raises(InvalidMessage) as refused:
         decode(msgpack.packb({**fields, field: value}), PairExplanation)
@@ -167,16 +167,16 @@ def ruled(*ends: list[Any]) -> bytes:
     "ends",
     [[["a", 1, 2], ["a", 1, 2]], [["a", 1], ["b", 1, 2]], [["a", 1]], [["a", 1, 2, 3]] * 2],
 )
-def test_a_ruling_on_nothing_is_refused(ends: list[Any]) -> None:
+def test_a_constraint_without_effect_is_refused(ends: list[Any]) -> None:
     with pytest.raises(InvalidMessage):
         decode(ruled(*ends), ManualConstraint)
 
 
-def test_a_ruling_on_one_map_retires_it() -> None:
+def test_a_constraint_on_one_map_retires_it() -> None:
     assert decode(ruled(["a", 1], ["a", 1]), ManualConstraint).retires == MapId("a", 1)
 
 
-def test_what_would_not_decode_is_not_encoded() -> None:
+def test_undecodable_values_are_not_encoded() -> None:
     with pytest.raises(InvalidValue):
         encode(
             PairExplanation(*nodes(), Standing.LINKED, "x" * 5000, *[np.zeros((0, 2), int)] * 2, np.zeros(0))
