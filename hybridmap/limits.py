@@ -1,7 +1,7 @@
-"""Types with ranges: what the fields of values may hold that come from outside.
+"""Types with ranges, for the fields of values that come in messages and files.
 
-Within a program they are plain types. `mapweave.wire.typed` refuses messages, files and records that hold
-anything else. Text is one printable line and numbers are finite wherever they come from.
+In a program they are plain types. Messages and files with a field out of range are refused
+(`mapweave.wire.typed`). Text is one printable line and numbers are finite in all of them.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ MAX_NUMBER = 2**53
 MAX_STAMP_NS = 2**63 - 1
 
 MAX_POSITION = 1e6
-"""Of whatever a message places, m. What a merge places is the sum of what robots measured."""
+"""Largest coordinate in messages, m: merged poses are sums of what robots measured."""
 
 MAX_FLOAT = 1e300
-"""Stands for what is infinite."""
+"""Replaces an infinite number in messages."""
 
 MAX_LANDMARKS = 2000
 """Of a node."""

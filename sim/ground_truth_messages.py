@@ -1,4 +1,4 @@
-"""What is asked of a simulator about the truth, and its answers.
+"""Questions to a simulator about the ground truth, and their answers.
 
 A question is a MessagePack map with the operation in `op`.
 """
@@ -79,7 +79,7 @@ Question = Kidnap | Apply | Advance | AskSnapshot | AskStatus | AskTruth | AskTr
 
 @dataclass(frozen=True)
 class Done:
-    """What has been done, in words."""
+    """The operation is done; `said` describes it."""
 
     said: Words = ""
 

@@ -42,7 +42,7 @@ MAGIC = b"MAPWEAVE"
 VERSION = 1
 HEADER = struct.Struct("<8sIQ")
 DIGEST_BYTES = 32
-# A map file has as many values as it has room for: whoever reads one has chosen it.
+# A map file may have any number of values: the user has chosen to read it.
 LIMIT = Limit("map file", 2**32 - 1, 2**32 - 1)
 
 Kind = Literal["agent", "merged"]
@@ -96,11 +96,11 @@ class MapFile:
         if not self.faded:
             return
         sizes = {body.node.id: len(body.node.landmarks) for body in self.changes if isinstance(body, NodePut)}
-        for node, gone in self.faded.items():
+        for node, flags in self.faded.items():
             if node not in sizes:
                 raise InvalidValue(f"landmarks of {node} have faded, which is not there")
-            if gone.shape != (sizes[node],):
-                raise InvalidValue(f"faded landmarks of shape {gone.shape} do not fit node {node}")
+            if flags.shape != (sizes[node],):
+                raise InvalidValue(f"faded landmarks of shape {flags.shape} do not fit node {node}")
 
 
 def write_map_file(path: Path, content: MapFile) -> None:

@@ -127,7 +127,8 @@ class Ack(LogMessage, frozen=True):
 
     def encode(self) -> bytes:
         """With the newest refusals and the beginning of their reasons."""
-        brief = tuple(Refusal(one.sequence, one.reason[:MAX_REASON]) for one in self.refusals[-MAX_REFUSALS:])
+        newest = self.refusals[-MAX_REFUSALS:]
+        brief = tuple(Refusal(refusal.sequence, refusal.reason[:MAX_REASON]) for refusal in newest)
         return LogMessage.encode(msgspec.structs.replace(self, refusals=brief))
 
 

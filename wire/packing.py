@@ -1,8 +1,8 @@
 """MessagePack with a guard at the door: every message is a map with its schema version.
 
-A message is no longer than its kind may be and has no more values, its text is printable, on one line, and
-its numbers are finite. `msgspec.convert` checks each field. Whatever is wrong with a message, an
-InvalidMessage with one line comes out.
+A message has at most the length and the number of values that its kind allows. Its text is printable, on one
+line, and its numbers are finite. `msgspec.convert` checks each field. An invalid message raises
+InvalidMessage with one line.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ def pack(fields: Mapping[str, object], *, single_floats: bool = False) -> bytes:
 
 
 class Limit(NamedTuple):
-    """What a kind of message may be.
+    """Limits of a kind of message.
 
     Attributes:
-        what: its name, for the reason.
-        size: the longest that is looked at, bytes.
-        values: most values in it, see MAX_VALUES. They are counted before any is made.
+        what: its name, for the reason of a refusal.
+        size: longest message that is read, bytes.
+        values: most values in it, see MAX_VALUES. They are counted before any is created.
     """
 
     what: str
@@ -64,16 +64,16 @@ class Limit(NamedTuple):
 
 
 def unpack(data: bytes, kind: Any, limit: Limit, read: Callable[[Any, Any], Any] | None = None) -> Any:
-    """Make a value of a message.
+    """Read a message.
 
     Args:
-        data: as it came.
-        kind: what it must be, for `msgspec.convert`.
-        limit: of such messages.
-        read: makes values of types that msgspec does not know.
+        data: as received.
+        kind: its type, for `msgspec.convert`.
+        limit: of messages of this kind.
+        read: returns values of types that msgspec does not know.
 
     Raises:
-        InvalidMessage: anything is wrong with it; one line says what.
+        InvalidMessage: the message is invalid; one line says why.
     """
     try:
         return msgspec.convert(_fields(data, limit), kind, builtin_types=(bytes,), dec_hook=read)
@@ -105,7 +105,7 @@ def _fields(data: bytes, limit: Limit) -> dict[str, Any]:
 
 
 def _check(fields: dict[str, Any]) -> None:
-    """Refuse text that no line shows and numbers that are none, wherever they are."""
+    """Refuse text that is not printable and numbers that are not finite, at any depth."""
     left: list[Any] = [fields]
     while left:
         value = left.pop()

@@ -89,9 +89,9 @@ class PoseNews:
         lost: dict[int, list[int]] = {}
         for node in self.gone:
             lost.setdefault(node.epoch, []).append(node.number)
-        gone = [_Gone(epoch, numbers) for epoch, numbers in sorted(lost.items())]
-        told = _Poses(check_name(agent), self.run, self.after, self.sequence, placed, gone)
-        data = pack(msgspec.to_builtins(told, builtin_types=(bytes,)))
+        removed = [_Gone(epoch, numbers) for epoch, numbers in sorted(lost.items())]
+        message = _Poses(check_name(agent), self.run, self.after, self.sequence, placed, removed)
+        data = pack(msgspec.to_builtins(message, builtin_types=(bytes,)))
         try:
             PoseNews.decode(data, agent)
         except InvalidMessage as error:
@@ -100,23 +100,23 @@ class PoseNews:
 
     @staticmethod
     def decode(data: bytes, agent: str) -> PoseNews:
-        """Decode what an agent is told.
+        """Decode what an agent is message.
 
         Raises:
             InvalidMessage: it is damaged, or another agent's.
         """
-        told: _Poses = unpack(data, _Poses, LIMIT)
-        if told.agent != agent:
-            raise InvalidMessage(f"poses: they are of {told.agent}'s nodes, not of {agent}'s")
-        if told.after > told.sequence:
-            raise InvalidMessage(f"poses: {told.sequence} comes before {told.after}")
+        message: _Poses = unpack(data, _Poses, LIMIT)
+        if message.agent != agent:
+            raise InvalidMessage(f"poses: they are of {message.agent}'s nodes, not of {agent}'s")
+        if message.after > message.sequence:
+            raise InvalidMessage(f"poses: {message.sequence} comes before {message.after}")
         placed: dict[NodeId, MergedPose] = {}
-        for group in told.placed:
+        for group in message.placed:
             poses = _read_poses(group.poses, len(group.numbers))
             for number, pose in zip(group.numbers, poses, strict=True):
                 placed[NodeId(agent, group.epoch, number)] = MergedPose(group.frame, pose)
-        gone = tuple(NodeId(agent, group.epoch, number) for group in told.gone for number in group.numbers)
-        return PoseNews(told.run, told.after, told.sequence, placed, gone)
+        gone = tuple(NodeId(agent, group.epoch, number) for group in message.gone for number in group.numbers)
+        return PoseNews(message.run, message.after, message.sequence, placed, gone)
 
 
 def _read_poses(packed: bytes, count: int) -> list[Pose2]:

@@ -1,11 +1,10 @@
-"""Values as plain ones, and back: dataclasses as maps of their fields, in any depth.
+"""Conversion between values and plain data: dataclasses become maps of their fields, at any depth.
 
-`packed` gives what MessagePack and JSON take: numbers, text, bytes, lists and maps. On the way back
-`msgspec.convert` checks every type and range, and what else a value demands of its fields it says itself when
-it is made.
+`packed` returns what MessagePack and JSON accept: numbers, text, bytes, lists and maps. `decode` returns the
+value. `msgspec.convert` checks every type and range; a value checks what else it requires when it is created.
 
-A few types have a form of their own: poses are 36 bytes, a node is the body of its change, an array is
-`[kind, shape, bytes]`. A map whose keys are ids is a list of pairs.
+Some types have their own form, see docs/wire.md: poses are 36 bytes, a node is the body of its change, an
+array is `[kind, shape, bytes]`, a map with node ids as keys is a list of pairs.
 """
 
 from __future__ import annotations
@@ -41,11 +40,11 @@ Packers = Mapping[type, Callable[[Any], Any]]
 
 
 class Form(NamedTuple):
-    """How values of a type come in.
+    """How values of a type are read.
 
     Attributes:
-        plain: type of what comes.
-        read: makes a value of it; raises InvalidMessage or InvalidValue.
+        plain: type of the plain data.
+        read: returns the value; raises InvalidMessage or InvalidValue.
     """
 
     plain: Any
@@ -55,14 +54,14 @@ class Form(NamedTuple):
 def _node(data: bytes) -> Node:
     body = decode_body(data)
     if not isinstance(body, NodePut):
-        raise InvalidMessage("this is no node")
+        raise InvalidMessage("not a node")
     return body.node
 
 
 def _edge(data: bytes) -> Edge:
     body = decode_body(data)
     if not isinstance(body, EdgePut):
-        raise InvalidMessage("this is no edge")
+        raise InvalidMessage("not an edge")
     return body.edge
 
 
@@ -71,10 +70,10 @@ def _ends(ends: tuple[list[Any], list[Any]]) -> Any:
 
 
 def _events(events: list[dict[str, Any]]) -> tuple[MapEvent, ...]:
-    """Those of kinds that are known: others are a newer program's."""
+    """Skips events of unknown kinds: a newer program may have written them."""
     kinds = set(MapEventKind)
-    read = (one for one in events if not isinstance(one.get("kind"), str) or one["kind"] in kinds)
-    return tuple(_convert(one, _schema(MapEvent)) for one in read)
+    read = (event for event in events if not isinstance(event.get("kind"), str) or event["kind"] in kinds)
+    return tuple(_convert(event, _schema(MapEvent)) for event in read)
 
 
 FORMS: dict[Any, Form] = {
@@ -99,17 +98,17 @@ PACKERS: Packers = {
 
 
 def packed(value: Any, packers: Packers = PACKERS) -> Any:
-    """A value as plain ones.
+    """Return a value as plain data.
 
     Args:
-        value: of dataclasses, lists, maps, and what `packers` know.
-        packers: for types with a form of their own.
+        value: dataclasses, lists, maps, and the types of `packers`, nested in any way.
+        packers: functions for types with their own form.
 
     Raises:
-        InvalidValue: a number is out of the range that messages have.
+        InvalidValue: a number is out of the range of messages.
     """
-    if (pack := packers.get(type(value))) is not None:
-        return pack(value)
+    if (pack_value := packers.get(type(value))) is not None:
+        return pack_value(value)
     if is_dataclass(value):
         return {field.name: packed(getattr(value, field.name), packers) for field in fields(value)}
     match value:
@@ -133,14 +132,14 @@ def packed(value: Any, packers: Packers = PACKERS) -> Any:
 
 
 def encode(value: Any, limit: Limit) -> bytes:
-    """A message of a value.
+    """Encode a value as a message.
 
     Raises:
         InvalidValue: it would not decode.
     """
     data = pack(packed(value))
     try:
-        # One rule for both sides: what a receiver would refuse is not sent.
+        # The same rule for both sides: nothing is sent that a receiver would refuse.
         decode(data, type(value), limit)
     except InvalidMessage as error:
         raise InvalidValue(str(error)) from None
@@ -148,55 +147,58 @@ def encode(value: Any, limit: Limit) -> bytes:
 
 
 def decode(data: bytes, kind: type[Value], limit: Limit) -> Value:
-    """The value of a message.
+    """Decode a message.
 
     Raises:
-        InvalidMessage: anything is wrong with it; one line says what.
+        InvalidMessage: the message is invalid; one line says why.
     """
     schema: Any = kind
     value: Value = unpack(data, _schema(schema), limit, _read)
     return value
 
 
-class _Left(type):
-    """Of types that msgspec leaves to `_read`, and whose values it takes as they are."""
+class _Opaque(type):
+    """Metaclass of types that msgspec passes to `_read`. It accepts every value that `_read` returns."""
 
     def __instancecheck__(cls, value: object) -> bool:
         return True
 
 
 @cache
-def _left(kind: Any) -> type:
-    return _Left("Left", (), {"kind": kind})
+def _opaque(kind: Any) -> type:
+    return _Opaque("Opaque", (), {"kind": kind})
 
 
 @cache
 def _schema(kind: Any) -> Any:
-    """The same type, in which dataclasses and types with a form of their own are left to `_read`."""
+    """Return the type for msgspec: dataclasses and types with their own form are opaque in it.
+
+    msgspec would read a dataclass itself, without the forms of the types within.
+    """
     origin, inner = get_origin(kind), get_args(kind)
     by_id = origin is Mapping and inner[0] is NodeId
     if kind in FORMS or is_dataclass(kind) or origin is np.ndarray or by_id:
-        return _left(kind)
+        return _opaque(kind)
     if origin is None or origin is Literal:
         return kind
     if origin is Annotated:
         return Annotated[_schema(inner[0]), *kind.__metadata__]
     if origin in (Union, UnionType):
-        some = [one for one in inner if one is not NoneType]
-        if len(some) < len(inner):
-            return _schema(reduce(or_, some)) | None
-        return reduce(or_, map(_schema, inner))
-    return origin[tuple(one if one is ... else _schema(one) for one in inner)]
+        members = [member for member in inner if member is not NoneType]
+        if len(members) < len(inner):
+            return _schema(reduce(or_, members)) | None
+        return reduce(or_, map(_schema, members))
+    return origin[tuple(member if member is ... else _schema(member) for member in inner)]
 
 
 @cache
 def _fields(kind: Any) -> type[msgspec.Struct]:
-    """What comes of a dataclass: its fields, of which those with a default may be missing."""
+    """Return the fields of a dataclass as a struct; those with a default may be missing in a message."""
     hints, declared = get_type_hints(kind, include_extras=True), []
-    for one in fields(kind):
-        given: dict[str, Any] = {"default": one.default, "default_factory": one.default_factory}
+    for field in fields(kind):
+        given: dict[str, Any] = {"default": field.default, "default_factory": field.default_factory}
         default = msgspec.field(**{name: value for name, value in given.items() if value is not MISSING})
-        declared.append((one.name, _schema(hints[one.name]), default))
+        declared.append((field.name, _schema(hints[field.name]), default))
     return msgspec.defstruct(kind.__name__, declared, kw_only=True)
 
 
@@ -204,11 +206,11 @@ def _convert(plain: Any, kind: Any) -> Any:
     return msgspec.convert(plain, kind, builtin_types=(bytes,), dec_hook=_read)
 
 
-def _read(left: Any, plain: Any) -> Any:
+def _read(opaque: Any, plain: Any) -> Any:
     try:
-        return _value(left.kind, plain)
+        return _value(opaque.kind, plain)
     except (msgspec.ValidationError, MapweaveError) as error:
-        # msgspec adds where it is.
+        # msgspec adds the path to a ValueError.
         raise ValueError(str(error).splitlines()[0]) from None
 
 
@@ -223,14 +225,15 @@ def _value(kind: Any, plain: Any) -> Any:
     if get_origin(kind) is np.ndarray:
         return _array(np.dtype(get_args(get_args(kind)[1])[0]), *_convert(plain, _Array))
     pair: Any = tuple[tuple(map(_schema, get_args(kind)))]  # type: ignore[misc]
-    return dict(_convert(plain, list[pair] | _Nothing))
+    # An empty map is packed as a map: nothing says what its keys would be.
+    return dict(_convert(plain, list[pair] | _EmptyMap))
 
 
-_Nothing = Annotated[dict[str, Any], Meta(max_length=0)]
+_EmptyMap = Annotated[dict[str, Any], Meta(max_length=0)]
 _Array = tuple[str, Annotated[list[Annotated[int, Meta(ge=0)]], Meta(max_length=3)], bytes]
 
 
 def _array(dtype: np.dtype[Any], kind: str, shape: list[int], data: bytes) -> NDArray[Any]:
     if kind != dtype.str[1:] or len(data) != math.prod(shape) * dtype.itemsize:
-        raise InvalidValue(f"{len(data)} bytes are no array of {shape} {dtype}, but {kind[:8]}")
+        raise InvalidValue(f"{len(data)} bytes of kind {kind[:8]} are not an array of {shape} {dtype}")
     return np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype).reshape(shape)

@@ -26,7 +26,7 @@ def time_of(stamp_ns: int) -> str:
 
 
 def _numbers(array: NDArray[Any]) -> Any:
-    """Lists of numbers; None for what is none."""
+    """Nested lists; NaN becomes None."""
     if array.dtype.kind != "f":
         return array.tolist()
     return np.where(np.isnan(array), np.array(None), array).tolist()
