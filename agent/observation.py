@@ -10,7 +10,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.limits import NAME_OR_NOTHING, Share
+from mapweave.hybridmap.limits import NAME_OR_NOTHING, Angle, Share
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.ranges import Ranges
 
@@ -20,8 +20,9 @@ FARTHEST = 1e4
 FASTEST = 1e3
 """No robot drives or turns faster, m/s and rad/s."""
 
+Coefficient = Annotated[float, Meta(ge=-1e4, le=1e4)]
+Distortion = tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
 Length = Annotated[float, Meta(ge=1e-3, le=100.0)]
-Bearing = Annotated[float, Meta(ge=-7.0, le=7.0)]
 Reach = Annotated[float, Meta(ge=0.0, le=FARTHEST)]
 Speed = Annotated[float, Meta(ge=0.0, le=FASTEST)]
 
@@ -105,12 +106,12 @@ class RobotDescription:
     """
 
     camera: Camera
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     radius: Length = 0.16
     axle: Length = 0.24
     wheel_noise: Share = 0.02
     side_slip: Share = 0.005
-    ranger_bearings: Annotated[tuple[Bearing, ...], Meta(max_length=MAX_RANGERS)] = ()
+    ranger_bearings: Annotated[tuple[Angle, ...], Meta(max_length=MAX_RANGERS)] = ()
     ranger_reach: Reach = 0.0
     max_forward: Speed = 0.3
     max_turn: Speed = 0.8

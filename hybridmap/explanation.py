@@ -11,7 +11,17 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.limits import Amount, Key, Number, Probability, Words
+from mapweave.hybridmap.limits import (
+    MAX_POSITION,
+    Amount,
+    Angle,
+    Cost,
+    Distance,
+    Key,
+    Number,
+    Probability,
+    Words,
+)
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, PoseGaussian
@@ -77,8 +87,8 @@ class Misfit:
 
     def __post_init__(self) -> None:
         """Refuse what is no difference of poses (InvalidValue)."""
-        if self.off.shape != (3,) or not np.isfinite(self.off).all():
-            raise InvalidValue("a misfit must be three finite numbers")
+        if self.off.shape != (3,) or not (np.abs(self.off) <= 2 * MAX_POSITION).all():
+            raise InvalidValue("a misfit must be three numbers of a pose")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +122,7 @@ class PairExplanation:
     shared: NDArray[np.int64]
     residuals_px: Array
     a_from_b: PoseGaussian | None = None
-    evidence: dict[Key, float] = field(default_factory=dict)
+    evidence: Annotated[dict[Key, float], Meta(max_length=64)] = field(default_factory=dict)
     probability: Probability | None = None
     misfit: Misfit | None = None
     witnesses: tuple[Witness, ...] = ()
@@ -207,9 +217,9 @@ class Hop:
     a: NodeId
     b: NodeId
     kind: Key
-    distance: Amount
-    turn: float
-    cost: Amount
+    distance: Distance
+    turn: Angle
+    cost: Cost
     words: Words
 
 

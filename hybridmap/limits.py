@@ -44,6 +44,13 @@ Coordinate = Annotated[float, Meta(ge=-MAX_POSITION, le=MAX_POSITION)]
 """m, or rad of a heading that is not wrapped."""
 
 Amount = Annotated[float, Meta(ge=0.0)]
+Distance = Annotated[float, Meta(ge=0.0, le=4 * MAX_POSITION)]
+"""m."""
+
+Cost = Annotated[float, Meta(ge=0.0, le=1e9)]
+Angle = Annotated[float, Meta(ge=-7.0, le=7.0)]
+"""rad, a turn or less to either side."""
+
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Probability = Share
 LandmarkCount = Annotated[int, Meta(ge=0, le=MAX_LANDMARKS)]

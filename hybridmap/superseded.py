@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mapweave.hybridmap.limits import Amount, Number
+from mapweave.hybridmap.limits import Angle, Distance, Number
 from mapweave.hybridmap.node import NodeId
 
 
@@ -22,8 +22,8 @@ class Superseded:
 
     by: NodeId
     found: Number
-    distance: Amount
-    turn: Amount
+    distance: Distance
+    turn: Angle
 
     def __str__(self) -> str:
         """For example `r1.1.5 replaces it, 0.31 m off and turned by 12 degrees, with 34 landmarks`."""

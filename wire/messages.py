@@ -62,11 +62,11 @@ LIMITS: dict[type, Limit] = {
     KnownAnswer: Limit("known", 16 * MAX_KNOWN + 2**13),
     ExplainRequest: Limit("explain request", 2**16),
     PairExplanation: Limit("explanation", 2 * MAX_BODY_BYTES + 4_000_000, 200_000),
-    FleetExplanation: Limit("explanation", 4_000_000, 500_000),
+    FleetExplanation: Limit("explanation", 8_000_000, 500_000),
     RouteExplanation: Limit("explanation of a route", 16_000_000, 200_000),
     ManualConstraint: Limit("ruling", 4096),
     History: Limit("history", 2**26, 1_000_000),
-    KeptHistory: Limit("history", 2**26, 1_000_000),
+    KeptHistory: Limit("history", 2**26, 2_000_000),
 }
 """Kinds of messages."""
 
