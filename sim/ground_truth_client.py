@@ -41,14 +41,14 @@ Answer = TypeVar("Answer")
 
 
 class SimControl:
-    """Asks the simulator.
+    """Client of the ground truth service.
 
     Every method raises NotConnected if no simulator answers, InvalidValue if it refuses (with its reason),
     and InvalidMessage if its answer is broken.
     """
 
     def __init__(self, bus: Bus, fleet: str, timeout: float = 10.0) -> None:
-        """Nothing is asked yet.
+        """Prepare the client.
 
         Args:
             bus: the connection.

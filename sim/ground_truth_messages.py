@@ -90,7 +90,7 @@ class RobotStatus:
 
     Attributes:
         world_from_robot: true pose.
-        collisions: how often it has hit something.
+        collisions: their number.
         active: whether its agent takes part.
     """
 

@@ -60,7 +60,7 @@ class GroundTruthService:
         self._stop = stop
 
     def answer(self, question: bytes) -> bytes:
-        """Do what is asked.
+        """Answer a question.
 
         Raises:
             MapweaveError: the question is broken, or the simulation refuses.
