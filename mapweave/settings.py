@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.pipeline import PipelineSettings
 from mapweave.mapserver.admission_control import AdmissionSettings
 from mapweave.storage.settings_file import build, read_toml
@@ -36,12 +37,14 @@ class Settings:
 
     Attributes:
         network: how to reach the fleet.
+        robot: driver, camera and body of an agent's robot.
         pipeline: of an agent.
         desk: how a map server shares out the questions that take long.
         merge: how maps are merged, as it stands in the file; see `merge_settings`.
     """
 
     network: NetworkSettings = dataclasses.field(default_factory=NetworkSettings)
+    robot: RobotSettings = dataclasses.field(default_factory=RobotSettings)
     pipeline: PipelineSettings = dataclasses.field(default_factory=PipelineSettings)
     desk: AdmissionSettings = dataclasses.field(default_factory=AdmissionSettings)
     merge: Mapping[str, Any] = dataclasses.field(default_factory=dict)

@@ -68,7 +68,7 @@ def tell_if_alone(bus: ZenohBus, who: str) -> None:
     def look() -> None:
         # Who leaves before the time is over has not looked for long enough.
         if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
-            advice = "start `mapweave server` or give --connect"
+            advice = "start `mapweave server` or `mapweave router`, or give --connect"
             print(f"{who} finds no router: {advice}; it goes on looking", file=sys.stderr, flush=True)
 
     threading.Thread(target=look, name="router", daemon=True).start()

@@ -1,0 +1,211 @@
+"""A robot made of a base and a camera: odometry at the time of each image, and nothing that makes it wait."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.drivers.base import Base, BaseReading, Wheels
+from mapweave.agent.drivers.camera import Capture, FrameSource
+from mapweave.agent.drivers.clock import now_ns
+from mapweave.agent.drivers.settings import RobotSettings
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
+
+log = logging.getLogger(__name__)
+
+POLL = 0.05
+"""s between two readings of the base: twice as often as images are used."""
+RETRY = 0.3
+"""s until a port that has failed is tried again."""
+PATIENCE = 5.0
+"""s; a base and a camera that have not answered by then are not there."""
+STALE = 0.5
+"""s; older proximity readings say nothing."""
+LONGEST_EXTRAPOLATION_NS = 100_000_000
+"""The wheels' speed is taken for constant for so long after their last reading."""
+
+
+class WheeledRobot:
+    """The Robot protocol over a base and a camera.
+
+    A thread talks to the base: it sends the newest command, reads, and connects again when the line fails.
+    Another takes images. `sense` and `act` only look at what these have left.
+    """
+
+    def __init__(self, base: Base, settings: RobotSettings, camera: FrameSource | None = None) -> None:
+        """Begin to connect.
+
+        Args:
+            base: what drives.
+            settings: camera and geometry.
+            camera: in place of the one in the settings.
+
+        Raises:
+            SettingsError: there is no camera.
+            DeviceError: the camera is not there.
+        """
+        self._base = base
+        self._settings = settings
+        self._description: RobotDescription | None = None
+        self._changed = threading.Condition()
+        self._readings: deque[tuple[int, BaseReading]] = deque(maxlen=64)
+        self._command: Wheels | None = None
+        self._failure = ""
+        self._opened = self._closing = False
+        self._stamp_ns = 0
+        self._odometry_at = Wheels()
+        self._due = 0.0
+        if camera is None:
+            if settings.camera is None:
+                settings.describe(base.geometry)  # says what is missing
+                raise AssertionError
+            camera = Capture(settings.camera)
+        self._camera = camera
+        self._thread = threading.Thread(target=self._serve, name="base", daemon=True)
+        self._thread.start()
+
+    def describe(self) -> RobotDescription:
+        """What settings and driver know; waits until the base has answered once.
+
+        Raises:
+            DeviceError: it does not answer.
+            SettingsError: something about the body is not known.
+        """
+        if self._description is None:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._readings) or self._closing, PATIENCE)
+                if not self._readings:
+                    raise DeviceError(self._failure or "the robot was closed before it has answered")
+                self._odometry_at = self._readings[-1][1].way
+            self._description = self._settings.describe(self._base.geometry)
+        return self._description
+
+    def sense(self) -> Observation | None:
+        """What is newest, a tick after the last time; None once closed.
+
+        A line that has failed shows in this: the wheels stand still, and proximity sensors are not there.
+
+        Raises:
+            DeviceError: the base has never answered, or its driver has failed.
+        """
+        description = self.describe()
+        tick = description.tick
+        begin = time.monotonic()
+        self._due = max(self._due + tick, begin)
+        with self._changed:
+            if self._changed.wait_for(lambda: self._closing, self._due - begin):
+                return None
+        frame = self._camera.newer(self._stamp_ns, tick)
+        with self._changed:
+            if self._closing:
+                return None
+            if not self._thread.is_alive():
+                raise DeviceError("the driver of the base has failed; see above")
+            stamp_ns = frame.stamp_ns if frame is not None else max(self._stamp_ns + 1, self._readings[-1][0])
+            way = self._way(stamp_ns)
+            read_ns, reading = self._readings[-1]
+        before, self._odometry_at = self._odometry_at, way
+        self._stamp_ns = stamp_ns
+        left, right = way.left - before.left, way.right - before.right
+        fresh = now_ns() - read_ns < STALE * 1e9
+        return Observation(
+            stamp_ns,
+            Odometry((left + right) / 2, (right - left) / description.axle),
+            None if frame is None else frame.image,
+            reading.proximity if fresh else np.zeros(0),
+            reading.bumped and fresh,
+        )
+
+    def act(self, command: Command) -> Command:
+        """Leave a command for the base's thread.
+
+        Returns:
+            The command that the base drives: within its limits, in its steps.
+
+        Raises:
+            InvalidValue: it is not finite.
+        """
+        wheels = self._base.nearest(self._wheels(command))
+        with self._changed:
+            self._command = wheels
+            self._changed.notify_all()
+        axle = self.describe().axle
+        return Command((wheels.left + wheels.right) / 2, (wheels.right - wheels.left) / axle)
+
+    def close(self) -> None:
+        """Stop the wheels and let go. Twice is no error."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+        self._camera.close()
+
+    def _wheels(self, command: Command) -> Wheels:
+        """The wheels' speeds of a command within the limits."""
+        if not (math.isfinite(command.forward) and math.isfinite(command.turn)):
+            raise InvalidValue(f"command: {command} is not finite")
+        d = self.describe()
+        forward = min(max(command.forward, -d.max_forward), d.max_forward)
+        half = min(max(command.turn, -d.max_turn), d.max_turn) * d.axle / 2
+        return Wheels(forward - half, forward + half)
+
+    def _way(self, stamp_ns: int) -> Wheels:
+        """The wheels' ways at a time: between two readings, or a little beyond the last."""
+        stamps = np.array([stamp for stamp, _ in self._readings], dtype=np.int64)
+        # (N, 2) m. Relative stamps: nanoseconds since 1970 are too many for a float.
+        ways = np.array([reading.way for _, reading in self._readings])
+        times: NDArray[np.float64] = (stamps - stamps[-1]).astype(np.float64)
+        at = float(stamp_ns - int(stamps[-1]))
+        if at > 0.0 and len(ways) > 1:
+            speed = (ways[-1] - ways[-2]) / max(times[-1] - times[-2], 1.0)
+            left, right = ways[-1] + speed * min(at, LONGEST_EXTRAPOLATION_NS)
+        else:
+            left, right = (float(np.interp(at, times, ways[:, wheel])) for wheel in (0, 1))
+        return Wheels(float(left), float(right))
+
+    # In the base's thread.
+
+    def _serve(self) -> None:
+        while not self._closing:
+            try:
+                self._base.open()
+                while not self._closing:
+                    self._exchange()
+            except DeviceError as error:
+                self._fail(str(error))
+            finally:
+                self._base.close()
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing, RETRY)
+
+    def _exchange(self) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._command is not None or self._closing, POLL)
+            command, self._command = self._command, None
+        if self._closing:
+            return
+        if command is not None:
+            self._base.drive(command)
+        asked = now_ns()
+        reading = self._base.read()
+        with self._changed:
+            self._readings.append(((asked + now_ns()) // 2, reading))
+            if self._failure and self._opened:
+                log.warning("the robot answers again")
+            self._opened, self._failure = True, ""
+            self._changed.notify_all()
+
+    def _fail(self, failure: str) -> None:
+        if self._opened and not self._failure:
+            log.warning("%s; the wheels stand until it answers again", failure)
+        self._failure = failure
+        # What was to be driven then is void when the line is back.
+        self._command = None
