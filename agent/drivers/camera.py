@@ -105,7 +105,8 @@ class Capture:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         else:
-            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG)
+            # One thread: with more, FFmpeg decodes as many frames at once, and all come so many frames late.
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         if not capture.isOpened():
             capture.release()
             raise DeviceError(

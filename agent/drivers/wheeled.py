@@ -28,6 +28,8 @@ PATIENCE = 5.0
 """s; a base and a camera that have not answered by then are not there."""
 STALE = 0.5
 """s; older proximity readings say nothing."""
+OLDEST_IMAGE_NS = 1_000_000_000
+"""The first image is no older; of the others it is known how old they are when they are here."""
 LONGEST_EXTRAPOLATION_NS = 100_000_000
 """The wheels' speed is taken for constant for so long after their last reading."""
 
@@ -58,8 +60,10 @@ class WheeledRobot:
         self._readings: deque[tuple[int, BaseReading]] = deque(maxlen=64)
         self._command: Wheels | None = None
         self._failure = ""
+        self._mistake: Exception | None = None
         self._opened = self._closing = False
         self._stamp_ns = 0
+        self._age_ns = OLDEST_IMAGE_NS
         self._odometry_at = Wheels()
         self._due = 0.0
         if camera is None:
@@ -83,7 +87,9 @@ class WheeledRobot:
                 self._changed.wait_for(lambda: bool(self._readings) or self._closing, PATIENCE)
                 if not self._readings:
                     raise DeviceError(self._failure or "the robot was closed before it has answered")
-                self._odometry_at = self._readings[-1][1].way
+                read_ns, reading = self._readings[-1]
+                self._stamp_ns = read_ns - self._age_ns
+                self._odometry_at = reading.way
             self._description = self._settings.describe(self._base.geometry)
         return self._description
 
@@ -106,9 +112,16 @@ class WheeledRobot:
         with self._changed:
             if self._closing:
                 return None
-            if not self._thread.is_alive():
-                raise DeviceError("the driver of the base has failed; see above")
-            stamp_ns = frame.stamp_ns if frame is not None else max(self._stamp_ns + 1, self._readings[-1][0])
+            if self._mistake is not None:
+                what = f"{type(self._mistake).__name__}: {self._mistake}"
+                raise DeviceError(f"the driver of the base has failed: {what}") from self._mistake
+            if frame is not None:
+                stamp_ns = frame.stamp_ns
+                self._age_ns = now_ns() - stamp_ns
+            else:
+                # As an image would have been stamped a tick ago, so that the next one is newer.
+                tick_ns = round(tick * 1e9)
+                stamp_ns = max(self._stamp_ns + tick_ns // 10, now_ns() - self._age_ns - tick_ns)
             way = self._way(stamp_ns)
             read_ns, reading = self._readings[-1]
         before, self._odometry_at = self._odometry_at, way
@@ -181,6 +194,9 @@ class WheeledRobot:
                     self._exchange()
             except DeviceError as error:
                 self._fail(str(error))
+            except Exception as error:  # noqa: BLE001 - a driver's mistake, told where the agent senses
+                self._mistake = error
+                return
             finally:
                 self._base.close()
             with self._changed:
