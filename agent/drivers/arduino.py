@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import time
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.hybridmap.errors import DeviceError, SettingsError
 from mapweave.storage.settings_file import build
 
+STATE = re.compile(r"S( -?[0-9]{1,10}){2} [01]( -?[0-9]{1,6}){0,256}")
 BOOT = 3.0
 """s; many boards restart when the port is opened."""
 
@@ -93,7 +95,7 @@ class ArduinoBase:
         newest: list[int] | None = None
         while newest is None or self._port.line_waiting():
             line = self._port.line()
-            newest = _numbers(line) or newest
+            newest = parse_state(line) or newest
             if newest is None and time.monotonic() >= end:
                 raise DeviceError(f"{self._options.port}: {line!r} is not 'S left right bumped cm ...'")
         left, right, bumped, *centimetres = newest
@@ -109,15 +111,9 @@ class ArduinoBase:
         return BaseReading(way, proximity, bool(bumped))
 
 
-def _numbers(line: str) -> list[int] | None:
+def parse_state(line: str) -> list[int] | None:
     """Left and right count, bumper, centimetres; None if the line is no such."""
-    word, *rest = line.split()
-    if word != "S" or len(rest) < 3:
-        return None
-    try:
-        return [int(part) for part in rest]
-    except ValueError:
-        return None
+    return [int(part) for part in line.split()[1:]] if STATE.fullmatch(line) else None
 
 
 class Arduino(WheeledRobot):

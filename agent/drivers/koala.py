@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
 from mapweave.storage.settings_file import build
 
+NUMBER = re.compile(r"-?[0-9]{1,10}")
 INFRARED_REACH = 0.2
 """m; farther away infrared sensors see nothing."""
 INFRARED_AT_REACH = 20.0
@@ -210,13 +212,18 @@ class KoalaBase:
         raise DeviceError(f"{self._path}: {command.decode().strip()!r} was answered by {line!r}")
 
     def _numbers(self, text: str, count: int | None = None) -> list[int]:
-        try:
-            numbers = [int(part) for part in text.split(",")]
-        except ValueError:
-            numbers = []
-        if not numbers or (count is not None and len(numbers) != count):
+        numbers = parse_numbers(text)
+        if numbers is None or (count is not None and len(numbers) != count):
             raise DeviceError(f"{self._path}: {text!r} is not {count or 'a list of'} numbers")
         return numbers
+
+
+def parse_numbers(text: str) -> list[int] | None:
+    """Whole numbers of 32 bit between commas; None if it is anything else."""
+    parts = text.split(",")
+    if not all(NUMBER.fullmatch(part) for part in parts):
+        return None
+    return [int(part) for part in parts]
 
 
 class Koala(WheeledRobot):

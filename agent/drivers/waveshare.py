@@ -5,11 +5,10 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-import math
 import time
 import urllib.parse
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from mapweave.agent.drivers.base import BaseReading, Wheels
 from mapweave.agent.drivers.serial_port import SerialPort
@@ -31,7 +30,24 @@ FASTEST = 0.5
 TIMEOUT = 0.5
 """s for an answer over HTTP, which a network carries."""
 
+LARGEST_SPEED = 5.0
+"""m/s; more is a line that was damaged."""
+LARGEST_ODOMETER = 1e9
+"""cm."""
+
 Json = dict[str, Any]
+
+
+class BaseInfo(NamedTuple):
+    """What an answer says.
+
+    Attributes:
+        speeds: measured, m/s.
+        odometers: ways since the base was switched on, m; None if the firmware has none.
+    """
+
+    speeds: Wheels
+    odometers: Wheels | None = None
 
 
 @dataclass(frozen=True)
@@ -52,7 +68,7 @@ class Line(Protocol):
         """Send a command."""
         ...
 
-    def feedback(self) -> Json:
+    def feedback(self) -> BaseInfo:
         """The newest answer that says how the wheels turn."""
         ...
 
@@ -75,11 +91,11 @@ class SerialLine:
         """A line."""
         self._port.write(json.dumps(command, separators=(",", ":")).encode() + b"\n")
 
-    def feedback(self) -> Json:
+    def feedback(self) -> BaseInfo:
         """The newest line; waits for one."""
-        newest: Json | None = None
+        newest: BaseInfo | None = None
         while newest is None or self._port.line_waiting():
-            newest = _base_info(self._port.line()) or newest
+            newest = parse_info(self._port.line()) or newest
         return newest
 
     def close(self) -> None:
@@ -100,9 +116,9 @@ class HttpLine:
         """Ask and forget the answer."""
         self._ask(command)
 
-    def feedback(self) -> Json:
+    def feedback(self) -> BaseInfo:
         """Ask for it."""
-        info = _base_info(self._ask({"T": FEEDBACK}))
+        info = parse_info(self._ask({"T": FEEDBACK}))
         if info is None:
             raise DeviceError(f"{self._address}: no answer about the base")
         return info
@@ -123,18 +139,26 @@ class HttpLine:
             ) from error
 
 
-def _base_info(text: str) -> Json | None:
-    """An answer about the base; None if it is about something else, or half of it."""
+def parse_info(text: str) -> BaseInfo | None:
+    """What an answer says of the wheels; None if it is about something else, or half of it."""
     try:
         answer = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(answer, dict) or answer.get("T") != BASE_INFO:
         return None
-    numbers = [answer.get(name) for name in ("L", "R")]
-    if not all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
+    speeds = [answer.get(name) for name in ("L", "R")]
+    odometers = [answer.get(name) for name in ("odl", "odr")]
+    if not all(_is_number(speed, LARGEST_SPEED) for speed in speeds):
         return None
-    return answer
+    info = BaseInfo(Wheels(*map(float, speeds)))
+    if all(_is_number(centimetres, LARGEST_ODOMETER) for centimetres in odometers):
+        info = info._replace(odometers=Wheels(*(float(centimetres) / 100.0 for centimetres in odometers)))
+    return info
+
+
+def _is_number(value: Any, largest: float) -> bool:
+    return isinstance(value, int | float) and -largest <= value <= largest
 
 
 class WaveshareBase:
@@ -178,11 +202,7 @@ class WaveshareBase:
     def read(self) -> BaseReading:
         """Odometers where the firmware has them, else the sum of the measured speeds."""
         assert self._line is not None
-        info, now = self._line.feedback(), time.monotonic()
-        speeds = Wheels(float(info["L"]), float(info["R"]))
-        odometers = None
-        if "odl" in info and "odr" in info:
-            odometers = Wheels(float(info["odl"]) / 100.0, float(info["odr"]) / 100.0)
+        (speeds, odometers), now = self._line.feedback(), time.monotonic()
         if self._last is not None:
             then, before, odometers_before = self._last
             if odometers is not None and odometers_before is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.server
-import math
 import threading
 import time
 from pathlib import Path
@@ -14,12 +13,10 @@ import numpy as np
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
-from tests.agent.drivers.emulators import Koala25, TwoWheels
+from tests.agent.drivers.emulators import Koala25, KoalaSilver, LineEmulator, TwoWheels
 
 RANGERS = 72
-"""Of the simulated robot, 5 degrees apart; the Koala has nine of them."""
-BEARINGS_DEG = (110, 70, 35, 0, -35, -70, -110, -160, 160)
-"""Left rear, left front, front left, front, front right, right front, right rear, back right, back left."""
+"""Of the simulated robot, 5 degrees apart; a Koala has some of them."""
 
 
 class SimulatedWheels(TwoWheels):
@@ -54,14 +51,14 @@ class SimulatedWheels(TwoWheels):
             return l0 + share * (l1 - l0), r0 + share * (r1 - r0)
 
 
-class KoalaInSimulation(Koala25):
+class InSimulation(LineEmulator):
     """Runs one robot of a simulation in real time; its only ends are the serial port and the stream's URL."""
 
     def __init__(self, folder: Path, simulation: Simulation, name: str) -> None:
         super().__init__(folder)
         self._simulation, self._name = simulation, name
         description = simulation.describe(name)
-        self._tick, self._reach = description.tick, description.ranger_reach
+        self._tick = description.tick
         self.wheels = self._wheels = SimulatedWheels(description.axle, description.tick)
         # The simulation is touched between ticks only.
         self.world = threading.RLock()
@@ -132,14 +129,41 @@ class KoalaInSimulation(Koala25):
                     self._new.notify_all()
                 self._shown.append((time.time_ns(), pose))
             self._wheels.turned(seen)
-            self.ultrasonic = [self._centimetres(seen.proximity, bearing) for bearing in BEARINGS_DEG]
+            self.feel(seen.proximity)
             if seen.image is not None:
                 pose = taken
                 frame = cv2.imencode(".jpg", seen.image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
-    def _centimetres(self, proximity: np.ndarray, bearing_deg: int) -> int:
-        """Manual of the Koala 2.5, section 4.1: nothing nearer than 25 cm, nothing beyond 250."""
-        distance = 100.0 * float(proximity[round(bearing_deg % 360 / 360 * RANGERS) % RANGERS])
-        if distance >= min(250.0, 100.0 * self._reach) or math.isnan(distance):
-            return 1000
-        return 0 if distance < 25.0 else round(distance)
+    def feel(self, proximity: np.ndarray) -> None:
+        """Set what the sensors say."""
+        raise NotImplementedError
+
+
+def at(proximity: np.ndarray, bearing_deg: int) -> float:
+    """Distance in a direction, m."""
+    return float(proximity[round(bearing_deg % 360 / 360 * RANGERS) % RANGERS])
+
+
+class Koala25InSimulation(InSimulation, Koala25):
+    """Koala 2.5 with nine ultrasonic sensors; manual, section 4.1."""
+
+    BEARINGS_DEG = (110, 70, 35, 0, -35, -70, -110, -160, 160)
+    """Left rear, left front, front left, front, front right, right front, right rear, back right, back left."""
+
+    def feel(self, proximity: np.ndarray) -> None:
+        """Nothing is told apart below 25 cm, and nothing is seen beyond 250."""
+        centimetres = [100.0 * at(proximity, bearing) for bearing in self.BEARINGS_DEG]
+        self.ultrasonic = [1000 if c >= 249.5 else 0 if c < 25.0 else round(c) for c in centimetres]
+
+
+class KoalaSilverInSimulation(InSimulation, KoalaSilver):
+    """Koala silver edition with sixteen infrared sensors that reach 20 cm."""
+
+    BEARINGS_DEG = (5, 20, 35, 55, 75, 105, 135, 170)
+    """Of the left side, from the front; then those of the right."""
+
+    def feel(self, proximity: np.ndarray) -> None:
+        """Light that comes back: with the inverse square of the distance, ten bits."""
+        both = [*self.BEARINGS_DEG, *(-bearing for bearing in self.BEARINGS_DEG)]
+        light = [20 * (0.2 / max(at(proximity, bearing), 0.01)) ** 2 for bearing in both]
+        self.infrared = [min(round(value), 1023) for value in light]

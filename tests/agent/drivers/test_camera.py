@@ -158,3 +158,62 @@ def test_a_stream_that_ends_is_opened_again(stream: Stream) -> None:
     assert last is not None
     assert camera.newer(last.stamp_ns, 6.0) is not None
     camera.close()
+
+
+class Device:
+    """What OpenCV makes of a Video4Linux device, for machines without one."""
+
+    def __init__(self, locks: bool) -> None:
+        self.locks = locks
+        self.properties = {cv2.CAP_PROP_EXPOSURE: 157.0, cv2.CAP_PROP_AUTO_EXPOSURE: 3.0}
+        self.exposed_ns = 0
+        self.released = False
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, name: int, value: float) -> bool:
+        if name == cv2.CAP_PROP_AUTO_EXPOSURE and not self.locks:
+            return False
+        self.properties[name] = value
+        return True
+
+    def get(self, name: int) -> float:
+        if name == cv2.CAP_PROP_POS_MSEC:
+            return self.exposed_ns / 1e6
+        return self.properties.get(name, 0.0)
+
+    def grab(self) -> bool:
+        # Taken 60 ms before it is here.
+        self.exposed_ns = time.monotonic_ns() - 60_000_000
+        time.sleep(0.03)
+        return not self.released
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+    def release(self) -> None:
+        self.released = True
+
+
+@pytest.mark.parametrize("locks", [True, False])
+def test_a_device_is_stamped_by_its_driver_and_its_exposure_locked(
+    locks: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    device, opened = Device(locks), []
+    monkeypatch.setattr("cv2.VideoCapture", lambda *arguments: opened.append(arguments) or device)
+    monkeypatch.setattr("mapweave.agent.drivers.camera.SETTLING", 0.2)
+    camera = Capture(settings("/dev/video2", lock_exposure=True))
+    assert opened == [(2, cv2.CAP_V4L2)]
+    frame = camera.newer(0, 2.0)
+    assert frame is not None
+    age = (time.time_ns() - frame.stamp_ns) / 1e9
+    assert 0.08 < age < 0.4
+    assert device.properties[cv2.CAP_PROP_FRAME_WIDTH] == WIDTH
+    assert device.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == 3.0
+    time.sleep(0.6)
+    assert device.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == (1.0 if locks else 3.0)
+    assert device.properties[cv2.CAP_PROP_EXPOSURE] == 157.0
+    assert ("cannot lock its exposure" in caplog.text) is not locks
+    camera.close()
+    assert device.released

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 
 from mapweave.agent.drivers.robot import Robot
+from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
+from mapweave.agent.drivers.waveshare import Waveshare
 from mapweave.agent.observation import Command
 from tests.agent.drivers.contract import RobotContract, drive
 from tests.agent.drivers.emulators import UgvHttp, UgvSerial
@@ -39,16 +41,19 @@ class TestUgvSerial(RobotContract):
         assert emulator.wheels.speeds[0] > 0.05
 
 
-class TestUgvWithOdometers(RobotContract):
-    DRIVER = "waveshare"
-    SPEED_STEP = 0.001
-    COUNT = 0.01
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        ugv = UgvSerial(tmp_path, odometers=True)
-        yield ugv
-        ugv.close()
+def test_odometers_go_before_speeds(tmp_path: Path, video: Path) -> None:
+    """Firmware ugv_base_ros: `odl`, `odr` in centimetres."""
+    ugv = UgvSerial(tmp_path, odometers=True)
+    camera = CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3, source=str(video))
+    robot = Waveshare(RobotSettings(options={"port": str(ugv.path)}, camera=camera))
+    robot.sense()
+    seen = drive(robot, Command(0.2, 0.5), 1.0)
+    seen += drive(robot, Command(), 0.3)
+    left, right = ugv.wheels.way()
+    assert sum(o.odometry.forward for o in seen) == pytest.approx((left + right) / 2, abs=0.01)
+    assert sum(o.odometry.turn for o in seen) == pytest.approx((right - left) / 0.172, abs=0.06)
+    robot.close()
+    ugv.close()
 
 
 class TestUgvHttp(RobotContract):
