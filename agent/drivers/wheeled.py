@@ -127,13 +127,14 @@ class WheeledRobot:
         before, self._odometry_at = self._odometry_at, way
         self._stamp_ns = stamp_ns
         left, right = way.left - before.left, way.right - before.right
-        fresh = now_ns() - read_ns < STALE * 1e9
+        # A body whose settings say that it has no sensors does not use those that there are.
+        fresh = now_ns() - read_ns < STALE * 1e9 and bool(description.ranger_bearings)
         return Observation(
             stamp_ns,
             Odometry((left + right) / 2, (right - left) / description.axle),
             None if frame is None else frame.image,
             reading.proximity if fresh else np.zeros(0),
-            reading.bumped and fresh,
+            reading.bumped,
         )
 
     def act(self, command: Command) -> Command:

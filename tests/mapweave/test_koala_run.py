@@ -22,19 +22,14 @@ from mapweave.storage.map_file import unpack_map_file
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
-from tests.mapweave.koala_in_simulation import (
-    RANGERS,
-    InSimulation,
-    Koala25InSimulation,
-    KoalaSilverInSimulation,
-)
+from tests.mapweave.koala_in_simulation import RANGERS, KoalaInSimulation
 
 EXPLORE = 90.0
 """s of exploration."""
 SEED = 11
 
 
-def settings_file(folder: Path, koala: InSimulation, simulation: Simulation) -> Path:
+def settings_file(folder: Path, koala: KoalaInSimulation, simulation: Simulation) -> Path:
     d = simulation.describe("r0")
     c = d.camera
     path = folder / "robot.toml"
@@ -68,14 +63,13 @@ wheel_noise = {d.wheel_noise}
 
 @pytest.mark.slow
 @pytest.mark.timeout(560)
-@pytest.mark.parametrize("kind", [Koala25InSimulation, KoalaSilverInSimulation])
-def test_a_koala_maps_is_carried_off_and_parks(kind: type[InSimulation], tmp_path: Path) -> None:
+def test_a_koala_maps_is_carried_off_and_parks(tmp_path: Path) -> None:
     keys, endpoint = Keys("serial"), f"tcp/127.0.0.1:{free_port()}"
     network = ["--fleet", "serial", "--connect", endpoint]
     bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
     robot = RobotSetup("r0", rangers=RANGERS, ranger_reach=2.5)
     with Simulation(make_world("office", SEED), [robot], seed=SEED) as simulation:
-        koala = kind(tmp_path, simulation, "r0")
+        koala = KoalaInSimulation(tmp_path, simulation, "r0")
         try:
             with Children(tmp_path / "logs") as children:
 
