@@ -25,7 +25,7 @@ from mapweave.wire.packing import MAX_STAMP_NS
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 AXLE_PER_HEIGHT = 0.9
-"""A recording does not say how wide its robot is; taller ones are wider."""
+"""A recording does not give its robot's width; taller robots are wider."""
 
 
 def read_camera(path: Path) -> tuple[Camera, tuple[float, float, float, float, float]]:
@@ -87,7 +87,7 @@ class Replay:
         Args:
             folder: the recording.
             robot: which robot of its `splits.toml`; None plays all frames.
-            frames: these alone, whatever `splits.toml` says; ascending.
+            frames: only these, without regard to `splits.toml`; ascending.
 
         Raises:
             DeviceError: something is missing or wrong, in one line.
@@ -189,7 +189,7 @@ def _read_odometry(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float6
             except ValueError as error:
                 raise DeviceError(f"{path}: line {reader.line_num}: {error}") from None
     except FileNotFoundError:
-        raise DeviceError(f"{path}: no such file; without odometry nothing tells the map's scale") from None
+        raise DeviceError(f"{path}: no such file; without odometry the map has no scale") from None
     except KeyError as missing:
         raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
     except (OSError, ValueError, TypeError, csv.Error) as error:
@@ -205,7 +205,7 @@ def _read_split(path: Path, robot: str | None, count: int) -> range:
     try:
         robots = {str(r["name"]): r for r in tomllib.loads(read_whole(path).decode("utf-8")).get("robot", [])}
     except FileNotFoundError:
-        raise DeviceError(f"{path}: no such file; without it there is no robot {robot!r}") from None
+        raise DeviceError(f"{path}: no such file; it must describe robot {robot!r}") from None
     except (OSError, ValueError) as error:
         raise DeviceError(f"{path}: {error}") from None
     except (KeyError, TypeError):

@@ -127,14 +127,15 @@ class WheeledRobot:
         before, self._odometry_at = self._odometry_at, way
         self._stamp_ns = stamp_ns
         left, right = way.left - before.left, way.right - before.right
-        # A body whose settings say that it has no sensors does not use those that there are.
-        fresh = now_ns() - read_ns < STALE * 1e9 and bool(description.ranger_bearings)
+        fresh = now_ns() - read_ns < STALE * 1e9
+        # Settings without ranger bearings leave the sensors of the base unused.
+        used = fresh and bool(description.ranger_bearings)
         return Observation(
             stamp_ns,
             Odometry((left + right) / 2, (right - left) / description.axle),
             None if frame is None else frame.image,
-            reading.proximity if fresh else np.zeros(0),
-            reading.bumped,
+            reading.proximity if used else np.zeros(0),
+            reading.bumped and fresh,
         )
 
     def act(self, command: Command) -> Command:

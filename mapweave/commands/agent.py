@@ -15,7 +15,7 @@ from mapweave.commands.network import (
     network_of,
     settings_of,
     stop_on_signals,
-    tell_if_alone,
+    warn_without_router,
 )
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     bus, keys = connect(network)
     body, claim, robot = bus, None, None
     try:
-        tell_if_alone(bus, name)
+        warn_without_router(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
         if body.wait_connected(SOON):

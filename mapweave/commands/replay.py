@@ -22,7 +22,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--name", help="in the fleet (default: the robot's, else the folder's)")
     parser.add_argument("--data", type=Path, default=Path("out/replay"), help="folder for the map")
     parser.add_argument("--epoch", type=int, help="least number of the new map (default: the next one)")
-    parser.add_argument("--offline", action="store_true", help="do not look for a server")
+    parser.add_argument("--offline", action="store_true", help="do not connect to a server")
     parser.add_argument(
         "--patience", type=float, default=20.0, metavar="S", help="longest wait for the server"
     )

@@ -40,8 +40,8 @@ class RelocalizationEvaluation:
     def report(self) -> dict[str, Any]:
         """For `json.dumps`: figures of the first way at the top, those of the others under their names."""
         names = list(self.verdicts)
-        others = {name: figures(self.verdicts[name]) for name in names[1:]}
-        return {**self.about, "verified": names[0], **figures(self.verdicts[names[0]]), **others}
+        by_selection = {name: figures(self.verdicts[name]) for name in names[1:]}
+        return {**self.about, "verified": names[0], **figures(self.verdicts[names[0]]), **by_selection}
 
     def write(self, folder: Path) -> list[Path]:
         """One table of verdicts for each way."""
