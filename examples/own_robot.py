@@ -17,7 +17,7 @@ METRES_PER_STEP = 0.0002
 
 
 class Board:
-    """The wheels; WheeledRobot adds the camera, the time stamps and a thread of its own for this class."""
+    """The wheels; WheeledRobot adds the camera, the stamps and a thread for this class."""
 
     geometry = Geometry(radius=0.12, axle=0.15, max_forward=0.3, max_turn=0.8)
 

@@ -37,7 +37,7 @@ class Settings:
 
     Attributes:
         network: how to reach the fleet.
-        robot: driver, camera and body of an agent's robot.
+        robot: driver, camera and geometry of an agent's robot.
         pipeline: of an agent.
         desk: how a map server shares out the questions that take long.
         merge: how maps are merged, as it stands in the file; see `merge_settings`.

@@ -208,7 +208,7 @@ class Keys:
         return f"{self.root}/robot/{check_name(robot)}/driver/{check_epoch(number)}"
 
     def robot_drivers_of(self, robot: str) -> str:
-        """Pattern: everybody who drives one body."""
+        """Pattern: all agents that drive one base."""
         return f"{self.root}/robot/{check_name(robot)}/driver/*"
 
     def robot_drivers(self) -> str:

@@ -1,4 +1,4 @@
-"""Any two-wheeled robot whose microcontroller speaks ten lines of text; docs/arduino.md has the sketch."""
+"""Any two-wheeled robot with a microcontroller and the text protocol of docs/arduino.md."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mapweave.storage.settings_file import build
 
 STATE = re.compile(r"S( -?[0-9]{1,10}){2} [01]( -?[0-9]{1,6}){0,256}")
 BOOT = 3.0
-"""s; many boards restart when the port is opened."""
+"""s that a board may take to start; many boards restart when the port is opened."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ArduinoOptions:
         port: serial device.
         wheel_radius: m.
         counts_per_turn: of a wheel's encoder.
-        baud: as the sketch sets it.
+        baud: as set in the sketch.
     """
 
     port: str
@@ -40,16 +40,16 @@ class ArduinoOptions:
 
 
 class ArduinoBase:
-    """The base. The sketch stops the wheels when commands cease."""
+    """The base. The sketch has a watchdog."""
 
     geometry = Geometry(max_forward=0.3, max_turn=0.8)
 
     def __init__(self, options: ArduinoOptions, geometry: Geometry) -> None:
-        """Nothing is opened yet.
+        """Create a base without opening the port.
 
         Args:
             options: port and wheels.
-            geometry: of the settings; the microcontroller knows nothing of it.
+            geometry: proximity sensors of the settings.
         """
         self._options = options
         self._rangers = len(geometry.ranger_bearings_deg or ())
@@ -59,7 +59,7 @@ class ArduinoBase:
         self._counters = [WheelCounter(scale, 32, 3.0) for _ in range(2)]
 
     def open(self) -> None:
-        """Open the port and wait until the board has started."""
+        """Open the port and wait for the board to start."""
         self._port = SerialPort(self._options.port, self._options.baud)
         end = time.monotonic() + BOOT
         while True:
@@ -72,7 +72,7 @@ class ArduinoBase:
         self.drive(Wheels())
 
     def close(self) -> None:
-        """Stop and let go."""
+        """Stop the wheels and close the port."""
         if self._port is not None:
             with contextlib.suppress(DeviceError):
                 self.drive(Wheels())
@@ -80,16 +80,16 @@ class ArduinoBase:
             self._port = None
 
     def nearest(self, speeds: Wheels) -> Wheels:
-        """In whole mm/s."""
+        """Round to whole mm/s."""
         return Wheels(round(speeds.left * 1e3) / 1e3, round(speeds.right * 1e3) / 1e3)
 
     def drive(self, speeds: Wheels) -> None:
-        """Send a speed."""
+        """Send speeds."""
         assert self._port is not None
         self._port.write(f"D {round(speeds.left * 1e3)} {round(speeds.right * 1e3)}\n".encode())
 
     def read(self) -> BaseReading:
-        """The newest line of the stream; lines that a reset has cut off are passed over."""
+        """Wait for a line of the stream; returns the newest. Incomplete lines are skipped."""
         assert self._port is not None
         end = time.monotonic() + TIMEOUT
         newest: list[int] | None = None
@@ -112,7 +112,7 @@ class ArduinoBase:
 
 
 def parse_state(line: str) -> list[int] | None:
-    """Left and right count, bumper, centimetres; None if the line is no such."""
+    """Parse left and right count, bumper and centimetres; None for any other line."""
     return [int(part) for part in line.split()[1:]] if STATE.fullmatch(line) else None
 
 
@@ -120,10 +120,10 @@ class Arduino(WheeledRobot):
     """Any Arduino with ten lines of text protocol (docs/arduino.md)."""
 
     def __init__(self, settings: RobotSettings) -> None:
-        """Connect to the port of the options.
+        """Connect to the port in the options.
 
         Raises:
-            SettingsError: the wheels are no wheels.
+            SettingsError: a dimension of the wheels is not positive.
         """
         options = build(ArduinoOptions, settings.options, "[robot.options]")
         if not (options.wheel_radius > 0.0 and options.counts_per_turn > 0.0):

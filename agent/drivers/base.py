@@ -1,4 +1,4 @@
-"""What a driver of two wheels writes: how its protocol says "drive" and "where are the wheels"."""
+"""Protocol of a robot base: two wheels and proximity sensors behind a serial or network line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mapweave.agent.drivers.settings import Geometry
 
 
 class Wheels(NamedTuple):
-    """Left and right wheel: speeds in m/s, or ways in m."""
+    """Left and right wheel: speeds in m/s, or distances in m."""
 
     left: float = 0.0
     right: float = 0.0
@@ -20,10 +20,10 @@ class Wheels(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BaseReading:
-    """What a base says of itself at one moment.
+    """State of a base at one moment.
 
     Attributes:
-        way: of each wheel since the driver was made, m.
+        way: distance of each wheel since the driver was made, m.
         proximity: (K,) m from the robot's edge; the reach where nothing is near.
         bumped: whether the bumper is pressed.
     """
@@ -34,47 +34,47 @@ class BaseReading:
 
 
 class Base(Protocol):
-    """Wheels and proximity sensors behind a line. One thread calls it; any call may take its time.
+    """Wheels and proximity sensors. One thread calls all methods but `nearest`; they may block.
 
-    Each method but `nearest` raises DeviceError when the line fails; it is then closed and opened again.
+    `open`, `drive` and `read` raise DeviceError when the line fails; then the base is closed and reopened.
     """
 
     @property
     def geometry(self) -> Geometry:
-        """The body as far as the driver knows it; asked after the first `open`."""
+        """Dimensions and limits known to the driver; valid after the first `open`."""
         ...
 
     def open(self) -> None:
-        """Connect; the wheels stand. Called again after each failure."""
+        """Connect, with the wheels stopped. Called again after each failure."""
         ...
 
     def close(self) -> None:
-        """Stop the wheels if they can be reached, and let go. Never raises."""
+        """Stop the wheels if possible, and release the line. Never raises."""
         ...
 
     def nearest(self, speeds: Wheels) -> Wheels:
-        """The speeds that the base would really drive if these were asked for. Called from any thread."""
+        """The speeds that the hardware would drive for these speeds. Called from any thread."""
         ...
 
     def drive(self, speeds: Wheels) -> None:
-        """Drive at these speeds. A base that does not stop by itself tells its `WheelGuard` of each one."""
+        """Drive at these speeds. A base without a hardware watchdog informs its `WheelGuard`."""
         ...
 
     def read(self) -> BaseReading:
-        """Ask for the wheels and the sensors."""
+        """Read encoders and sensors."""
         ...
 
 
 class WheelCounter:
-    """The way of a wheel from an encoder's count that wraps around, and begins at zero after a restart."""
+    """Distance of a wheel from an encoder count that wraps around and restarts at zero."""
 
     def __init__(self, metres_per_count: float, bits: int, fastest: float) -> None:
-        """No count was read yet.
+        """Create a counter without a reading.
 
         Args:
-            metres_per_count: way of the wheel for a count.
+            metres_per_count: distance of the wheel for one count.
             bits: width of the counter.
-            fastest: no wheel turns faster, m/s; a greater leap is a counter that was set back.
+            fastest: largest speed of the wheel, m/s; a greater jump means that the counter was reset.
         """
         self._scale = metres_per_count
         self._range = 1 << bits
@@ -83,20 +83,20 @@ class WheelCounter:
         self.way = 0.0
 
     def update(self, count: int, now: float) -> float:
-        """Take a count.
+        """Add a reading.
 
         Args:
-            count: as it was read.
-            now: of a clock that only grows, s.
+            count: the reading.
+            now: monotonic time, s.
 
         Returns:
-            The way since the first count, m.
+            Distance since the first reading, m.
         """
         if self._last is not None:
             before, then = self._last
             counts = (count - before + self._range // 2) % self._range - self._range // 2
             way = counts * self._scale
-            # A tenth of a metre more, for a base that coasts and for clocks that are read between.
+            # 0.1 m of tolerance, for a base that coasts and for the delay between reading and clock.
             if abs(way) <= self._fastest * (now - then) + 0.1:
                 self.way += way
         self._last = (count, now)

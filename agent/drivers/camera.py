@@ -1,4 +1,4 @@
-"""Images from a video device, a file or a stream, by OpenCV: always the newest, stamped when it was taken.
+"""Images from a video device, a file or a stream with OpenCV: the newest frame, stamped at capture.
 
 On a Raspberry Pi with libcamera (Bookworm and later) the camera is no video device for OpenCV. Either run
 `rpicam-vid -t 0 --codec mjpeg --inline --listen -o tcp://0.0.0.0:8888` and give `source =
@@ -27,15 +27,15 @@ from mapweave.hybridmap.errors import DeviceError
 log = logging.getLogger(__name__)
 
 RETRY = 1.0
-"""s until a camera that has failed is opened again."""
+"""s between two attempts to open a camera."""
 SETTLING = 1.0
-"""s after which exposure and white balance are locked."""
+"""s of automatic exposure before it is locked."""
 FARTHEST_STAMP_NS = 1_000_000_000
-"""A device's time stamp that is off by more is not of the monotonic clock."""
+"""Largest age of a frame; a greater difference means that the device uses another clock."""
 
 
 class Frame(NamedTuple):
-    """An image and when it was taken.
+    """An image with its stamp.
 
     Attributes:
         stamp_ns: of the exposure.
@@ -50,22 +50,22 @@ class FrameSource(Protocol):
     """A camera."""
 
     def newer(self, stamp_ns: int, patience: float) -> Frame | None:
-        """The newest frame if it is newer than a stamp; waits so long for one, s. Never raises."""
+        """Wait up to `patience` (s) for a frame newer than a stamp; returns the newest. Never raises."""
         ...
 
     def close(self) -> None:
-        """Let go. Never raises."""
+        """Release the camera. Never raises."""
         ...
 
 
 class Capture:
-    """OpenCV's capture. A thread takes every frame, so that none waits in a buffer, and keeps the newest."""
+    """OpenCV capture. A thread grabs every frame, so that buffers stay empty, and keeps the newest."""
 
     def __init__(self, settings: CameraSettings) -> None:
-        """Open the source.
+        """Open the source and start to capture.
 
         Raises:
-            DeviceError: it is not there, or gives no image.
+            DeviceError: the source cannot be opened.
         """
         self._settings = settings
         self._changed = threading.Condition()
@@ -76,7 +76,7 @@ class Capture:
         self._thread.start()
 
     def newer(self, stamp_ns: int, patience: float) -> Frame | None:
-        """The newest frame if it is newer than a stamp; see FrameSource."""
+        """Wait for a frame newer than a stamp; see FrameSource."""
 
         def there() -> bool:
             return self._closing or (self._newest is not None and self._newest.stamp_ns > stamp_ns)
@@ -86,7 +86,7 @@ class Capture:
             return self._newest if self._newest is not None and self._newest.stamp_ns > stamp_ns else None
 
     def close(self) -> None:
-        """Let go of the source. Twice is no error."""
+        """Release the source. May be called twice."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -105,12 +105,12 @@ class Capture:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         else:
-            # One thread: with more, FFmpeg decodes as many frames at once, and all come so many frames late.
+            # FFmpeg with n threads decodes n frames at once, which delays each by n frames.
             capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         if not capture.isOpened():
             capture.release()
             raise DeviceError(
-                f"camera {source}: cannot be opened; is it plugged in, and used by nobody else?"
+                f"camera {source}: cannot be opened; is it connected, and not in use by another program?"
             )
         return capture
 
@@ -122,7 +122,7 @@ class Capture:
             self._capture.release()
             if self._is_file or self._closing:
                 return
-            log.warning("camera %s gives no more images; opening it again", self._settings.source)
+            log.warning("camera %s delivers no images; opening it again", self._settings.source)
             while not self._closing:
                 time.sleep(RETRY)
                 try:
@@ -132,12 +132,12 @@ class Capture:
                     continue
 
     def _take_all(self) -> None:
-        """Take frames until none comes."""
+        """Capture until the source ends."""
         capture, settings = self._capture, self._settings
         begin, locked = time.monotonic(), not (settings.lock_exposure and self._is_device)
         while not self._closing and capture.grab():
             if self._is_file:
-                # A file plays at its own pace.
+                # A file plays at its frame rate.
                 ahead = begin + capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 - time.monotonic()
                 time.sleep(max(ahead, 0.0))
             stamp_ns = self._stamp_ns() - round(settings.delay * 1e9)
@@ -153,19 +153,19 @@ class Capture:
                 self._lock_exposure()
 
     def _stamp_ns(self) -> int:
-        """When the frame was taken that was grabbed just now."""
+        """Stamp of the frame that was just grabbed."""
         if self._is_device:
-            # Video4Linux stamps frames by the monotonic clock; not every driver of a device does.
+            # Video4Linux stamps frames with the monotonic clock; some device drivers do not.
             taken = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             if 0 <= time.monotonic_ns() - taken < FARTHEST_STAMP_NS:
                 return of_monotonic_ns(taken)
         return now_ns()
 
     def _lock_exposure(self) -> None:
-        """Keep exposure, gain and white balance as they are now."""
+        """Fix exposure and white balance at their present values."""
         capture = self._capture
         exposure = capture.get(cv2.CAP_PROP_EXPOSURE)
-        # 1 is "manual" of Video4Linux.
+        # 1 is manual exposure in Video4Linux.
         done = capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1) and capture.set(cv2.CAP_PROP_EXPOSURE, exposure)
         capture.set(cv2.CAP_PROP_AUTO_WB, 0)
         if not done:

@@ -1,4 +1,4 @@
-"""Finds the mistakes that authors of drivers make, at the first observation and in one line each."""
+"""Checks the output of a driver; each mistake is an error of one line at the first observation."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.errors import DeviceError
 
 SMALLEST_SHARE = 0.01
-"""Stamps that rise by less than this share of a tick are no nanoseconds."""
+"""Stamps that rise by less than this share of a tick are not in nanoseconds."""
 DAY = 86400.0
 UNITS = {"seconds": 1.0, "milliseconds": 1e3, "microseconds": 1e6}
 
 
 class CheckedRobot:
-    """Any robot; each observation is held against what the robot says of itself."""
+    """Wraps a robot and compares each observation with its description."""
 
     def __init__(self, robot: Robot, clock: Callable[[], float] = time.time) -> None:
-        """Check nothing yet.
+        """Wrap a robot.
 
         Args:
-            robot: to be checked.
+            robot: the robot.
             clock: seconds since 1970.
         """
         self._robot = robot
@@ -34,10 +34,10 @@ class CheckedRobot:
         self._stamp_ns: int | None = None
 
     def describe(self) -> RobotDescription:
-        """What the robot says of itself.
+        """Description of the robot.
 
         Raises:
-            DeviceError: it says nothing, or its bearings are not radians.
+            DeviceError: it is no description, or its bearings are not in radians.
         """
         if self._description is None:
             description = self._robot.describe()
@@ -55,7 +55,7 @@ class CheckedRobot:
         """The next observation.
 
         Raises:
-            DeviceError: something about it is wrong.
+            DeviceError: the observation is wrong.
         """
         description = self.describe()
         seen = self._robot.sense()
@@ -72,7 +72,7 @@ class CheckedRobot:
         """Send a command.
 
         Raises:
-            DeviceError: no command comes back.
+            DeviceError: the driver returns no command.
         """
         applied = self._robot.act(command)
         if not isinstance(applied, Command):
@@ -82,7 +82,7 @@ class CheckedRobot:
         return applied
 
     def close(self) -> None:
-        """Stop the wheels and let go."""
+        """Stop the wheels and release the robot."""
         self._robot.close()
 
     def _check_stamp(self, stamp_ns: int, tick: float) -> None:
@@ -128,7 +128,7 @@ def _check_numbers(seen: Observation, description: RobotDescription) -> None:
     forward, turn = seen.odometry.forward, seen.odometry.turn
     if not (math.isfinite(forward) and math.isfinite(turn)):
         raise _mistake("odometry", f"is not finite: {forward:g} m, {turn:g} rad")
-    # No readings are a sensor that fails, which the agent sees; a reading of none is NaN.
+    # An empty array means that the sensors have failed, which the agent handles.
     readings, bearings = np.ndim(seen.proximity), len(description.ranger_bearings)
     if readings != 1:
         raise _mistake("proximity", "must be an array of one distance for each bearing, m")

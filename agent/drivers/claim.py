@@ -1,4 +1,4 @@
-"""One agent a robot: another of the same name is refused before it moves anything."""
+"""One agent per robot: a second agent of the same name is refused before it moves the robot."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 
 LEAVING = 4.0
-"""s; an agent that was killed or lost its power is gone from the network by then (the bus waits 2.5 s)."""
+"""s; a dead agent has left the network by then (the lease of the bus is 2.5 s)."""
 SETTLING = 0.5
-"""s; news of an agent that starts at the same time takes no longer."""
+"""s; liveliness of an agent that starts at the same time arrives within this time."""
 
 
 class Claim:
-    """The right to drive a robot, held until closed or dead.
+    """Exclusive right to drive a robot, held until closed or until the process dies.
 
     Attributes:
-        number: drawn at random; under it the agent is seen.
+        number: random; part of the agent's liveliness key.
     """
 
     def __init__(self, bus: Bus, keys: Keys, robot: str, leaving: float = LEAVING) -> None:
-        """Take it.
+        """Claim the robot.
 
-        An agent looks first and then announces itself. Two that do so at the same time see each other when
-        they look again; the one with the greater number gives way. Without a router nobody is seen: a port
-        can be opened by one process alone, and a body on the network cannot be reached either.
+        The agent checks for other claims and then announces its own. Two agents that start at the same time
+        see each other in a second check; the one with the greater number gives up. Without a router no other
+        agent is seen; the serial port is locked, and a remote base is out of reach.
 
         Args:
-            bus: of the body; connected, if it can be.
-            keys: of the fleet.
-            robot: its name.
-            leaving: how long to wait for an agent that is seen and may be dead, s.
+            bus: bus of the robot base, connected if a router is there.
+            keys: keys of the fleet.
+            robot: name of the robot.
+            leaving: how long to wait for the end of another claim, whose agent may be dead, s.
 
         Raises:
             DeviceError: another agent drives the robot.
@@ -58,7 +58,7 @@ class Claim:
             raise self._refusal()
 
     def close(self) -> None:
-        """Give it back. Twice is no error."""
+        """Release the claim. May be called twice."""
         self._alive.close()
         self._watch.close()
 
@@ -71,7 +71,7 @@ class Claim:
             self._changed.notify_all()
 
     def _wait(self, free: Callable[[], bool], patience: float) -> bool:
-        """Whether the robot is free, once news has had time to come, or within the patience after that."""
+        """Whether the robot is free after the settling time, or within the patience after that."""
         time.sleep(SETTLING)
         with self._changed:
             return self._changed.wait_for(free, patience)

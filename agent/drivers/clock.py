@@ -1,18 +1,18 @@
-"""The time by which drivers stamp: nanoseconds since 1970 as at the start, and never a step back."""
+"""Clock for stamps: nanoseconds since 1970, without steps when the system clock is set."""
 
 from __future__ import annotations
 
 import time
 
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
-"""When the monotonic clock was zero. Looked up once: setting the system's clock later moves no stamp."""
+"""System time at zero of the monotonic clock; read once, so that stamps never step."""
 
 
 def now_ns() -> int:
-    """Now."""
+    """The current time."""
     return _EPOCH_NS + time.monotonic_ns()
 
 
 def of_monotonic_ns(monotonic_ns: int) -> int:
-    """The stamp of a reading of the system's monotonic clock."""
+    """Stamp of a monotonic clock reading."""
     return _EPOCH_NS + monotonic_ns

@@ -18,7 +18,7 @@ START, SAFE, DRIVE_DIRECT, QUERY_LIST = 128, 131, 145, 149
 BUMPS, MODE, LEFT_COUNTS, RIGHT_COUNTS = 7, 35, 43, 44
 """Sensor packets; their sizes are 1, 1, 2 and 2 bytes."""
 PASSIVE = 1
-"""Mode in which wheels take no commands; a cliff, a dropped wheel or the charger leads there from Safe."""
+"""Mode without wheel control; a cliff, a wheel drop or the charger ends the Safe mode."""
 METRES_PER_COUNT = math.pi * 72e-3 / 508.8
 FASTEST_MM = 500
 QUERY = bytes([QUERY_LIST, 4, BUMPS, MODE, LEFT_COUNTS, RIGHT_COUNTS])
@@ -37,12 +37,12 @@ class CreateOptions:
 
 
 class CreateBase:
-    """The base. It has no watchdog: a guard stops its wheels."""
+    """The base. It has no watchdog, so a `WheelGuard` stops its wheels."""
 
     geometry = Geometry(radius=0.175, axle=0.235, max_forward=0.3, max_turn=0.8)
 
     def __init__(self, port: str) -> None:
-        """Nothing is opened yet."""
+        """Create a base without opening the port."""
         self._path = port
         self._port: SerialPort | None = None
         self._guard: WheelGuard | None = None
@@ -50,17 +50,17 @@ class CreateBase:
         self._counters = [WheelCounter(METRES_PER_COUNT, 16, FASTEST_MM / 1e3) for _ in range(2)]
 
     def open(self) -> None:
-        """Take control in Safe mode: the robot itself stops at cliffs and when it is lifted."""
+        """Enter Safe mode, in which the robot stops at cliffs and when it is lifted."""
         self._port = SerialPort(self._path, 115200)
-        # Start ends any mode; what was cut off of a command before takes up to four bytes: opcode 0 is none.
+        # An incomplete command of before takes up to four bytes; opcode 0 is ignored.
         self._port.write(bytes(4) + bytes([START, SAFE]))
-        # Half a command takes at most four bytes of the first stop, the second is whole.
+        # An incomplete command takes up to four bytes of the first stop; the second is complete.
         self._guard = WheelGuard(self._port.descriptor, STOP * 2)
         self.drive(Wheels())
         self.read()
 
     def close(self) -> None:
-        """Let the guard stop the wheels, and let go."""
+        """Stop the wheels by the guard, and close the port."""
         if self._guard is not None:
             self._guard.close()
             self._guard = None
@@ -69,12 +69,12 @@ class CreateBase:
             self._port = None
 
     def nearest(self, speeds: Wheels) -> Wheels:
-        """In whole mm/s."""
+        """Round to whole mm/s."""
         left, right = _millimetres(speeds)
         return Wheels(left / 1e3, right / 1e3)
 
     def drive(self, speeds: Wheels) -> None:
-        """Send a speed; the right wheel comes first."""
+        """Send speeds; the right wheel comes first."""
         assert self._port is not None
         assert self._guard is not None
         left, right = _millimetres(speeds)
@@ -84,7 +84,7 @@ class CreateBase:
         self._guard.moving(bool(left or right))
 
     def read(self) -> BaseReading:
-        """Ask for encoders, bumper and mode."""
+        """Read encoders, bumper and mode."""
         assert self._port is not None
         self._port.clear()
         self._port.write(QUERY)
@@ -104,6 +104,6 @@ class Create(WheeledRobot):
     """iRobot Create 2 and Roomba over the serial Open Interface."""
 
     def __init__(self, settings: RobotSettings) -> None:
-        """Connect to the port of the options."""
+        """Connect to the port in the options."""
         options = build(CreateOptions, settings.options, "[robot.options]")
         super().__init__(CreateBase(options.port), settings)

@@ -20,10 +20,10 @@ from mapweave.storage.settings_file import build
 
 NUMBER = re.compile(r"-?[0-9]{1,10}")
 INFRARED_REACH = 0.2
-"""m; farther away infrared sensors see nothing."""
+"""m; range of the infrared sensors."""
 INFRARED_AT_REACH = 20.0
-"""Value of an infrared sensor at its reach, little above its noise; 1023 is the most. Light that comes back
-from a surface falls with the square of the distance."""
+"""Value of an infrared sensor at its reach, slightly above the noise; 1023 is the largest value. The
+reflected light falls with the square of the distance."""
 ULTRASONIC_REACH = 2.5
 """m; manual of the Koala 2.5, section 4.1."""
 ULTRASONIC_OFF = 2000
@@ -32,17 +32,17 @@ ULTRASONIC_OFF = 2000
 
 @dataclass(frozen=True)
 class Generation:
-    """One of the two.
+    """Protocol and dimensions of one generation.
 
     Attributes:
-        baud: of the line.
-        stop_bits: of the line.
-        end: of a command.
-        position: letter that asks for the wheels' counters.
-        proximity: letter that asks for the proximity sensors.
-        metres_per_count: way of a wheel for a pulse of its encoder.
-        fastest_units: greatest speed that a command can say; a unit is a pulse in 10 ms.
-        geometry: the body.
+        baud: bits a second.
+        stop_bits: 1 or 2.
+        end: end of a command.
+        position: command that reads the encoders.
+        proximity: command that reads the proximity sensors.
+        metres_per_count: distance of a wheel for one encoder pulse.
+        fastest_units: largest speed of a command; a unit is one pulse in 10 ms.
+        geometry: dimensions, limits and sensors.
     """
 
     baud: int
@@ -56,18 +56,18 @@ class Generation:
 
     @property
     def unit(self) -> float:
-        """Speed of a wheel for a unit of the command, m/s."""
+        """Speed of a wheel for one unit, m/s."""
         return self.metres_per_count / 0.01
 
     def distances(self, values: list[int]) -> Array:
-        """(K,) m of what the proximity sensors say. Raises DeviceError where that is another number."""
+        """Convert proximity values to (K,) m. Raises DeviceError for a wrong number of values."""
         expected = len(self.geometry.ranger_bearings_deg or ())
         if len(values) != expected:
             raise DeviceError(f"{len(values)} proximity values instead of {expected}")
         given = np.array(values, dtype=np.float64)
         if self is SILVER:
             return INFRARED_REACH * np.sqrt(INFRARED_AT_REACH / np.maximum(given, INFRARED_AT_REACH))
-        # Nearer than 25 cm the sensors say 0: it may be at the very edge. One that is off is not read.
+        # 0 means nearer than 25 cm, possibly touching. A sensor that is off has no reading.
         reach = np.where(given == ULTRASONIC_OFF, np.nan, ULTRASONIC_REACH)
         return np.where(given / 100.0 < ULTRASONIC_REACH, given / 100.0, reach)
 
@@ -107,10 +107,10 @@ class KoalaOptions:
 
 
 class KoalaBase:
-    """The base of a Koala. It has no watchdog: a guard stops its wheels."""
+    """The base of a Koala. It has no watchdog, so a `WheelGuard` stops its wheels."""
 
     def __init__(self, port: str) -> None:
-        """Nothing is opened yet."""
+        """Create a base without opening the port."""
         self._path = port
         self._port: SerialPort | None = None
         self._guard: WheelGuard | None = None
@@ -119,23 +119,23 @@ class KoalaBase:
 
     @property
     def geometry(self) -> Geometry:
-        """Of the generation that has answered."""
+        """Dimensions of the generation that has answered."""
         return self._generation.geometry
 
     def open(self) -> None:
-        """Find out which generation it is, and stand."""
+        """Detect the generation and stop the wheels."""
         for generation in (KOALA_2_5, SILVER):
             port = SerialPort(self._path, generation.baud, generation.stop_bits)
             self._port, self._generation = port, generation
             try:
-                # What the other generation's question may have left is ended first.
+                # Ends what the probe for the other generation may have left in the input of the robot.
                 port.write(generation.end)
                 version = self._ask("B")
             except DeviceError:
                 port.close()
                 self._port = None
                 continue
-            # The 2.5 says a letter and a number, the silver edition two numbers (BIOS and protocol).
+            # The 2.5 answers with a letter and a number, the silver edition with two numbers.
             if version[:1].isalpha() == (generation is KOALA_2_5):
                 break
             port.close()
@@ -148,11 +148,13 @@ class KoalaBase:
             g = self._generation
             fastest = g.fastest_units * g.unit
             self._counters = tuple(WheelCounter(g.metres_per_count, 32, fastest) for _ in range(2))
-        self._guard = WheelGuard(self._port.descriptor, self._drive_command(0, 0) * 2)
+        # The end of line before it ends an incomplete command.
+        stop = self._generation.end + self._drive_command(0, 0)
+        self._guard = WheelGuard(self._port.descriptor, stop)
         self.drive(Wheels())
 
     def close(self) -> None:
-        """Let the guard stop the wheels, and let go."""
+        """Stop the wheels by the guard, and close the port."""
         if self._guard is not None:
             self._guard.close()
             self._guard = None
@@ -161,12 +163,12 @@ class KoalaBase:
             self._port = None
 
     def nearest(self, speeds: Wheels) -> Wheels:
-        """In whole units."""
+        """Round to whole units."""
         units, unit = self._units(speeds), self._generation.unit
         return Wheels(units[0] * unit, units[1] * unit)
 
     def drive(self, speeds: Wheels) -> None:
-        """Send a speed."""
+        """Send speeds."""
         assert self._port is not None
         assert self._guard is not None
         left, right = self._units(speeds)
@@ -174,7 +176,7 @@ class KoalaBase:
         self._guard.moving(bool(left or right))
 
     def read(self) -> BaseReading:
-        """Ask for counters and proximity sensors."""
+        """Read encoders and proximity sensors."""
         left, right = self._numbers(self._ask(self._generation.position), 2)
         now = time.monotonic()
         way = Wheels(self._counters[0].update(left, now), self._counters[1].update(right, now))
@@ -187,26 +189,20 @@ class KoalaBase:
         return left, right
 
     def _drive_command(self, left: int, right: int) -> bytes:
-        # Twice the end before: half a command that was cut off is none.
-        end = self._generation.end
-        return (
-            end + f"D,{left},{right}".encode() + end
-            if not (left or right)
-            else f"D,{left},{right}".encode() + end
-        )
+        return f"D,{left},{right}".encode() + self._generation.end
 
     def _ask(self, command: str) -> str:
         return self._ask_bytes(command.encode() + self._generation.end)
 
     def _ask_bytes(self, command: bytes) -> str:
-        """What follows the letter in the answer to a command."""
+        """Send a command; returns its answer without the letter."""
         assert self._port is not None
         letter = chr(command.strip()[0]).lower()
         self._port.clear()
         self._port.write(command)
         for _ in range(4):
             line = self._port.line()
-            # Other lines answer what the guard has sent, or end half a command.
+            # Other lines are answers to the guard or to an incomplete command.
             if line[:1] == letter:
                 return line[1:].lstrip(",")
         raise DeviceError(f"{self._path}: {command.decode().strip()!r} was answered by {line!r}")
@@ -219,7 +215,7 @@ class KoalaBase:
 
 
 def parse_numbers(text: str) -> list[int] | None:
-    """Whole numbers of 32 bit between commas; None if it is anything else."""
+    """Parse integers separated by commas; None for any other text."""
     parts = text.split(",")
     if not all(NUMBER.fullmatch(part) for part in parts):
         return None
@@ -230,6 +226,6 @@ class Koala(WheeledRobot):
     """K-Team Koala over RS-232, silver edition and 2.5."""
 
     def __init__(self, settings: RobotSettings) -> None:
-        """Connect to the port of the options."""
+        """Connect to the port in the options."""
         options = build(KoalaOptions, settings.options, "[robot.options]")
         super().__init__(KoalaBase(options.port), settings)

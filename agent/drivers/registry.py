@@ -1,7 +1,7 @@
-"""Which drivers there are: those of this package, those of other packages, and classes in files.
+"""Lookup of drivers: built-in ones, those of other packages, and classes in files.
 
-A driver is a class that is made from `RobotSettings` and has the methods of `Robot`. Another package adds one
-by an entry point:
+A driver is a class that takes `RobotSettings` and has the methods of `Robot`. Other packages add drivers by
+entry points:
 
     [project.entry-points."mapweave.robots"]
     rover = "my_package.rover:Rover"
@@ -23,7 +23,7 @@ from mapweave.agent.drivers.settings import REMOTE, RobotSettings
 from mapweave.hybridmap.errors import DeviceError, MapweaveError, SettingsError
 
 GROUP = "mapweave.robots"
-"""The entry points of other packages' drivers."""
+"""Group of the entry points of other packages."""
 
 SHIPPED: Mapping[str, str] = {
     "arduino": "mapweave.agent.drivers.arduino:Arduino",
@@ -32,7 +32,7 @@ SHIPPED: Mapping[str, str] = {
     REMOTE: "mapweave.agent.drivers.remote:RemoteRobot",
     "waveshare": "mapweave.agent.drivers.waveshare:Waveshare",
 }
-"""Drivers of this package. Not entry points, so that a source tree has them without being installed."""
+"""Drivers of this package; available without installed metadata."""
 
 Driver = Callable[[RobotSettings], Robot]
 
@@ -41,13 +41,13 @@ METHODS = ("describe", "sense", "act", "close")
 
 @dataclass(frozen=True)
 class Listed:
-    """A driver in a list.
+    """A driver as listed by `mapweave robots`.
 
     Attributes:
-        name: by which settings pick it.
-        line: what it is, in one line; empty if it cannot be loaded.
-        missing: the module that it lacks; empty if none.
-        error: why else it cannot be loaded.
+        name: name in the settings.
+        line: one-line description; empty if the driver cannot be loaded.
+        missing: missing module; empty if none.
+        error: other reason why the driver cannot be loaded.
     """
 
     name: str
@@ -57,13 +57,13 @@ class Listed:
 
 
 def drivers() -> Mapping[str, str]:
-    """`module:Class` of every driver by its name. A shipped one goes before another package's."""
+    """`module:Class` of every driver by name. Built-in drivers cannot be replaced by other packages."""
     found = {point.name: point.value for point in entry_points(group=GROUP)}
     return dict(sorted({**found, **SHIPPED}.items()))
 
 
 def listing() -> list[Listed]:
-    """Every driver, loaded or not, by name."""
+    """All drivers by name, including those that cannot be loaded."""
     listed = []
     for name, target in drivers().items():
         try:
@@ -71,18 +71,18 @@ def listing() -> list[Listed]:
             listed.append(Listed(name, words.split("\n")[0].rstrip(".")))
         except ModuleNotFoundError as error:
             listed.append(Listed(name, missing=error.name or ""))
-        except Exception as error:  # noqa: BLE001 - another package's code; the list goes on without it
+        except Exception as error:  # noqa: BLE001 - code of another package
             listed.append(Listed(name, error=f"{type(error).__name__}: {error}"))
     return listed
 
 
 def find_driver(name: str) -> Driver:
-    """The driver of a name, or of `FILE.py:CLASS`.
+    """Find a driver by name, or by `FILE.py:CLASS`.
 
     Raises:
-        SettingsError: there is none.
-        DeviceError: the file or the class cannot be used; one line says why.
-        ModuleNotFoundError: the driver needs a library that is not installed.
+        SettingsError: no driver has this name.
+        DeviceError: the file or the class is not usable.
+        ModuleNotFoundError: a library of the driver is not installed.
     """
     path, colon, class_name = name.rpartition(":")
     if colon and path.endswith(".py"):
@@ -123,7 +123,7 @@ def _of_file(path: Path, name: str) -> object:
 
 
 def _last_line(error: Exception, path: Path) -> int:
-    """Where in the file the error arose; 0 if nowhere."""
+    """Line of the file where the error was raised; 0 if none."""
     line, trace = 0, error.__traceback__
     while trace is not None:
         if trace.tb_frame.f_code.co_filename == str(path):

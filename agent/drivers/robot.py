@@ -1,6 +1,6 @@
-"""The Robot protocol: a few methods that a driver, a recording, the simulator and a test all have.
+"""The Robot protocol, which drivers, recordings, the simulator and tests implement.
 
-SI units and radians throughout; `docs/drivers.md` says how to write one.
+SI units and radians throughout. `docs/drivers.md` explains how to write a driver.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ class Robot(Protocol):
         ...
 
     def sense(self) -> Observation | None:
-        """Wait for the next observation, at most two ticks. None when there will be no more.
+        """Wait for the next observation, at most two ticks. None at the end of the observations.
 
-        A line to the robot that fails later does not end it: the robot stands, its odometry and proximity
-        readings stop, and the driver connects again.
+        A driver whose line fails later reconnects. Meanwhile the robot stands, and its observations have zero
+        odometry and no proximity readings.
 
         Raises:
             DeviceError: the robot cannot be read.
@@ -29,9 +29,9 @@ class Robot(Protocol):
         ...
 
     def act(self, command: Command) -> Command:
-        """Send a command; returns the command that is really applied. Takes no time.
+        """Send a command; returns the applied command. Does not block.
 
-        The wheels stop within 0.5 s when no further command comes, also when this process dies.
+        The wheels stop within 0.5 s when no further command follows, also when this process dies.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""A serial port as drivers use it: questions with a time limit, and one line when something is wrong."""
+"""Serial port for drivers: reads with a time limit, errors as one line of text."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import serial
 from mapweave.hybridmap.errors import DeviceError
 
 TIMEOUT = 0.3
-"""s; no robot here takes longer to answer."""
+"""s; the supported robots answer faster."""
 LONGEST_LINE = 4096
-"""Bytes; more without an end of line is no answer."""
+"""Bytes; longer input without an end of line is discarded as noise."""
 
 
 class SerialPort:
-    """An open port. Nobody else may open it as long as it is open."""
+    """An open port, locked against other processes."""
 
     def __init__(self, path: str, baud: int, stop_bits: int = 1) -> None:
-        """Open it.
+        """Open the port.
 
         Args:
             path: of the device, or a URL of pyserial (`socket://host:port`).
@@ -29,7 +29,7 @@ class SerialPort:
             stop_bits: 1 or 2.
 
         Raises:
-            DeviceError: it is not there, or in use.
+            DeviceError: the port is missing or in use.
         """
         self.path = path
         self._rest = b""
@@ -46,7 +46,7 @@ class SerialPort:
         return int(self._serial.fileno())
 
     def close(self) -> None:
-        """Close it. Never raises."""
+        """Close the port. Never raises."""
         with contextlib.suppress(serial.SerialException, OSError):
             self._serial.close()
 
@@ -54,22 +54,22 @@ class SerialPort:
         """Send bytes.
 
         Raises:
-            DeviceError: the port is gone, or takes no bytes.
+            DeviceError: the port is gone or blocked.
         """
         with self._failing():
             self._serial.write(data)
 
     def clear(self) -> None:
-        """Forget what has come and was not read."""
+        """Discard unread input."""
         with self._failing():
             self._serial.reset_input_buffer()
         self._rest = b""
 
     def read(self, count: int) -> bytes:
-        """So many bytes.
+        """Read a number of bytes.
 
         Raises:
-            DeviceError: they do not come in time.
+            DeviceError: they do not arrive in time.
         """
         with self._failing():
             data = bytes(self._serial.read(count))
@@ -78,10 +78,10 @@ class SerialPort:
         return data
 
     def line(self) -> str:
-        """The next line that is not empty, without its end; carriage return and line feed both end one.
+        """Read the next non-empty line, without its end. CR and LF both end a line.
 
         Raises:
-            DeviceError: none comes in time.
+            DeviceError: none arrives in time.
         """
         end = time.monotonic() + TIMEOUT
         while True:
@@ -99,10 +99,10 @@ class SerialPort:
         return b"\n" in self._rest
 
     def _take(self, least: int) -> None:
-        """Take what has come, and wait for so many bytes."""
+        """Read all input that has arrived, at least this number of bytes."""
         with self._failing():
             came = self._serial.read(max(least, self._serial.in_waiting))
-        # Empty lines are none.
+        # Empty lines are skipped.
         self._rest = (self._rest + came).replace(b"\r", b"\n").lstrip(b" \n")
 
     @contextlib.contextmanager
@@ -118,7 +118,7 @@ def _reason(error: Exception) -> str:
     number = getattr(error, "errno", None)
     words = str(error)
     if number == 2 or "No such file" in words:
-        return "there is no such port; is the robot plugged in and switched on?"
+        return "there is no such port; is the robot connected and switched on?"
     if number == 13 or "Permission denied" in words:
         return "may not be opened: add your user to the group that owns it (often dialout) and log in again"
     if number == 11 or "exclusively lock" in words:

@@ -1,4 +1,4 @@
-"""The `[robot]` table of a settings file: which driver, its options, the camera, and the body's geometry."""
+"""The `[robot]` table of a settings file: which driver, its options, the camera, and the robot's geometry."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import SettingsError
 
 REMOTE = "remote"
-"""The driver of a body behind Zenoh keys, for example a simulated one."""
+"""The driver of a robot base behind Zenoh keys, for example a simulated one."""
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Where images come from, and the camera that takes them. Names as in the `camera.toml` of recordings.
+    """Source of the images and calibration of the camera. Names as in the `camera.toml` of recordings.
 
     Attributes:
         width: px.
@@ -31,7 +31,7 @@ class CameraSettings:
         distortion: (k1, k2, p1, p2, k3) of the lens, OpenCV's order.
         source: number or path of a video device, a video file, or the URL of an RTSP or HTTP stream.
         delay: time from the middle of the exposure until the frame is here, s; subtracted from the stamps.
-        lock_exposure: leave exposure and white balance alone after the first second.
+        lock_exposure: fix exposure and white balance after the first second.
     """
 
     width: int
@@ -57,7 +57,7 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class Geometry:
-    """The body. A driver knows its robot's; what a settings file gives goes over that. None: not given.
+    """Dimensions and limits of a robot. The settings file overrides the driver's values; None is not given.
 
     Attributes:
         radius: of the footprint, m.
@@ -78,7 +78,7 @@ class Geometry:
     ranger_reach: float | None = None
 
     def over(self, defaults: Geometry) -> Geometry:
-        """These values where they are given, the defaults elsewhere."""
+        """These values where given, the defaults elsewhere."""
         given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         return replace(defaults, **given)
 
@@ -90,8 +90,8 @@ class RobotSettings:
     Attributes:
         driver: name of a driver, as `mapweave robots` lists them, or `FILE.py:CLASS`.
         options: the driver's own table.
-        camera: where images come from; a driver that has images of its own needs none.
-        geometry: what differs from what the driver knows of its robot.
+        camera: source and calibration; None for a driver with images of its own.
+        geometry: overrides the driver's values.
     """
 
     driver: str = REMOTE
@@ -100,34 +100,34 @@ class RobotSettings:
     geometry: Geometry = field(default_factory=Geometry)
 
     def describe(self, known: Geometry) -> RobotDescription:
-        """What the agent is told of the robot.
+        """Description of the robot for the agent.
 
         Args:
-            known: what the driver knows of the body.
+            known: values of the driver.
 
         Raises:
-            SettingsError: there is no camera, or a length is missing or no length.
+            SettingsError: there is no camera, or a length is missing or not positive.
         """
         if self.camera is None:
             raise SettingsError(
                 "the settings have no [robot.camera]: give source, width, height, fx, fy, cx, cy and height_m"
             )
-        body = self.geometry.over(known)
+        geometry = self.geometry.over(known)
         for name in ("radius", "axle", "max_forward", "max_turn"):
-            value = getattr(body, name)
+            value = getattr(geometry, name)
             if value is None:
                 raise SettingsError(f"[robot.geometry] {name} is missing: the driver cannot know it")
             if not value > 0.0:
                 raise SettingsError(f"[robot.geometry] {name} = {value:g} must be positive")
-        assert body.radius and body.axle and body.max_forward and body.max_turn
+        assert geometry.radius and geometry.axle and geometry.max_forward and geometry.max_turn
         given = RobotDescription(
             self.camera.intrinsics,
             self.camera.distortion,
-            radius=body.radius,
-            axle=body.axle,
-            max_forward=body.max_forward,
-            max_turn=body.max_turn,
-            ranger_bearings=tuple(math.radians(b) for b in body.ranger_bearings_deg or ()),
-            ranger_reach=body.ranger_reach or 0.0,
+            radius=geometry.radius,
+            axle=geometry.axle,
+            max_forward=geometry.max_forward,
+            max_turn=geometry.max_turn,
+            ranger_bearings=tuple(math.radians(b) for b in geometry.ranger_bearings_deg or ()),
+            ranger_reach=geometry.ranger_reach or 0.0,
         )
-        return given if body.wheel_noise is None else replace(given, wheel_noise=body.wheel_noise)
+        return given if geometry.wheel_noise is None else replace(given, wheel_noise=geometry.wheel_noise)

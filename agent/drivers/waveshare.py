@@ -22,16 +22,16 @@ SPEEDS, FEEDBACK, STREAM, WATCHDOG, INTERVAL, ECHO = 1, 130, 131, 136, 142, 143
 BASE_INFO = 1001
 """`T` of the answer."""
 WATCHDOG_MS = 300
-"""The base stops by itself so long after the last command; 3000 unless it is told."""
+"""The base stops by itself after this time without a command; the default of the firmware is 3000."""
 STREAM_MS = 50
-"""Between two answers of the stream."""
+"""Period of the stream."""
 FASTEST = 0.5
-"""m/s that a command can say."""
+"""Largest speed of a command, m/s."""
 TIMEOUT = 0.5
-"""s for an answer over HTTP, which a network carries."""
+"""s for an answer over HTTP."""
 
 LARGEST_SPEED = 5.0
-"""m/s; more is a line that was damaged."""
+"""m/s; a greater value means a damaged line."""
 LARGEST_ODOMETER = 1e9
 """cm."""
 
@@ -39,11 +39,11 @@ Json = dict[str, Any]
 
 
 class BaseInfo(NamedTuple):
-    """What an answer says.
+    """State of the base.
 
     Attributes:
         speeds: measured, m/s.
-        odometers: ways since the base was switched on, m; None if the firmware has none.
+        odometers: distances since power on, m; None if the firmware has no odometers.
     """
 
     speeds: Wheels
@@ -62,37 +62,37 @@ class WaveshareOptions:
 
 
 class Line(Protocol):
-    """How commands get there and answers come back. Each method raises DeviceError."""
+    """Transport of commands and answers. Each method may raise DeviceError."""
 
     def send(self, command: Json) -> None:
         """Send a command."""
         ...
 
     def feedback(self) -> BaseInfo:
-        """The newest answer that says how the wheels turn."""
+        """Read the newest state of the wheels."""
         ...
 
     def close(self) -> None:
-        """Let go."""
+        """Close the connection."""
         ...
 
 
 class SerialLine:
-    """Lines of JSON; the base streams."""
+    """Lines of JSON over a serial port; the base streams its state."""
 
     def __init__(self, path: str) -> None:
-        """Open the port and begin the stream."""
+        """Open the port and start the stream."""
         self._port = SerialPort(path, 115200)
         self.send({"T": ECHO, "cmd": 0})
         self.send({"T": INTERVAL, "cmd": STREAM_MS})
         self.send({"T": STREAM, "cmd": 1})
 
     def send(self, command: Json) -> None:
-        """A line."""
+        """Send a line."""
         self._port.write(json.dumps(command, separators=(",", ":")).encode() + b"\n")
 
     def feedback(self) -> BaseInfo:
-        """The newest line; waits for one."""
+        """Wait for a line; returns the newest."""
         newest: BaseInfo | None = None
         while newest is None or self._port.line_waiting():
             newest = parse_info(self._port.line()) or newest
@@ -104,23 +104,23 @@ class SerialLine:
 
 
 class HttpLine:
-    """Questions to the base's HTTP server, over one connection."""
+    """Requests to the HTTP server of the base, over one connection."""
 
     def __init__(self, address: str) -> None:
-        """Nothing is asked yet."""
+        """Create a connection without a request."""
         where = urllib.parse.urlsplit(address)
         self._address = address
         self._connection = http.client.HTTPConnection(where.hostname or "", where.port or 80, timeout=TIMEOUT)
 
     def send(self, command: Json) -> None:
-        """Ask and forget the answer."""
+        """Send a request and ignore its answer."""
         self._ask(command)
 
     def feedback(self) -> BaseInfo:
-        """Ask for it."""
+        """Request the state."""
         info = parse_info(self._ask({"T": FEEDBACK}))
         if info is None:
-            raise DeviceError(f"{self._address}: no answer about the base")
+            raise DeviceError(f"{self._address}: no state of the base in the answer")
         return info
 
     def close(self) -> None:
@@ -140,25 +140,22 @@ class HttpLine:
 
 
 def parse_info(text: str) -> BaseInfo | None:
-    """What an answer says of the wheels; None if it is about something else, or half of it."""
+    """Parse an answer; None if it is incomplete or not about the wheels."""
     try:
         answer = json.loads(text)
     except (ValueError, RecursionError):
         return None
     if not isinstance(answer, dict) or answer.get("T") != BASE_INFO:
         return None
-    speeds = [answer.get(name) for name in ("L", "R")]
-    odometers = [answer.get(name) for name in ("odl", "odr")]
-    if not all(_is_number(speed, LARGEST_SPEED) for speed in speeds):
-        return None
-    info = BaseInfo(Wheels(*map(float, speeds)))
-    if all(_is_number(centimetres, LARGEST_ODOMETER) for centimetres in odometers):
-        info = info._replace(odometers=Wheels(*(float(centimetres) / 100.0 for centimetres in odometers)))
-    return info
+    speeds = _pair(answer, "L", "R", 1.0, LARGEST_SPEED)
+    return None if speeds is None else BaseInfo(speeds, _pair(answer, "odl", "odr", 0.01, LARGEST_ODOMETER))
 
 
-def _is_number(value: Any, largest: float) -> bool:
-    return isinstance(value, int | float) and -largest <= value <= largest
+def _pair(answer: Json, left: str, right: str, scale: float, largest: float) -> Wheels | None:
+    """Two numbers of an answer times a scale; None if they are missing or out of range."""
+    values = [answer.get(left), answer.get(right)]
+    numbers = [scale * v for v in values if isinstance(v, int | float) and -largest <= v <= largest]
+    return Wheels(*numbers) if len(numbers) == 2 else None
 
 
 class WaveshareBase:
@@ -167,21 +164,21 @@ class WaveshareBase:
     geometry = Geometry(radius=0.15, axle=0.172, max_forward=0.3, max_turn=0.8)
 
     def __init__(self, port: str) -> None:
-        """Nothing is opened yet."""
+        """Create a base without connecting."""
         self._path = port
         self._line: Line | None = None
         self._way = Wheels()
         self._last: tuple[float, Wheels, Wheels | None] | None = None
 
     def open(self) -> None:
-        """Connect, shorten the watchdog and stand."""
+        """Connect, shorten the watchdog and stop the wheels."""
         self._line = HttpLine(self._path) if self._path.startswith("http://") else SerialLine(self._path)
         self._line.send({"T": WATCHDOG, "cmd": WATCHDOG_MS})
         self.drive(Wheels())
         self._last = None
 
     def close(self) -> None:
-        """Stop and let go; should the line have failed, the watchdog stops the wheels."""
+        """Stop the wheels and disconnect. If the line has failed, the watchdog stops them."""
         if self._line is not None:
             with contextlib.suppress(DeviceError):
                 self.drive(Wheels())
@@ -189,18 +186,18 @@ class WaveshareBase:
             self._line = None
 
     def nearest(self, speeds: Wheels) -> Wheels:
-        """In whole mm/s."""
+        """Round to whole mm/s."""
         left, right = (min(max(round(speed, 3), -FASTEST), FASTEST) for speed in speeds)
         return Wheels(left, right)
 
     def drive(self, speeds: Wheels) -> None:
-        """Send a speed."""
+        """Send speeds."""
         assert self._line is not None
         left, right = self.nearest(speeds)
         self._line.send({"T": SPEEDS, "L": left, "R": right})
 
     def read(self) -> BaseReading:
-        """Odometers where the firmware has them, else the sum of the measured speeds."""
+        """Read the odometers, or integrate the measured speeds where there are none."""
         assert self._line is not None
         (speeds, odometers), now = self._line.feedback(), time.monotonic()
         if self._last is not None:
@@ -218,6 +215,6 @@ class Waveshare(WheeledRobot):
     """Waveshare UGV Rover, Beast and RaspRover over serial or HTTP."""
 
     def __init__(self, settings: RobotSettings) -> None:
-        """Connect to the port or address of the options."""
+        """Connect to the port or address in the options."""
         options = build(WaveshareOptions, settings.options, "[robot.options]")
         super().__init__(WaveshareBase(options.port), settings)

@@ -1,8 +1,8 @@
-"""Stops the wheels of a base that does not stop by itself, also when the driver's process is dead or hangs.
+"""Stops the wheels of a base without hardware watchdog when commands cease or the driver process dies.
 
-A process of its own that shares the open port. Run as a program it reads from its standard input `1` for each
-command that moves the robot and `0` for each that does not, and writes the bytes that stop the wheels to its
-standard output, the port: when nothing was read for a while after a `1`, and when its input ends.
+The guard is a separate process that shares the open port. It reads `1` from its standard input for each
+command that moves the robot and `0` for each that does not. It writes the stop command to its standard
+output, the port, when nothing was read for a while after a `1`, and when its input ends.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ SILENCE = 0.3
 
 
 class WheelGuard:
-    """The guard of one open port, seen from the driver."""
+    """Handle of the guard of one open port."""
 
     def __init__(self, port: int, stop: bytes) -> None:
-        """Start it.
+        """Start the guard process.
 
         Args:
             port: file descriptor of the open port.
-            stop: bytes that stop the wheels, whatever was written before them.
+            stop: bytes that stop the wheels, even after an incomplete command.
         """
-        # Alone and without site packages it starts in some ten milliseconds. A session of its own: Ctrl-C in
-        # the terminal stops the driver, and the guard only then.
+        # Without site packages the process starts in some ten milliseconds. A new session: Ctrl-C in the
+        # terminal must not end the guard before the driver.
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", __file__, stop.hex(), str(SILENCE)],
             stdin=subprocess.PIPE, stdout=port, start_new_session=True,
@@ -39,34 +39,34 @@ class WheelGuard:
         os.set_blocking(self._pipe, False)
 
     def moving(self, moving: bool) -> None:
-        """A command has just been given. Never waits."""
-        # A full pipe: the guard hangs on the port, and has more to read than it needs.
+        """Report a command. Does not block."""
+        # The pipe is full if the guard is blocked by the port; then it has enough to read.
         with contextlib.suppress(BlockingIOError, BrokenPipeError):
             os.write(self._pipe, b"1" if moving else b"0")
 
     def close(self) -> None:
-        """Let it stop the wheels for the last time, and end."""
+        """Stop the wheels and end the guard process."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
         try:
             self._process.wait(0.5)
         except subprocess.TimeoutExpired:
-            # The port does not take the bytes.
+            # The port is blocked.
             self._process.kill()
             self._process.wait()
 
 
 def _write(data: bytes) -> None:
-    # A port that has vanished takes the wheels' line with it: nothing is left to be done.
+    # The port has vanished: the wheels cannot be reached.
     with contextlib.suppress(OSError):
         os.write(1, data)
 
 
 def main(stop: bytes, silence: float) -> None:
-    """Guard until the input ends."""
+    """Run until the input ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        # The end of the driver's process is what counts.
+        # Only the end of the driver process ends the guard.
         signal.signal(number, signal.SIG_IGN)
     moving = False
     while True:

@@ -1,4 +1,4 @@
-"""A robot made of a base and a camera: odometry at the time of each image, and nothing that makes it wait."""
+"""A robot made of a base and a camera, with odometry at the time of each image and no blocking calls."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from mapweave.hybridmap.errors import DeviceError, InvalidValue
 log = logging.getLogger(__name__)
 
 POLL = 0.05
-"""s between two readings of the base: twice as often as images are used."""
+"""s between two readings of the base; half a tick."""
 RETRY = 0.3
-"""s until a port that has failed is tried again."""
+"""s between two attempts to open the base."""
 PATIENCE = 5.0
-"""s; a base and a camera that have not answered by then are not there."""
+"""s that `describe` waits for the first answer of the base."""
 STALE = 0.5
-"""s; older proximity readings say nothing."""
+"""s; older proximity readings are not reported."""
 OLDEST_IMAGE_NS = 1_000_000_000
-"""The first image is no older; of the others it is known how old they are when they are here."""
+"""Assumed age of the first image on arrival; later the age of the last image is used."""
 LONGEST_EXTRAPOLATION_NS = 100_000_000
-"""The wheels' speed is taken for constant for so long after their last reading."""
+"""Longest extrapolation of the wheels at constant speed beyond their last reading."""
 
 
 class WheeledRobot:
     """The Robot protocol over a base and a camera.
 
-    A thread talks to the base: it sends the newest command, reads, and connects again when the line fails.
-    Another takes images. `sense` and `act` only look at what these have left.
+    One thread sends the newest command to the base, reads it, and reconnects when the line fails. Another
+    thread captures images. `sense` and `act` only exchange values with these threads.
     """
 
     def __init__(self, base: Base, settings: RobotSettings, camera: FrameSource | None = None) -> None:
-        """Begin to connect.
+        """Open the camera and start to connect.
 
         Args:
-            base: what drives.
+            base: wheels and sensors.
             settings: camera and geometry.
-            camera: in place of the one in the settings.
+            camera: replaces the camera of the settings.
 
         Raises:
             SettingsError: there is no camera.
-            DeviceError: the camera is not there.
+            DeviceError: the camera cannot be opened.
         """
         self._base = base
         self._settings = settings
@@ -68,7 +68,7 @@ class WheeledRobot:
         self._due = 0.0
         if camera is None:
             if settings.camera is None:
-                settings.describe(base.geometry)  # says what is missing
+                settings.describe(base.geometry)  # raises SettingsError
                 raise AssertionError
             camera = Capture(settings.camera)
         self._camera = camera
@@ -76,11 +76,11 @@ class WheeledRobot:
         self._thread.start()
 
     def describe(self) -> RobotDescription:
-        """What settings and driver know; waits until the base has answered once.
+        """Combine settings and driver; waits for the first answer of the base.
 
         Raises:
-            DeviceError: it does not answer.
-            SettingsError: something about the body is not known.
+            DeviceError: the base does not answer.
+            SettingsError: a dimension of the robot is missing.
         """
         if self._description is None:
             with self._changed:
@@ -94,12 +94,12 @@ class WheeledRobot:
         return self._description
 
     def sense(self) -> Observation | None:
-        """What is newest, a tick after the last time; None once closed.
+        """Return the newest image one tick after the last call; None once closed.
 
-        A line that has failed shows in this: the wheels stand still, and proximity sensors are not there.
+        While the line has failed, the odometry is zero and the proximity readings are missing.
 
         Raises:
-            DeviceError: the base has never answered, or its driver has failed.
+            DeviceError: the base has never answered, or its driver has raised an error.
         """
         description = self.describe()
         tick = description.tick
@@ -119,7 +119,7 @@ class WheeledRobot:
                 stamp_ns = frame.stamp_ns
                 self._age_ns = now_ns() - stamp_ns
             else:
-                # As an image would have been stamped a tick ago, so that the next one is newer.
+                # The stamp of an image one tick ago, so that the next image is newer.
                 tick_ns = round(tick * 1e9)
                 stamp_ns = max(self._stamp_ns + tick_ns // 10, now_ns() - self._age_ns - tick_ns)
             way = self._way(stamp_ns)
@@ -139,13 +139,13 @@ class WheeledRobot:
         )
 
     def act(self, command: Command) -> Command:
-        """Leave a command for the base's thread.
+        """Pass a command to the thread of the base.
 
         Returns:
-            The command that the base drives: within its limits, in its steps.
+            The applied command: within the limits, in the steps of the hardware.
 
         Raises:
-            InvalidValue: it is not finite.
+            InvalidValue: the command is not finite.
         """
         wheels = self._base.nearest(self._wheels(command))
         with self._changed:
@@ -155,7 +155,7 @@ class WheeledRobot:
         return Command((wheels.left + wheels.right) / 2, (wheels.right - wheels.left) / axle)
 
     def close(self) -> None:
-        """Stop the wheels and let go. Twice is no error."""
+        """Stop the wheels and release base and camera. May be called twice."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -164,7 +164,7 @@ class WheeledRobot:
         self._camera.close()
 
     def _wheels(self, command: Command) -> Wheels:
-        """The wheels' speeds of a command within the limits."""
+        """Wheel speeds of a command within the limits."""
         if not (math.isfinite(command.forward) and math.isfinite(command.turn)):
             raise InvalidValue(f"command: {command} is not finite")
         d = self.describe()
@@ -173,7 +173,7 @@ class WheeledRobot:
         return Wheels(forward - half, forward + half)
 
     def _way(self, stamp_ns: int) -> Wheels:
-        """The wheels' ways at a time: between two readings, or a little beyond the last."""
+        """Distances of the wheels at a time, interpolated or slightly extrapolated."""
         stamps = np.array([stamp for stamp, _ in self._readings], dtype=np.int64)
         # (N, 2) m. Relative stamps: nanoseconds since 1970 are too many for a float.
         ways = np.array([reading.way for _, reading in self._readings])
@@ -196,7 +196,7 @@ class WheeledRobot:
                     self._exchange()
             except DeviceError as error:
                 self._fail(str(error))
-            except Exception as error:  # noqa: BLE001 - a driver's mistake, told where the agent senses
+            except Exception as error:  # noqa: BLE001 - raised again by `sense`
                 self._mistake = error
                 return
             finally:
@@ -223,7 +223,7 @@ class WheeledRobot:
 
     def _fail(self, failure: str) -> None:
         if self._opened and not self._failure:
-            log.warning("%s; the wheels stand until it answers again", failure)
+            log.warning("%s; the robot stands until it answers again", failure)
         self._failure = failure
-        # What was to be driven then is void when the line is back.
+        # A command of before must not be driven after the reconnection.
         self._command = None

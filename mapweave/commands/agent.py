@@ -37,7 +37,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--robot", metavar="DRIVER",
         help="a driver as `mapweave robots` lists them, or your own class, FILE.py:CLASS (default: [robot] "
-        "driver of the settings, else remote, a body behind Zenoh keys such as the simulator's)",
+        "driver of the settings, else remote, a base behind Zenoh keys such as the simulator's)",
     )  # fmt: skip
     parser.add_argument(
         "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
@@ -120,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _robot(
     arguments: argparse.Namespace, settings: RobotSettings, bus: Bus, fleet: str, name: str
 ) -> tuple[Robot, Synchronization]:
-    """The robot, and what the loop waits for: a simulation may be driven in lock-step."""
+    """The robot, and how the loop is synchronised: a simulation may run in lock-step."""
     from mapweave.agent.drivers.registry import find_driver
     from mapweave.agent.drivers.remote import RemoteRobot
     from mapweave.agent.drivers.settings import REMOTE
@@ -136,7 +136,7 @@ def _robot(
         robot = LockstepRobot(bus, fleet, name)
         return robot, Lockstep(robot.rendezvous)
     if arguments.lockstep or arguments.body:
-        raise SettingsError(f"--lockstep and --body are for simulated bodies, not for the driver {driver}")
+        raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
     return find_driver(driver)(settings), FreeRunning()
 
 

@@ -1,4 +1,4 @@
-"""`mapweave robots`: the drivers that there are."""
+"""`mapweave robots`: list the drivers."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "robots",
         help="list the drivers of robots",
-        description="List the drivers: name, what it drives, and what is missing to use it. The name goes "
-        'into the settings file of the robot, [robot] driver = "koala". Your own driver is FILE.py:CLASS.',
+        description="List the drivers with their robots and missing libraries. The settings file of a robot "
+        'names its driver: [robot] driver = "koala". Your own driver is FILE.py:CLASS.',
     )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print a line for each."""
+    """Print one line per driver."""
     from mapweave.agent.drivers.registry import listing
     from mapweave.extras import extra_of
 

@@ -13,9 +13,9 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "router",
         help="run the router alone, without a map server",
-        description="Run the Zenoh router that robots, bodies and tools connect to, and no map server. It "
-        "needs nothing but the base installation. Maps are not merged; robots keep theirs on their own disks "
-        "and send them when a map server can be reached.",
+        description="Run the Zenoh router for robots and tools, without a map server. It needs only the "
+        "base installation. Maps are not merged; robots keep them on their own disks and send them when a "
+        "map server can be reached.",
     )
     add_network(parser, listens=True)
     parser.set_defaults(run=run)

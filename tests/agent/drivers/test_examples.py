@@ -1,4 +1,4 @@
-"""The examples are short, and work: the own driver keeps the contract, the body of thirty lines is driven."""
+"""The examples are short; the own driver passes the contract, the remote base answers an agent."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ class TestOwnRobot(RobotContract):
 
 def test_they_are_short() -> None:
     assert len((EXAMPLES / "own_robot.py").read_text().splitlines()) < 60
-    code = [line for line in (EXAMPLES / "body.py").read_text().splitlines() if line.strip()]
+    code = [line for line in (EXAMPLES / "remote_base.py").read_text().splitlines() if line.strip()]
     assert len(code) <= 32
 
 
-def test_a_body_in_thirty_lines_is_driven() -> None:
+def test_the_remote_base_answers_an_agent() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
-    body = subprocess.Popen([sys.executable, EXAMPLES / "body.py", endpoint])
+    body = subprocess.Popen([sys.executable, EXAMPLES / "remote_base.py", endpoint])
     try:
         robot = CheckedRobot(RemoteRobot(router, "demo", "r0", patience=20.0))
         assert robot.describe().camera.width == 320
