@@ -39,7 +39,8 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, write, hand over."""
-    from mapweave.agent.drivers.replay import images_in, read_camera
+    from mapweave.agent.recordings.camera_file import read_camera
+    from mapweave.agent.recordings.image_folder import images_in
     from mapweave.hybridmap.change import NodePut
     from mapweave.hybridmap.errors import NotConnected
     from mapweave.hybridmap.node import MapId, check_name

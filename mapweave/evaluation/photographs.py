@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.drivers.replay import images_of
+from mapweave.agent.recordings.image_folder import images_of
 from mapweave.evaluation.verdict import Verdict
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError

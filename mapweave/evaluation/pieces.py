@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from mapweave.agent.drivers.replay import Replay, images_of
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.recordings.image_folder import images_of
 from mapweave.evaluation.splits import robots_of
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.node import check_name

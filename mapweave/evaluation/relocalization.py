@@ -11,8 +11,10 @@ from typing import Any
 from rich.console import Console
 from rich.progress import track
 
-from mapweave.agent.drivers.replay import Replay, images_of, read_camera
+from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.recordings.camera_file import read_camera
+from mapweave.agent.recordings.image_folder import images_of
 from mapweave.evaluation.drive import DriveMap, Truth
 from mapweave.evaluation.photographs import AppearanceMap, Photographs
 from mapweave.evaluation.splits import robots_of

@@ -13,10 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.drivers.replay import Replay, read_camera
+from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Command, Odometry
 from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
