@@ -13,12 +13,10 @@ import numpy as np
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
-from tests.agent.drivers.emulators import Koala25, TwoWheels
+from tests.agent.drivers.emulators import Koala25, KoalaSilver, LineEmulator, TwoWheels
 
 RANGERS = 72
-"""Of the simulated robot, 5 degrees apart; the Koala has nine of them."""
-BEARINGS_DEG = (110, 70, 35, 0, -35, -70, -110, -160, 160)
-"""Left rear, left front, front left, front, and so on clockwise to back left."""
+"""Of the simulated robot, 5 degrees apart; a Koala has some of them."""
 
 
 class SimulatedWheels(TwoWheels):
@@ -53,7 +51,7 @@ class SimulatedWheels(TwoWheels):
             return l0 + share * (l1 - l0), r0 + share * (r1 - r0)
 
 
-class KoalaInSimulation(Koala25):
+class InSimulation(LineEmulator):
     """Runs one robot of a simulation in real time; its only ends are the serial port and the stream's URL."""
 
     def __init__(self, folder: Path, simulation: Simulation, name: str) -> None:
@@ -137,11 +135,35 @@ class KoalaInSimulation(Koala25):
                 frame = cv2.imencode(".jpg", seen.image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
     def feel(self, proximity: np.ndarray) -> None:
-        """Nothing is told apart below 25 cm, and nothing is seen beyond 250."""
-        centimetres = [100.0 * at(proximity, bearing) for bearing in BEARINGS_DEG]
-        self.ultrasonic = [1000 if c >= 249.5 else 0 if c < 25.0 else round(c) for c in centimetres]
+        """Set the readings of the sensors."""
+        raise NotImplementedError
 
 
 def at(proximity: np.ndarray, bearing_deg: int) -> float:
     """Distance in a direction, m."""
     return float(proximity[round(bearing_deg % 360 / 360 * RANGERS) % RANGERS])
+
+
+class Koala25InSimulation(InSimulation, Koala25):
+    """Koala 2.5 with nine ultrasonic sensors; manual, section 4.1."""
+
+    BEARINGS_DEG = (110, 70, 35, 0, -35, -70, -110, -160, 160)
+    """Left rear, left front, front left, front, and so on clockwise to back left."""
+
+    def feel(self, proximity: np.ndarray) -> None:
+        """Readings from 25 to 250 cm."""
+        centimetres = [100.0 * at(proximity, bearing) for bearing in self.BEARINGS_DEG]
+        self.ultrasonic = [1000 if c >= 249.5 else 0 if c < 25.0 else round(c) for c in centimetres]
+
+
+class KoalaSilverInSimulation(InSimulation, KoalaSilver):
+    """Koala silver edition with sixteen infrared sensors that reach 20 cm."""
+
+    BEARINGS_DEG = (5, 20, 35, 55, 75, 105, 135, 170)
+    """Of the left side, from the front; the right side is mirrored."""
+
+    def feel(self, proximity: np.ndarray) -> None:
+        """Reflected light falls with the square of the distance; ten bits."""
+        both = [*self.BEARINGS_DEG, *(-bearing for bearing in self.BEARINGS_DEG)]
+        light = [20 * (0.2 / max(at(proximity, bearing), 0.01)) ** 2 for bearing in both]
+        self.infrared = [min(round(value), 1023) for value in light]
