@@ -1,10 +1,10 @@
-"""Fleets with one robot whose map has wrong geometry and true views: what lost robots are told then.
+"""Fleets with one robot whose map has wrong geometry and true views: answers to lost robots then.
 
     python -m benchmarks.wrong_geometry --seeds 0 1 2 --kinds slip carried long turns
 
 Nothing is rendered (see benchmarks.synthetic). Three sound robots map a house; a fourth maps the same house
 with one of four faults of its odometry. Lost robots then ask where they are, with and without the fourth
-robot's map. The house may have two rooms that look the same: what is told there must not become surer.
+robot's map. The house may have two rooms that look the same: answers there must not become more certain.
 """
 
 from __future__ import annotations

@@ -60,15 +60,15 @@ def rays(bearing: float | None) -> Ranges:
 def meeting(
     mine: Room, other: Room, late: float = 0.0, looks: int = 0, sigma: float = 0.01, seen: bool = False
 ) -> tuple[PoseGraph, BodyTrajectory, BodyTrajectory]:
-    """Two robots half a metre apart turn on the spot; at first the one looks about with its sensors.
+    """Two robots half a metre apart turn on the spot; at first the first one turns with its sensors.
 
     Args:
-        mine: what the one sees.
+        mine: what the first one sees.
         other: what the other one sees.
         late: how much later the other one comes, s.
-        looks: of the one.
+        looks: views of the first one.
         sigma: of all poses, m and rad.
-        seen: whether the one's sensors see the other one where it is.
+        seen: whether the first one's sensors see the second one where it is.
     """
     nodes, means = [], []
     for agent, room, x, wait in (("a", mine, 0.0, 0.0), ("b", other, 0.5, late)):

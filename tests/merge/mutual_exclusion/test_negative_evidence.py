@@ -1,4 +1,4 @@
-"""Views that show nothing of what another robot has mapped there: told from views that were hidden."""
+"""Views that show nothing of what another robot has mapped there: distinguished from occluded views."""
 
 import math
 from dataclasses import replace
@@ -62,7 +62,7 @@ def test_occluded_and_unobserved_landmarks_are_not_missed() -> None:
     assert 10 < len(hidden) < len(shown) and set(hidden) < set(shown)
     where = dict(zip(shown.tolist(), pixels[:, 0], strict=True))
     assert min(where[k] for k in hidden.tolist()) > 140 - S.around * CAMERA.fx
-    # Without the board nobody knows how far the view looked there.
+    # Without the board the view's range there is unknown.
     half, _ = should_show(node, replace(view, landmarks=old), Pose2(0.3, 0.0, 0.05), S)
     assert min(where[k] for k in half.tolist()) > 160 - S.around * CAMERA.fx
     # From another side, or much nearer, things look different.
