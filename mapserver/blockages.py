@@ -26,7 +26,7 @@ class Blockages:
     """
 
     def __init__(self, forget: float = FORGET, most: int = MOST) -> None:
-        """Start without blocks."""
+        """Nothing is blocked."""
         self._forget, self._most = forget, most
         self._reported: dict[Pair, float] = {}
         self._turn = threading.Lock()
@@ -47,7 +47,7 @@ class Blockages:
                 del self._reported[next(iter(self._reported))]
 
     def known(self, now: float) -> list[Pair]:
-        """The pairs that still count at a time of the server's clock, s."""
+        """What still counts at a time of the server's clock, s."""
         forget = self._forget
         with self._turn:
             self._reported = {pair: stamp for pair, stamp in self._reported.items() if now - stamp < forget}

@@ -134,7 +134,7 @@ class TraverseRecorder:
         return Traverse(start, self._node, between, fewest) if widest < WIDEST and way < straight else None
 
     def _with_floor(self, pose: PoseGaussian) -> PoseGaussian:
-        """A pose of the filter with the error floor added."""
+        """A pose of the filter with the uncertainty that the filter cannot know."""
         xy, heading = FLOOR
         more: Array = np.diag([xy**2, xy**2, heading**2])
         return PoseGaussian(pose.mean, pose.covariance + more)

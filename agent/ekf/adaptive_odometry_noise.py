@@ -11,8 +11,7 @@ from mapweave.hybridmap.pose import Array
 SLIP = (0.1, 0.2)
 """Sigma of (forward m, turn rad) of a step whose wheels the landmarks refute."""
 DISTRUST = 10
-"""Steps after one whose wheels the landmarks refute in which wheels that claim to stand are not
-believed."""
+"""Steps after one whose wheels the landmarks refute in which wheels that claim to stand are not trusted."""
 
 
 class AdaptiveOdometryNoise:

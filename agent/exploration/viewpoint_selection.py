@@ -13,7 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.pose import Array
 
 VIEW_RADIUS = 1.6
-"""Radius around a place within which its floor is known, m; also around places of others."""
+"""What lies around a place, and what others know around theirs, is judged within this radius, m."""
 
 
 DIRECTIONS = 36

@@ -74,9 +74,9 @@ class GlobalLocalization:
             description: of the robot.
             sift: finds features.
             motion: moves the robot.
-            own_map: the robot's own map.
-            policy: of the search.
-            fleet: the fleet's map; None for a robot that uses only its own map.
+            own_map: what the robot knows itself.
+            policy: how hard it tries, and what it believes.
+            fleet: what others know; None for a robot that counts on its own map alone.
         """
         self.detail = ""
         self._description = description

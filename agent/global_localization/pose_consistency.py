@@ -44,7 +44,7 @@ round."""
 
 
 def consistent(earlier: PoseHypothesis, now: PoseHypothesis) -> bool:
-    """Whether two recognitions are of different views and give the same pose."""
+    """Whether two recognitions come of different views and put the robot at the same place."""
     moved = earlier.odom_from_robot.inverse() @ now.odom_from_robot
     if abs(moved.heading) < OTHER_VIEW[1] and math.hypot(moved.x, moved.y) < OTHER_VIEW[0]:
         return False

@@ -56,7 +56,7 @@ GOAL_VIEWS = 4
 HIDDEN = 2.0
 """After this time at the goal without its landmarks visible, or recognised, the robot is not there, s."""
 PATIENCE = 6.0
-"""Time without progress before an edge counts as blocked, s."""
+"""Time without getting on before an edge counts as blocked, s."""
 STALLED = 3.0
 """Time that the servo may take without getting nearer before the robot drives around, s."""
 STALLED_PARKING = 10.0
@@ -215,7 +215,7 @@ class RouteFollower:
         return None if detection is None else detection[1]
 
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
-        """Whether the servo may drive: without progress it cannot pass an obstacle."""
+        """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
         tick = self._description.tick
         self._servo_barred = max(self._servo_barred - tick, 0.0)
         if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):

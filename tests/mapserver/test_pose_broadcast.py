@@ -47,8 +47,8 @@ def no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose_broadcast, "BEAT", math.inf)
 
 
-class Recorder:
-    """A pose broadcast, and what it publishes."""
+class Told:
+    """A herald, and what it publishes."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.heard: list[PoseNews] = []
@@ -90,7 +90,7 @@ def zenoh() -> Iterator[ZenohFleet]:
 
 
 def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) -> None:
-    told = Recorder(memory)
+    told = Told(memory)
     (first,) = told.tell(graph(A))
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
     assert told.tell(graph(A, 0.049)) == []
@@ -103,7 +103,7 @@ def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) 
 
 
 def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
-    told = Recorder(memory)
+    told = Told(memory)
     told.tell(graph(A), graph(B))
     one = graph(A)
     one.means[3, 1] = 0.2
@@ -117,7 +117,7 @@ def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> 
 
 
 def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
-    told = Recorder(memory)
+    told = Told(memory)
     told.tell(graph(A))
     (news,) = told.tell(graph(A[:-1]))
     assert news.gone == (A[-1],) and not news.placed
@@ -128,7 +128,7 @@ def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
 
 def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose_broadcast, "MOST", 2)
-    told = Recorder(memory)
+    told = Told(memory)
     pieces = told.tell(graph(A))
     assert [len(news.placed) for news in pieces] == [2, 2, 1]
     assert [(news.after, news.sequence) for news in pieces] == [(0, 1), (1, 2), (2, 3)]

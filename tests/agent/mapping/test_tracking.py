@@ -88,7 +88,7 @@ def test_further_tracks_hold_the_heading_when_wheels_lie(walls, description):
 def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last(
     walls, description, monkeypatch
 ):
-    """Few tracks in one corner: only wheels are trusted, they drift, and the robot was not carried off.
+    """Few tracks in one corner: wheels are trusted alone, lie by and by, and nobody carried the robot off.
 
     A robot before a bare wall once took itself for carried off when its filter was 20 px off its tracks.
     """
@@ -99,7 +99,7 @@ def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last
         before, pose = pose, Pose2(0.002 * tick)
         observed = walls.observe(before, pose, tick)
         tracking.step(replace(observed, odometry=Odometry(observed.odometry.forward, 0.01)))
-        assert tracking.strange == tracking.blank == 0
+        assert tracking.acceptance.strange == tracking.acceptance.blank == 0
     assert abs(tracking.pose.mean.heading - 0.2) < 1e-6, "by the wheels alone"
     assert len(tracking.ids) > 0.9 * alive
 
