@@ -33,8 +33,8 @@ def painted(painter: Painter, seed: tuple[int, ...], width_px: int, height_px: i
 class Texture:
     """A grey image on a surface, at every sharpness at which a camera may see it.
 
-    Painted from its own seed when it is first needed, so that a large world costs nothing where nobody
-    looks and the picture does not depend on the order in which things are seen.
+    Painted from its own seed when it is first needed, so that unseen parts of a large world cost nothing
+    and the picture does not depend on the order in which things are seen.
 
     Attributes:
         width_px: across.
