@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
-    from mapweave.agent.drivers.replay import read_camera as read_camera
     from mapweave.agent.drivers.robot import Robot as Robot
     from mapweave.agent.observation import Command as Command
     from mapweave.agent.observation import Observation as Observation
     from mapweave.agent.observation import Odometry as Odometry
     from mapweave.agent.observation import RobotDescription as RobotDescription
+    from mapweave.agent.recordings.camera_file import read_camera as read_camera
     from mapweave.hybridmap.camera import Camera as Camera
     from mapweave.hybridmap.errors import MapweaveError as MapweaveError
     from mapweave.hybridmap.hybrid_map import HybridMap as HybridMap
@@ -46,9 +46,9 @@ if TYPE_CHECKING:
     __version__: str
 else:
     _NAMES = {
-        "mapweave.agent.drivers.replay": ("read_camera",),
         "mapweave.agent.drivers.robot": ("Robot",),
         "mapweave.agent.observation": ("Command", "Observation", "Odometry", "RobotDescription"),
+        "mapweave.agent.recordings.camera_file": ("read_camera",),
         "mapweave.hybridmap.camera": ("Camera",),
         "mapweave.hybridmap.errors": ("MapweaveError",),
         "mapweave.hybridmap.hybrid_map": ("HybridMap",),

@@ -13,7 +13,7 @@ PATIENCE = 30.0
 def eventually(condition: Callable[[], object], seconds: float = PATIENCE) -> None:
     """Return as soon as a condition holds; fail if it does not within this time.
 
-    A condition that takes long to evaluate is evaluated less often: what it waits for needs the processor too.
+    A condition that takes long is evaluated less often: what it waits for needs the processor, too.
     """
     end = time.monotonic() + seconds
     while True:

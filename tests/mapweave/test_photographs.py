@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.agent.drivers.replay import read_camera
+from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.cli import main
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
