@@ -1,0 +1,105 @@
+"""Rules of merge and relocalization, each with what takes its place when it is switched off.
+
+No product code knows of these switches: a function is replaced for as long as something is measured.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
+from mapweave.merge import merging
+from mapweave.merge.mutual_exclusion import exclusion
+from mapweave.merge.mutual_exclusion.negative_evidence import Views
+from mapweave.merge.mutual_exclusion.refutation import Refutation
+from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency, segmentation
+from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
+from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
+
+Switch = tuple[object, str, object]
+"""Where a function stands, its name, and what takes its place."""
+
+
+def _each_a_witness(links: Sequence[Link], *_: object) -> NDArray[np.bool_]:
+    return np.eye(len(links), dtype=np.bool_)
+
+
+def _as_it_is(sorted_links: Sorted, *_: object) -> Sorted:
+    return sorted_links
+
+
+def _solved_once(
+    solver: ComponentSolver, links: Sequence[Link], strain: float, whole: bool = True
+) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
+    return solver.solve(links, believed=True, whole=whole), list(links), []
+
+
+def _nothing(*_: object, **__: object) -> list[Any]:
+    return []
+
+
+def _no_views(*_: object) -> Views:
+    return Views(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+WITHOUT_PULL_LIMIT = partial(ComponentSolver, huber=math.inf)
+MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
+    "independent support": ((pairwise_consistency, "neighbours", _each_a_witness),),
+    "chance support": ((Sorted, "beyond_chance", _as_it_is),),
+    "dominance": ((pairwise_consistency, "_rival", _nothing),),
+    "refused links heard again": (
+        (agglomerative_joining, "_heard_again", lambda _solver, kept, *_: list(kept)),
+    ),
+    "readmission": ((merging, "readmitted", _nothing),),
+    "worst first": ((merging, "optimise", _solved_once), (segmentation, "optimise", _solved_once)),
+    "Huber kernel": (
+        (merging, "ComponentSolver", WITHOUT_PULL_LIMIT),
+        (segmentation, "ComponentSolver", WITHOUT_PULL_LIMIT),
+    ),
+}
+"""Rules on links, for fleets without images."""
+TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
+    **MERGE_RULES,
+    "mutual exclusion": ((Refutation, "impossible", lambda *_: {}), (Refutation, "verdict", lambda *_: "")),
+    "negative evidence": ((exclusion, "negative_evidence", _no_views),),
+    "aliased landmarks": ((merging, "weigh", lambda links, *_: list(links)),),
+}
+"""Rules on links, for robots with images and bodies."""
+PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
+    "aliased regions": ((AliasedRegions, "counterpart", lambda *_: None),),
+}
+"""Rules on answers to lost robots."""
+
+
+@contextlib.contextmanager
+def switched_off(switches: Sequence[Switch]) -> Iterator[None]:
+    """Do without a rule for a while."""
+    with contextlib.ExitStack() as stack:
+        for where, name, instead in switches:
+            stack.enter_context(patch.object(where, name, instead))
+        yield
+
+
+def by_rule(
+    rules: Mapping[str, tuple[Switch, ...]], measured: Callable[[], dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """What is measured with all rules, and without each."""
+    out = {ALL: measured()}
+    for name, switches in rules.items():
+        with switched_off(switches):
+            out[name] = measured()
+    return out
+
+
+ALL = "all rules"
+"""Name of what is measured with none switched off."""
