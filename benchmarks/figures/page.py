@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.figures.questions import INTRODUCTION, QUESTIONS, RULES, Question, Rule
@@ -32,8 +32,9 @@ def _shown(figures: Mapping[str, Any], path: str, form: str) -> str:
         value = value[key]
     if value is None:
         return "none"
-    scale = SCALES.get(form[-1:], 1.0)
-    return format(value * scale, form[:-1]) if scale != 1.0 else format(value, form)
+    if form[-1:] in SCALES:
+        return format(value * SCALES[form[-1]], form[:-1] + "f")
+    return format(value, form)
 
 
 def page(results: Mapping[str, Result]) -> str:
@@ -48,28 +49,26 @@ def page(results: Mapping[str, Result]) -> str:
 
 
 def _question(question: Question, results: Mapping[str, Result]) -> str:
-    lines = (
-        [f"## {question.title}", "", question.words, ""] if question.words else [f"## {question.title}", ""]
-    )
-    lines += ["| what | figure | asked | measured by |", "|---|---|---|---|"]
-    lines += [
-        f"| {row.what} | {filled(row.figure, _of(results, row.source).figures)} | {row.asked} "
-        f"| [{row.source}](#when-and-where) |"
-        for row in question.rows
-    ]
+    lines = [f"## {question.title}", "", "| what | figure | asked | command |", "|---|---|---|---|"]
+    before = ""
+    for row in question.rows:
+        result = _of(results, row.source)
+        command = "same" if row.source == before else _command(result)
+        lines.append(f"| {row.what} | {filled(row.figure, result.figures)} | {row.asked} | {command} |")
+        before = row.source
     return "\n".join(lines)
 
 
-def _rules(rules: tuple[Rule, ...], results: Mapping[str, Result]) -> str:
+def _rules(rules: Sequence[Rule], results: Mapping[str, Result]) -> str:
     lines = [
         "## What fails without each rule", "",
         "A rule that rejects links, answers or frames is switched off by itself; everything else stays.", "",
-        "| rule | file | what fails without it | measured by |", "|---|---|---|---|",
+        "| rule | file | what fails without it | command |", "|---|---|---|---|",
     ]  # fmt: skip
     for rule in rules:
         told = "; ".join(filled(words, _of(results, source).figures) for words, source in rule.fails)
-        sources = ", ".join(dict.fromkeys(f"[{source}](#when-and-where)" for _, source in rule.fails))
-        lines.append(f"| {rule.name} | `{rule.file}` | {told} | {sources} |")
+        commands = ", ".join(dict.fromkeys(_command(_of(results, source)) for _, source in rule.fails))
+        lines.append(f"| {rule.name} | `{rule.file}` | {told} | {commands} |")
     return "\n".join(lines)
 
 
@@ -80,10 +79,14 @@ def _measured(results: Mapping[str, Result]) -> str:
         "| name | command | date | version | machine | minutes |", "|---|---|---|---|---|---|",
     ]  # fmt: skip
     lines += [
-        f"| {name} | `{one.command}` | {one.date} | {one.version} | {one.machine} | {one.minutes:g} |"
+        f"| {name} | {_command(one)} | {one.date} | {one.version} | {one.machine} | {one.minutes:g} |"
         for name, one in results.items()
     ]
     return "\n".join(lines)
+
+
+def _command(result: Result) -> str:
+    return f"`{result.command.removesuffix(' --json')}`"
 
 
 def _of(results: Mapping[str, Result], name: str) -> Result:

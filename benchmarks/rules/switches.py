@@ -15,9 +15,11 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.mapserver.relocalization import relocalizer
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.merge import merging
-from mapweave.merge.mutual_exclusion import exclusion
+from mapweave.merge.mutual_exclusion import exclusion, refutation
 from mapweave.merge.mutual_exclusion.negative_evidence import Views
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency, segmentation
@@ -53,6 +55,12 @@ def _no_views(*_: object) -> Views:
 
 
 WITHOUT_PULL_LIMIT = partial(ComponentSolver, huber=math.inf)
+WORST_FIRST: tuple[Switch, ...] = tuple(
+    (where, "optimise", _solved_once) for where in (merging, segmentation)
+)
+HUBER: tuple[Switch, ...] = tuple(
+    (where, "ComponentSolver", WITHOUT_PULL_LIMIT) for where in (merging, segmentation, refutation)
+)
 MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "independent support": ((pairwise_consistency, "neighbours", _each_a_witness),),
     "chance support": ((Sorted, "beyond_chance", _as_it_is),),
@@ -61,11 +69,9 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
         (agglomerative_joining, "_heard_again", lambda _solver, kept, *_: list(kept)),
     ),
     "readmission": ((merging, "readmitted", _nothing),),
-    "worst first": ((merging, "optimise", _solved_once), (segmentation, "optimise", _solved_once)),
-    "Huber kernel": (
-        (merging, "ComponentSolver", WITHOUT_PULL_LIMIT),
-        (segmentation, "ComponentSolver", WITHOUT_PULL_LIMIT),
-    ),
+    "worst first": WORST_FIRST,
+    "Huber kernel": HUBER,
+    "worst first and Huber kernel": (*WORST_FIRST, *HUBER),
 }
 """Rules on links, for fleets without images."""
 TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
@@ -77,6 +83,8 @@ TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
 """Rules on links, for robots with images and bodies."""
 PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "aliased regions": ((AliasedRegions, "counterpart", lambda *_: None),),
+    "nodes that look alike": ((Relocalizer, "doubled", _nothing),),
+    "lonely recognition": ((relocalizer, "is_lonely", lambda *_: False),),
 }
 """Rules on answers to lost robots."""
 

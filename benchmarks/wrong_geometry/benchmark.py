@@ -4,8 +4,8 @@
 
 Nothing is rendered (see `synthetic.wrong_geometry`). Three sound robots map a house; a fourth maps the same
 house with one of four faults of its odometry. Lost robots then ask where they are: without the fourth robot's
-map, with it, and with it while no map is looked for that has wrong geometry. The house may have two rooms that
-look the same: what is told there must not become surer.
+map, with it, and with it while no map is looked for that has wrong geometry. The house may have two rooms
+that look the same: what is told there must not become surer.
 """
 
 from __future__ import annotations
