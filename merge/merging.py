@@ -170,7 +170,7 @@ def _joined(
     tried = [r.link for r in refused if r.link is not None]
     kept += readmitted(solver, kept, tried, s.consistency)
     told = {link.key for link in kept}
-    return solver.solve(kept, believed=True), kept, [r for r in refused if r.pair not in told]
+    return solver.solve(kept), kept, [r for r in refused if r.pair not in told]
 
 
 def _weighed(

@@ -37,7 +37,7 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
     fragments = fragments_of(maps)
     by_node = fragment_by_node(fragments)
     believed = [link for link in links if link.a in by_node and link.b in by_node]
-    graphs = ComponentSolver(fragments).solve(believed, believed=True)
+    graphs = ComponentSolver(fragments).solve(believed)
     return MergedMap(
         maps,
         tuple(sorted(believed, key=lambda link: link.pair)),

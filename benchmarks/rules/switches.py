@@ -6,9 +6,7 @@ No product code knows of these switches: a function is replaced for as long as s
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -19,7 +17,7 @@ from mapweave.mapserver.relocalization import relocalizer
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.merge import merging
-from mapweave.merge.mutual_exclusion import exclusion, refutation
+from mapweave.merge.mutual_exclusion import exclusion
 from mapweave.merge.mutual_exclusion.negative_evidence import Views
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency, segmentation
@@ -43,7 +41,7 @@ def _as_it_is(sorted_links: Sorted, *_: object) -> Sorted:
 def _solved_once(
     solver: ComponentSolver, links: Sequence[Link], strain: float, whole: bool = True
 ) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
-    return solver.solve(links, believed=True, whole=whole), list(links), []
+    return solver.solve(links, whole=whole), list(links), []
 
 
 def _nothing(*_: object, **__: object) -> list[Any]:
@@ -54,12 +52,8 @@ def _no_views(*_: object) -> Views:
     return Views(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-WITHOUT_PULL_LIMIT = partial(ComponentSolver, huber=math.inf)
 WORST_FIRST: tuple[Switch, ...] = tuple(
     (where, "optimise", _solved_once) for where in (merging, segmentation)
-)
-HUBER: tuple[Switch, ...] = tuple(
-    (where, "ComponentSolver", WITHOUT_PULL_LIMIT) for where in (merging, segmentation, refutation)
 )
 MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "independent support": ((pairwise_consistency, "neighbours", _each_a_witness),),
@@ -70,8 +64,6 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     ),
     "readmission": ((merging, "readmitted", _nothing),),
     "worst first": WORST_FIRST,
-    "Huber kernel": HUBER,
-    "worst first and Huber kernel": (*WORST_FIRST, *HUBER),
 }
 """Rules on links, for fleets without images."""
 TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {

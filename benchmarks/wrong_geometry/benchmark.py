@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.rules.switches import switched_off
+from benchmarks.rules.switches import Switch, switched_off
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from synthetic.wrong_geometry import ODD, SCENES, Fault, Told, draw_fleet, lost_views, outcome
 
 WITHOUT, WITH, UNSEARCHED = "without_the_map", "with_the_map", "rule_off"
-NO_SEARCH = ((WrongGeometrySearch, "wrong", lambda *_: {}),)
+NO_SEARCH: tuple[Switch, ...] = ((WrongGeometrySearch, "wrong", lambda *_: {}),)
 
 
 def measured(

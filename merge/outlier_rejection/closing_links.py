@@ -83,11 +83,9 @@ def optimise(
     """
     left = list(links)
     refusals: list[RefusedLink] = []
-    # Limited pull lets the wrong ones stand out; where all are right it is not the best estimate.
-    passes = ((False, False), (True, False), (True, True)) if whole else ((True, False),)
     while True:
-        for believed, last in passes:
-            solved = solver.solve(left, believed=believed, whole=last)
+        for last in (False, True) if whole else (False,):
+            solved = solver.solve(left, whole=last)
             worst, strain2 = solver.worst()
             if worst is not None and strain2 > strain:
                 break

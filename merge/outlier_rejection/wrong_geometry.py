@@ -192,7 +192,7 @@ class WrongGeometrySearch:
         assert placed is not None, "a map with links has nodes"
         pairs = [(a, b) for a in agreeing for b in agreeing if a < b and (a, b) in self._ties]
         held = [link for pair in pairs if self._ties[pair].agrees for link in self._ties[pair].best]
-        graph = ComponentSolver(pieces).solve(held, believed=True)[0]
+        graph = ComponentSolver(pieces).solve(held)[0]
         across = [
             link if link.a.map == one else link.turned()
             for other in agreeing
