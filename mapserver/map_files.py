@@ -80,7 +80,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     maps, rulings = maps_of(content), ManualConstraints(content.rulings)
     links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
     try:
-        parts = fragments_of(apply_constraints(maps, (), rulings).maps, s.consistency, s.strain)
+        parts = fragments_of(apply_constraints(maps, (), rulings).maps, s.consistency)
         solved = ComponentSolver(parts).solve(links)
     except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
         # The solver's RuntimeError says that a system is singular.

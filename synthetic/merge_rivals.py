@@ -11,7 +11,7 @@ from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.merging import MergeSettings, merge_maps
+from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.max_clique import best_clique
 from mapweave.merge.outlier_rejection.pairwise_consistency import (
     ConsistencySettings,
@@ -26,6 +26,8 @@ from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from synthetic.fleet import SyntheticFleet
 from synthetic.gnc import inliers
 
+STRAIN = 25.0
+"""Chi-square with 3 degrees of freedom above which GNC holds a link for wrong."""
 MAPWEAVE = "mapweave"
 """The settings that are the default."""
 Maps = Mapping[MapId, HybridMap]
@@ -50,7 +52,7 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
 
 def gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
     """Graduated non-convexity over all links at once (Yang et al., RA-L 2020)."""
-    return least_squares(maps, inliers(fragments_of(maps), links, MergeSettings().strain))
+    return least_squares(maps, inliers(fragments_of(maps), links, STRAIN))
 
 
 def pcm(maps: Maps, links: Sequence[Link]) -> MergedMap:

@@ -20,11 +20,9 @@ from mapweave.merge import merging
 from mapweave.merge.mutual_exclusion import exclusion
 from mapweave.merge.mutual_exclusion.negative_evidence import Views
 from mapweave.merge.mutual_exclusion.refutation import Refutation
-from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency, segmentation
+from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency
 from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
-from mapweave.merge.pose_graph.component_solver import ComponentSolver
-from mapweave.merge.pose_graph.links import Link, RefusedLink
-from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.pose_graph.links import Link
 
 Switch = tuple[object, str, object]
 """Where a function stands, its name, and what takes its place."""
@@ -38,12 +36,6 @@ def _as_it_is(sorted_links: Sorted, *_: object) -> Sorted:
     return sorted_links
 
 
-def _solved_once(
-    solver: ComponentSolver, links: Sequence[Link], strain: float, whole: bool = True
-) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
-    return solver.solve(links, whole=whole), list(links), []
-
-
 def _nothing(*_: object, **__: object) -> list[Any]:
     return []
 
@@ -52,9 +44,6 @@ def _no_views(*_: object) -> Views:
     return Views(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-WORST_FIRST: tuple[Switch, ...] = tuple(
-    (where, "optimise", _solved_once) for where in (merging, segmentation)
-)
 MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "independent support": ((pairwise_consistency, "neighbours", _each_a_witness),),
     "chance support": ((Sorted, "beyond_chance", _as_it_is),),
@@ -63,7 +52,6 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
         (agglomerative_joining, "_heard_again", lambda _solver, kept, *_: list(kept)),
     ),
     "readmission": ((merging, "readmitted", _nothing),),
-    "worst first": WORST_FIRST,
 }
 """Rules on links, for fleets without images."""
 TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {

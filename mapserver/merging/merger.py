@@ -124,7 +124,7 @@ class Merger:
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
         merging = self.settings.merging
-        self._contradictions = WrongGeometrySearch(merging.consistency, merging.strain)
+        self._contradictions = WrongGeometrySearch(merging.consistency)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}

@@ -63,34 +63,3 @@ def misfits(links: Sequence[Link], graph: PoseGraph, s: ConsistencySettings) -> 
     )
     back = graph.relative([link.b for link in links], [link.a for link in links])
     return (measured @ back).distances2()
-
-
-def optimise(
-    solver: ComponentSolver, links: Sequence[Link], strain: float, whole: bool = True
-) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
-    """Optimise; refuse links that strain too much, worst first.
-
-    It never cuts a piece off: a link that is all that holds two pieces together has no strain.
-
-    Args:
-        solver: of the fragments.
-        links: that join them.
-        strain: chi-square with 3 degrees of freedom above which a link is refused.
-        whole: whether large components are at last optimised as a whole.
-
-    Returns:
-        The components, the links that are kept, and those that were refused.
-    """
-    left = list(links)
-    refusals: list[RefusedLink] = []
-    while True:
-        for last in (False, True) if whole else (False,):
-            solved = solver.solve(left, whole=last)
-            worst, strain2 = solver.worst()
-            if worst is not None and strain2 > strain:
-                break
-        else:
-            return solved, left, refusals
-        reason = f"strains the joined map: {strain2**0.5:.1f} standard deviations from where it ended"
-        refusals.append(refuse(worst, reason))
-        left = [link for link in left if link.key != worst.key]

@@ -3,9 +3,9 @@
 That a robot drove or turned from one node to the next while mapping it has measured all the way. That it
 recognised a place (`loop`) is a claim: in a warehouse the next bay looks like this one. So is what it
 measured between two places that it recognised on a later drive (`driven`). So a robot's own claims join the
-pieces that its way makes just as links join maps: sorted by consistency, then optimised, and one that strains
-is left out. Two things differ. One claim is enough, for the way speaks for it. And a map is never torn apart:
-where a robot resumed its map elsewhere, claims are all that ties the new part to the old one.
+pieces that its way makes just as links join maps: sorted by consistency. Two things differ. One claim is
+enough, for the way speaks for it. And a map is never torn apart: where a robot resumed its map elsewhere,
+claims are all that ties the new part to the old one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import networkx as nx
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
-from mapweave.merge.outlier_rejection.closing_links import join, optimise
+from mapweave.merge.outlier_rejection.closing_links import join
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS, sort_loop_closures
 from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings, group_links, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
@@ -30,7 +30,7 @@ WORDS = {EdgeKind.LOOP: "loop", EdgeKind.MERGED: "link", EdgeKind.DRIVEN: "drive
 
 
 def fragments_of(
-    maps: Mapping[MapId, HybridMap], consistency: ConsistencySettings | None = None, strain: float = 25.0
+    maps: Mapping[MapId, HybridMap], consistency: ConsistencySettings | None = None
 ) -> list[Fragment]:
     """Cut maps into connected pieces, each solved by itself, in the order of names.
 
@@ -38,14 +38,13 @@ def fragments_of(
         maps: by id. Edges whose ends are not both nodes of the same map are not theirs to say and are left
             out: maps are joined by links alone.
         consistency: when a robot's own claims are believed.
-        strain: chi-square with 3 degrees of freedom above which one is refused after all.
     """
     s = consistency or ConsistencySettings()
-    found = [piece for map_id in sorted(maps) for piece in _pieces(maps[map_id], s, strain)]
+    found = [piece for map_id in sorted(maps) for piece in _pieces(maps[map_id], s)]
     return sorted(found, key=lambda fragment: fragment.name)
 
 
-def _pieces(one: HybridMap, s: ConsistencySettings, strain: float) -> list[Fragment]:
+def _pieces(one: HybridMap, s: ConsistencySettings) -> list[Fragment]:
     """The fragments of one map."""
     own = sorted(
         (
@@ -70,15 +69,13 @@ def _pieces(one: HybridMap, s: ConsistencySettings, strain: float) -> list[Fragm
         refused += groups[first, second].refused
     kept, more = join(solver, groups, s)
     refused += more
-    graphs, kept, more = optimise(solver, kept, strain)
-    refused += more
     refusals += [
         replace(r, reason=f"the robot's own {WORDS[edge.kind]} {r.reason}", edge=edge.id)
         for r in refused
         for edge in claims[r.pair]
     ]
     pieces = []
-    for graph in graphs:
+    for graph in solver.solve(kept, whole=True):
         inside = [strand for strand in strands if strand.name in graph.rows]
         measurements = [m for strand in inside for m in strand.measurements]
         measurements += [Measurement(*k.pair, k.a_from_b, robust=True) for k in kept if k.a in graph.rows]

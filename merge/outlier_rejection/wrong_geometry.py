@@ -95,14 +95,13 @@ class _Tie:
 class WrongGeometrySearch:
     """Finds maps with wrong geometry. What was found out of maps and links that did not change is kept."""
 
-    def __init__(self, consistency: ConsistencySettings, strain: float) -> None:
+    def __init__(self, consistency: ConsistencySettings) -> None:
         """Nothing is known yet.
 
         Args:
             consistency: when links agree.
-            strain: see `mapweave.merge.outlier_rejection.segmentation.fragments_of`.
         """
-        self._s, self._strain = consistency, strain
+        self._s = consistency
         self._memory = DecisionCache()
         self._ties: dict[MapPair, _Tie] = {}
         self._checked: dict[tuple[MapId, tuple[MapId, ...]], bool] = {}
@@ -160,7 +159,7 @@ class WrongGeometrySearch:
 
     def _main(self, map_id: MapId, one: HybridMap) -> Fragment | None:
         """The largest piece of a map."""
-        pieces = self._memory.fragments({map_id: one}, self._s, self._strain)
+        pieces = self._memory.fragments({map_id: one}, self._s)
         return max(pieces, key=len, default=None)
 
     def _tie(self, pair: MapPair, maps: Mapping[MapId, HybridMap], links: Sequence[Link]) -> None:

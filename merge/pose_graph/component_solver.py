@@ -130,14 +130,6 @@ class ComponentSolver:
         self._move_on(np.sort(self._index(links)), whole)
         return sorted(self._graphs.values(), key=lambda graph: (-len(graph.nodes), graph.anchor))
 
-    def worst(self) -> tuple[Link | None, float]:
-        """The link that holds and strains most, and by how much: chi-square with 3 degrees of freedom."""
-        strains = self._table.take(self._active).strains(self._means)
-        if not len(strains):
-            return None, 0.0
-        worst = int(strains.argmax())
-        return self._links[self._active[worst]], float(strains[worst])
-
     def graph_of(self, node: NodeId) -> PoseGraph:
         """The component of a node, as it was solved last."""
         return self._graphs[int(self._labels[self._row[node]])]
