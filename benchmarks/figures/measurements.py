@@ -16,7 +16,7 @@ MEASUREMENTS: dict[str, str] = {
     "relocalize": "python -m benchmarks.relocalize --nodes 1000 100000 --no-peer --ceilings --seed 708 "
     "--json",
     "merge": "python -m benchmarks.merge --runs 6 --seed 709 --json",
-    "merge_scale": "python -m benchmarks.merge --scale 1000 10000 --seed 710 --json",
+    "merge_scale": "python -m benchmarks.merge --scale 10000 --seed 710 --json",
     "merge_sim": "python -m benchmarks.merge_sim --scenarios office warehouse --runs 1 --seed 712 --json",
     "kitti_two": "mapweave eval merge DATA/kitti03 --robots 2 --json",
     "kitti_three": "mapweave eval merge DATA/kitti03 --robots 3 --json",

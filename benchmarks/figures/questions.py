@@ -205,15 +205,15 @@ MERGING = Question(
             "none",
         ),
         Row(
-            "a new node with its merges, among 1 000 and 10 000 nodes, processor time: verification, a merge "
-            "after five nodes",
-            "{scale/cpu_ms_per_node/1000:.0f}, {scale/cpu_ms_per_node/10000:.0f} ms; "
-            "{scale/cpu_ms_per_merge/1000:.0f}, {scale/cpu_ms_per_merge/10000:.0f} ms",
+            "a map of 10 000 nodes grows, processor time: a new node, verified; a merge after five nodes",
+            "{scale/cpu_ms_per_node/10000:.0f} ms; {scale/cpu_ms_per_merge/10000:.0f} ms",
             "merge_scale",
             "a node at most 50 ms",
         ),
         Row(
-            "false links there", "{scale/false_links/1000:.0f}, {scale/false_links/10000:.0f}", "merge_scale"
+            "false links there; memory of the server",
+            "{scale/false_links/10000:.0f} of {scale/links/10000:.0f}; {scale/rss_mb/10000:.0f} MB",
+            "merge_scale",
         ),
         Row(
             "simulated office, from the first image to the merged map: false links, wrong joins, error",
@@ -260,4 +260,98 @@ LIFE = Question(
 )
 QUESTIONS = (FILTERS, DRIVING, LANDMARKS, LOST, MERGING, LIFE)
 
-RULES: tuple[Rule, ...] = ()
+
+def _fleets(rule: str) -> tuple[str, str]:
+    """What comes of fleets without a rule, and with all."""
+    good, falsely, good_all, falsely_all = (
+        ", ".join(f"{{fleets/{way}/{share}/{figure}}}" for share in (50, 80, 90))
+        for way in (rule, "all rules")
+        for figure in ("good", "joined_falsely")
+    )
+    words = (
+        f"fleets with 50, 80, 90 % false links that are as good as with the true ones: {good} instead of "
+        f"{good_all}; joined falsely: {falsely} instead of {falsely_all}"
+    )
+    return words, "rules_fleets"
+
+
+def _trials(rule: str, scenario: str) -> tuple[str, str]:
+    """What comes of simulated trials without a rule, and with all."""
+    found, whole = (
+        f"{{trials/{scenario}/{way}/false_links}} of {{trials/{scenario}/{way}/links}}"
+        for way in (rule, "all rules")
+    )
+    return f"{scenario}: false links {found} instead of {whole}", "rules_trials"
+
+
+def _places(rule: str) -> tuple[str, str]:
+    """What lost robots are told without a rule, and with all."""
+    told = (
+        "{places/WAY/wrong/twins:.1%} of twin rooms, {places/WAY/wrong/nowhere:.1%} of unknown buildings, "
+        "recall {places/WAY/recall_at_1:.1%}"
+    )
+    words = f"told a place: {told.replace('WAY', rule)} instead of {told.replace('WAY', 'all rules')}"
+    return words, "rules_places"
+
+
+RULES = (
+    Rule(
+        "independent support",
+        "merge/outlier_rejection/independent_support.py",
+        (_fleets("independent support"),),
+    ),
+    Rule(
+        "support beyond chance",
+        "merge/outlier_rejection/independent_support.py",
+        (_fleets("chance support"),),
+    ),
+    Rule("dominance", "merge/outlier_rejection/pairwise_consistency.py", (_fleets("dominance"),)),
+    Rule(
+        "refused links heard again",
+        "merge/outlier_rejection/agglomerative_joining.py",
+        (
+            (
+                "share of true links kept at 50, 80, 90 % false links: "
+                + ", ".join(
+                    f"{{fleets/refused links heard again/{share}/recall:.3f}}" for share in (50, 80, 90)
+                )
+                + " instead of "
+                + ", ".join(f"{{fleets/all rules/{share}/recall:.3f}}" for share in (50, 80, 90)),
+                "rules_fleets",
+            ),
+        ),
+    ),
+    Rule(
+        "readmission",
+        "merge/outlier_rejection/readmission.py",
+        (
+            (
+                "chi-square over the optimum of Manhattan in four: {graphs/readmission/manhattan:.3f} "
+                "instead of {graphs/all rules/manhattan:.6f}",
+                "rules_graphs",
+            ),
+        ),
+    ),
+    Rule(
+        "mutual exclusion",
+        "merge/mutual_exclusion/",
+        (_trials("mutual exclusion", "twin-corridor"), _trials("mutual exclusion", "warehouse")),
+    ),
+    Rule(
+        "aliased regions",
+        "mapserver/relocalization/aliased_regions.py",
+        (_places("aliased regions"),),
+    ),
+    Rule(
+        "wrong geometry",
+        "merge/outlier_rejection/wrong_geometry.py",
+        (
+            (
+                "right answers to lost robots: {rule_off/right} instead of {with_the_map/right}; fleets "
+                "whose sound maps are in pieces: {rule_off/in_pieces} instead of {with_the_map/in_pieces} of "
+                "{with_the_map/fleets}",
+                "wrong_geometry",
+            ),
+        ),
+    ),
+)
