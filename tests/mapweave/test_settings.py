@@ -136,17 +136,18 @@ def test_the_merge_too_can_be_written_down_and_chosen(tmp_path):
     default = MergeSettings()
     assert merging(tmp_path, "") == default
     assert merging(tmp_path, as_toml({"merge": dataclasses.asdict(default)})) == default
-    chosen = merging(tmp_path, "[merge]\nstrain = 16.0\n[merge.consistency]\nleast_links = 3")
+    chosen = merging(tmp_path, "[merge.exclusion]\ndoubt = 0.01\n[merge.consistency]\nleast_links = 3")
     consistency = dataclasses.replace(default.consistency, least_links=3)
-    assert chosen == dataclasses.replace(default, strain=16.0, consistency=consistency)
+    exclusion = dataclasses.replace(default.exclusion, doubt=0.01)
+    assert chosen == dataclasses.replace(default, exclusion=exclusion, consistency=consistency)
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("merge = 3", "merge: must be a table"),
-        ("[merge]\nstrains = 9.0", "merge: no setting 'strains'; did you mean 'strain'?"),
-        ("[merge]\nstrain = 'much'", "merge: strain: 'much' is no float"),
+        ("[merge]\nexclusions = 9.0", "merge: no setting 'exclusions'; did you mean 'exclusion'?"),
+        ("[merge.exclusion]\ndoubt = 'much'", "merge: exclusion: doubt: 'much' is no float"),
         ("[merge.consistency]\nleast_links = 1.5", "merge: consistency: least_links: 1.5 is no int"),
     ],
 )

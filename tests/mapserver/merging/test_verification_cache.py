@@ -19,6 +19,7 @@ from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, Verificat
 from mapweave.mapserver.merging.verification_cache_file import load, save
 from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX, VerificationCacheKeeper
 from mapweave.merge.merging import MergeSettings
+from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
@@ -166,7 +167,7 @@ def test_what_is_damaged_is_made_anew(
     settings = {
         "verification": MergerSettings(verification=VerificationSettings(most_sigma_xy=0.15)),
         # What large islands had decided was decided by other rules.
-        "merging": MergerSettings(merging=MergeSettings(strain=20.0)),
+        "merging": MergerSettings(merging=MergeSettings(exclusion=ExclusionSettings(doubt=0.01))),
     }
     merger = Merger(None, settings.get(damage))
     with caplog.at_level(logging.INFO):
