@@ -17,14 +17,15 @@ MEASUREMENTS: dict[str, str] = {
     "--json",
     "merge": "python -m benchmarks.merge --runs 6 --seed 709 --json",
     "merge_scale": "python -m benchmarks.merge --scale 10000 --seed 710 --json",
-    "merge_sim": "python -m benchmarks.merge_sim --scenarios office warehouse --runs 1 --seed 712 --json",
+    "merge_sim": "python -m benchmarks.merge_sim --scenarios office --runs 1 --seed 712 --json",
     "kitti_two": "mapweave eval merge DATA/kitti03 --robots 2 --json",
     "kitti_three": "mapweave eval merge DATA/kitti03 --robots 3 --json",
     "rules_fleets": "python -m benchmarks.rules --fleets 30 --seed 721 --json",
     "rules_graphs": "python -m benchmarks.rules --g2o DATA/posegraph/intel.g2o DATA/posegraph/manhattan.g2o "
     "--json",
     "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",
+    "rules_corridors": "python -m benchmarks.rules --trials twin-corridor --runs 3 --seed 724 --json",
     "rules_places": "python -m benchmarks.rules --places 1000 --seed 708 --json",
-    "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --seed 723 --json",
+    "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room --seed 723 --json",
     "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
 }
