@@ -25,7 +25,7 @@ def clearance(
         description: footprint and rangers.
         proximity: (K,) m from the robot's edge.
         direction: rad, 0 ahead, positive to the left.
-        unknown: what is returned if no ranger looks that way.
+        unknown: returned if no ranger points that way.
     """
     bearings, radius = np.array(description.ranger_bearings), description.radius
     if not len(bearings) or len(proximity) != len(bearings):

@@ -48,7 +48,7 @@ def decode_mission(payload: bytes) -> Mission:
 
 
 class FleetClient:
-    """Runs beside the robot's loop; nothing here makes the loop wait, unless it asks to."""
+    """Runs beside the robot's loop, which never waits for it unless it asks to."""
 
     def __init__(
         self,
@@ -102,15 +102,15 @@ class FleetClient:
         return out
 
     def server_in_reach(self) -> bool:
-        """Whether the map server can hear and be heard now, as far as is known."""
+        """Whether the map server is known to be reachable in both directions."""
         return self._server_alive and self._bus.connected()
 
     def report(self, status: Status, stamp_ns: int, publish: bool = True) -> None:
-        """Tell people what the robot is doing: who asks, and, best effort, who listens.
+        """Publish the robot's status: on request and, best effort, to subscribers.
 
         Args:
             status: of the pipeline.
-            stamp_ns: time of the observation that it speaks of.
+            stamp_ns: time of the observation that it describes.
             publish: send it now; else only remember it for who asks.
         """
         self._status, self._stamp_ns = status, stamp_ns

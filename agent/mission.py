@@ -21,7 +21,7 @@ class Explore:
 
 @dataclass(frozen=True)
 class Carried:
-    """Map while somebody else moves the robot."""
+    """Map while a person moves the robot."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ class Answer:
 
     Attributes:
         number: of the question.
-        content: None when nobody answered.
-        error: what is known of the reason then.
+        content: None without an answer.
+        error: the reason then, if it is known.
         retry_after: seconds after which a server that was only busy may answer; else 0.
     """
 

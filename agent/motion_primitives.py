@@ -11,7 +11,7 @@ from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.pose import Pose2
 
 Behaviour = Generator[Command, None, None]
-NO_ANSWER = "nobody answered: is the map server up?"
+NO_ANSWER = "no answer: is the map server running?"
 
 
 class MotionPrimitives:
@@ -25,12 +25,12 @@ class MotionPrimitives:
     """
 
     def __init__(self, description: RobotDescription, patience: int = 0) -> None:
-        """Take the body.
+        """Take the robot's description.
 
         Args:
             description: of the robot.
-            patience: ticks that an answer may take before the question counts as lost; a robot that asks
-                nobody needs none.
+            patience: ticks that an answer may take before the question counts as lost; unused by a robot
+                that asks no questions.
         """
         self.odom_from_robot = Pose2()
         self.now = self.way = self.turned = 0.0
@@ -71,7 +71,7 @@ class MotionPrimitives:
     def ask(self, question: Question) -> Generator[Command, None, Answer]:
         """Ask the fleet's map, and stand until the answer comes or is overdue.
 
-        A server that is busy says when it will not be, and is asked again then.
+        A busy server says when to ask again.
         """
         self._questions.append(question)
         answer, again = Answer(question.number, None, NO_ANSWER), math.inf

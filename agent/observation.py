@@ -86,8 +86,8 @@ class RobotDescription:
         max_forward: speed limit, m/s; 0 if the robot is carried and takes no commands.
         max_turn: rate limit, rad/s.
         tick: time between two observations, s.
-        clock: name of the clock that observations are stamped by, if other robots' are stamped by the same
-            (a network time to well under a second, a simulator); empty if nobody knows.
+        clock: name of the clock of the stamps, if other robots' stamps have the same (a network time to well
+            under a second, a simulator); empty if unknown.
     """
 
     camera: Camera

@@ -1,4 +1,4 @@
-"""The floor as the proximity sensors saw it: where the robot may drive, and where it has not looked yet."""
+"""Occupancy grid of the proximity sensors: where the robot may drive, and what is unknown."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class OccupancyGridSettings:
 
 
 RAYS = 48
-"""Directions in which a look around is tried."""
+"""Rays of a full turn."""
 
 
 class OccupancyGrid:
@@ -87,17 +87,17 @@ class OccupancyGrid:
         s, radius = self._settings, self._description.radius
         angles = map_from_robot.heading + self._bearings
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        here = np.array([map_from_robot.x, map_from_robot.y])
+        origin = np.array([map_from_robot.x, map_from_robot.y])
         ends = proximity + radius
         along = self._steps[None, :] < (ends - 0.5 * s.cell)[:, None]
-        points = here + directions[:, None, :] * self._steps[None, :, None]
+        points = origin + directions[:, None, :] * self._steps[None, :, None]
         free = np.unique(self.cells(points[along]), axis=0)
         hits = proximity < self._description.ranger_reach - 0.05
-        ended = np.unique(self.cells(here + directions[hits] * ends[hits, None]), axis=0)
+        ended = np.unique(self.cells(origin + directions[hits] * ends[hits, None]), axis=0)
         self._odds[free[:, 0], free[:, 1]] -= MISS
         self._odds[ended[:, 0], ended[:, 1]] += OCCUPANCY_GRID_HIT + MISS
-        # Where the robot stands there is nothing.
-        own = self.cells(here + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
+        # The robot's own footprint is free.
+        own = self.cells(origin + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
         self._odds[own[:, 0], own[:, 1]] = -MOST
         np.clip(self._odds, -MOST, MOST, out=self._odds)
 
@@ -115,29 +115,29 @@ class OccupancyGrid:
     def _enough(self) -> float:
         return self._description.radius + self._settings.clearance
 
-    def unknown_around(self, radius: float, told: Array) -> Array:
+    def unknown_around(self, radius: float, covered: Array) -> Array:
         """For each cell the share of unknown cells around it: how much is to be seen from there.
 
         Args:
-            radius: half the side of the square that is looked at, m.
-            told: (N, 2) m in map; somebody else knows the floor within the radius of these.
+            radius: half the side of the square, m.
+            covered: (N, 2) m in map; others know the floor within the radius of these.
         """
-        unknown = self._unknown(told, radius)
+        unknown = self._unknown(covered, radius)
         side = 2 * round(radius / self._settings.cell) + 1
         return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
 
-    def unknown_in_sight(self, points: Array, told: Array, known: float, reach: float) -> Array:
+    def unknown_in_sight(self, points: Array, covered: Array, radius: float, reach: float) -> Array:
         """How much unknown floor would be seen from each of some points, looking all around, (N,) m^2.
 
         What was seen to be occupied hides what is behind it; unknown floor hides nothing.
 
         Args:
             points: (N, 2) m in map.
-            told: (M, 2) m in map; somebody else knows the floor around these.
-            known: up to this far, m.
+            covered: (M, 2) m in map; others know the floor around these.
+            radius: of that floor, m.
             reach: how far one can see, m.
         """
-        cell, unknown, hidden = self._settings.cell, self._unknown(told, known), self._odds > 0.3
+        cell, unknown, hidden = self._settings.cell, self._unknown(covered, radius), self._odds > 0.3
         angles = np.arange(RAYS) * (math.tau / RAYS)
         along = np.arange(0.5 * cell, reach, cell)
         ray = along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
@@ -145,14 +145,14 @@ class OccupancyGrid:
         areas = np.zeros(len(points))
         for k, point in enumerate(points):
             at = self.cells(point + ray)
-            seen = ~np.logical_or.accumulate(hidden[at[..., 0], at[..., 1]], axis=1)
-            areas[k] = (unknown[at[..., 0], at[..., 1]] * seen * pieces).sum()
+            visible = ~np.logical_or.accumulate(hidden[at[..., 0], at[..., 1]], axis=1)
+            areas[k] = (unknown[at[..., 0], at[..., 1]] * visible * pieces).sum()
         return areas
 
-    def _unknown(self, told: Array, radius: float) -> NDArray[np.float32]:
+    def _unknown(self, covered: Array, radius: float) -> NDArray[np.float32]:
         """1 where a cell is unknown and none of (N, 2) points in map is within the radius (m), else 0."""
         unknown = (np.abs(self._odds) <= 0.3).astype(np.float32)
-        for row, column in self.cells(told):
+        for row, column in self.cells(covered):
             cv2.circle(unknown, (int(column), int(row)), round(radius / self._settings.cell), 0.0, -1)
         return unknown
 
@@ -171,21 +171,21 @@ class OccupancyGrid:
         queue: list[tuple[float, tuple[int, int]]] = [(0.0, (first[0], first[1]))]
         room = self.room()
         while queue:
-            so_far, cell = heapq.heappop(queue)
-            if so_far > cost[cell] or so_far > reach:
+            distance, cell = heapq.heappop(queue)
+            if distance > cost[cell] or distance > reach:
                 continue
             for dx, dy in _NEIGHBOURS:
-                there = (cell[0] + dx, cell[1] + dy)
-                if not (0 <= there[0] < drivable.shape[0] and 0 <= there[1] < drivable.shape[1]):
+                neighbour = (cell[0] + dx, cell[1] + dy)
+                if not (0 <= neighbour[0] < drivable.shape[0] and 0 <= neighbour[1] < drivable.shape[1]):
                     continue
                 # Close to something already, the robot may still leave it, but come no closer.
-                if not drivable[there] and (drivable[cell] or room[there] < max(room[cell], 0.05)):
+                if not drivable[neighbour] and (drivable[cell] or room[neighbour] < max(room[cell], 0.05)):
                     continue
-                further = so_far + self._settings.cell * math.hypot(dx, dy)
-                if further < cost.get(there, math.inf):
-                    cost[there] = further
-                    before[there] = cell
-                    heapq.heappush(queue, (further, there))
+                further = distance + self._settings.cell * math.hypot(dx, dy)
+                if further < cost.get(neighbour, math.inf):
+                    cost[neighbour] = further
+                    before[neighbour] = cell
+                    heapq.heappush(queue, (further, neighbour))
         return DistanceField(self, drivable, cost, before)
 
 
@@ -223,13 +223,13 @@ class DistanceField:
             chain.append(at)
         chain.reverse()
         corners: list[Array] = []
-        here = 0
-        while here < len(chain) - 1:
-            there = len(chain) - 1
-            while there > here + 1 and not self._straight(chain[here], chain[there]):
-                there -= 1
-            corners.append(self._floor.centre(chain[there]))
-            here = there
+        first = 0
+        while first < len(chain) - 1:
+            last = len(chain) - 1
+            while last > first + 1 and not self._straight(chain[first], chain[last]):
+                last -= 1
+            corners.append(self._floor.centre(chain[last]))
+            first = last
         return corners
 
     def _straight(self, a: tuple[int, int], b: tuple[int, int]) -> bool:

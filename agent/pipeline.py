@@ -62,14 +62,14 @@ class Status:
         detail: why, or how far.
         nodes: nodes of the own map.
         tracked: features tracked in the image.
-        map_from_robot: where the robot believes to be in its own map while mapping.
+        map_from_robot: estimated pose in its own map while mapping.
         finished: whether the mission is complete.
         mission: its name.
         fix_node: the node that the robot knows itself by while navigating.
         node_from_robot: pose in that node's frame.
         legs: nodes on the first route of the drive, beginning and goal included.
         lost: whether it has given up to find itself on its own map: a fresh map must be begun.
-        astray: whether it looks for a place of its own map; `map_from_robot` then means nothing.
+        astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
         tally: what the drive was made of so far.
     """
 
@@ -122,7 +122,7 @@ class Pipeline:
 
         Args:
             map_id: of the map.
-            description: the body.
+            description: of the robot.
             settings: of the parts.
             contents: of the map, as `Journal.resume` gives it.
             next_number: the first that no node or edge of the map has ever had.
@@ -158,7 +158,7 @@ class Pipeline:
     def lost(self) -> bool:
         """Whether the robot shall map and has given up to find itself on its own map.
 
-        It stands still then. Whoever runs it may begin a fresh map, in a new pipeline; another `set_mission`
+        It stands still then. The caller may begin a new map, in a new pipeline; another `set_mission`
         lets it try again.
         """
         return self._resumption is not None and self._resumption.lost
@@ -195,7 +195,7 @@ class Pipeline:
         self._rangers.see(observation.proximity)
         match self._mission:
             case Idle() if self._mapper.started:
-                # Whoever goes on mapping later needs to know what the wheels did meanwhile.
+                # Mapping that goes on later needs the motion of the wheels until then.
                 self._keep_up(observation)
             case Explore() | Carried() if self._mapper.astray:
                 command = self._resume(observation)
@@ -213,7 +213,7 @@ class Pipeline:
 
     @property
     def _blind(self) -> str:
-        """Why a robot that drives by itself must stand, by its rangers; empty if it may drive."""
+        """Why the rangers forbid an autonomous robot to drive; empty if it may."""
         return self._rangers.fault if isinstance(self._mission, Explore | GoTo) else ""
 
     def _new_explorer(self) -> Explorer:
@@ -248,10 +248,10 @@ class Pipeline:
                 self._description, self._sift, self.map, drives, settings.resumption, settings.seed
             )
         command = self._resumption.step(observation, bool(self._blind))
-        found, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
-        if found is None:
+        recognized, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
+        if recognized is None:
             return command
-        self._mapper.resume(observation, found.features, found.node, found.recognition)
+        self._mapper.resume(observation, recognized.features, recognized.node, recognized.recognition)
         map_from_odom = self._mapper.map_from_robot.mean @ odom_from_robot.inverse()
         for odom_from_then, proximity in self._resumption.seen:
             self._floor.see(map_from_odom @ odom_from_then, proximity)

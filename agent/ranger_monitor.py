@@ -1,4 +1,4 @@
-"""Whether the proximity sensors that a robot promises are read: without them nothing tells free room."""
+"""Whether the proximity sensors that a robot promises are read: without them free room is unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot's loop: sense, think, act. The only place where body, mind and fleet meet."""
+"""The robot's loop: sense, plan, act. Connects the driver, the pipeline and the fleet."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REPORT_EVERY = 5
 
 
 class Runner:
-    """Runs one robot until its body ends, it is told to stop, or it must begin a fresh map."""
+    """Runs one robot until its driver ends, it is stopped, or it must begin a new map."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Runner:
         self._answers = self._synchronization.answers(self._fleet)
 
     def run(self, robot: Robot, stop: threading.Event) -> int:
-        """Loop until the body has no more observations, `stop` is set or the pipeline wants a fresh map.
+        """Loop until there are no more observations, `stop` is set or the pipeline requests a new map.
 
         Returns:
             How many ticks were run.

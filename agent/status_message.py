@@ -1,4 +1,4 @@
-"""What an agent says of itself, as a message: for people, and for trials."""
+"""An agent's status as a message: for people, and for scenarios."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class AgentStatus:
     """A status as others receive it.
 
     Attributes:
-        status: what the agent says of itself.
-        stamp_ns: time of the observation that it speaks of.
+        status: of the agent.
+        stamp_ns: time of the observation that it describes.
         epoch: of the map that it makes.
         unsent: changes that no server has on its disk yet.
         traffic: bytes that it has sent and received over the fleet's network since it began.
@@ -83,7 +83,7 @@ def encode_agent_status(report: AgentStatus) -> bytes:
 
 
 def _one_line(text: str) -> str:
-    """Text as a record can hold it: a status may quote whatever a server or a driver has said."""
+    """Text as a record can hold it: a status may quote the text of a server or a driver."""
     return "".join(c if c.isprintable() else " " for c in text)[:MAX_WORDS]
 
 

@@ -60,7 +60,7 @@ class FreeRunning:
 
 
 class Lockstep:
-    """Simulated time stands still until disk, server and answers have come, however slow the machine is."""
+    """Simulated time stops until disk, server and answers are done, however slow the machine is."""
 
     answer_timeout = LOCKSTEP_PATIENCE
 
@@ -77,7 +77,7 @@ class Lockstep:
         saved = replicator.flush(LOCKSTEP_PATIENCE)
         if saved and fleet.server_in_reach():
             saved = replicator.wait_acknowledged(LOCKSTEP_PATIENCE)
-            # A network that went away meanwhile belongs to the scenario and is no reason to complain.
+            # A network failure in between is part of the scenario and is not reported.
             saved = saved or not fleet.server_in_reach()
         if not saved:
             log.warning(

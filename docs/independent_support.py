@@ -85,7 +85,7 @@ def panel(axes: Axes, title: str, pairs: Sequence[tuple[int, int]], offset: int,
     axes.text(
         0.0,
         -3.3,
-        f"{len(pairs)} links agree, {support.witnesses:.0f} independent\n"
+        f"{len(pairs)} links agree, {support.places:.0f} independent\n"
         f"false sets as good, expected: {expected:.2g}  →  {verdict}",
         fontsize=9,
         va="top",

@@ -15,7 +15,7 @@ from mapweave.hybridmap.pose import Array
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Intrinsics and mount of an ideal (undistorted) camera that looks along the robot's x axis.
+    """Intrinsics and mount of an ideal (undistorted) camera that faces along the robot's x axis.
 
     Frames: robot is x forward, y left, z up with its origin on the floor below the middle of the axle;
     camera is x right, y down, z forward. Pixels are undistorted: lens distortion is removed where images
@@ -29,7 +29,7 @@ class Camera:
         cx: principal point, px.
         cy: principal point, px.
         mount_height: height of the optical centre above the floor, m.
-        mount_forward: how far the optical centre stands ahead of the axle, m.
+        mount_forward: distance of the optical centre ahead of the axle, m.
     """
 
     width: int

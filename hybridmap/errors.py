@@ -26,7 +26,7 @@ class DeviceError(MapweaveError):
 
 
 class NotConnected(MapweaveError):
-    """No router, or nobody answers."""
+    """No router, or no answer."""
 
 
 class Busy(MapweaveError):
@@ -37,6 +37,6 @@ class Busy(MapweaveError):
     """
 
     def __init__(self, retry_after: float) -> None:
-        """Say when."""
+        """Take the time until the next attempt."""
         super().__init__(f"busy, retry after {retry_after:.1f} s")
         self.retry_after = retry_after

@@ -22,9 +22,9 @@ class Standing(StrEnum):
     REFUSED = "refused"
     """Compared, and not linked."""
     UNDONE = "undone"
-    """A person has ruled so."""
+    """A manual constraint."""
     UNCOMPARED = "not compared"
-    """Other pairs look more alike; the numbers come from a comparison that was made for the explanation."""
+    """Other pairs are more similar; the numbers come from a comparison made for the explanation."""
 
 
 DOUBLES = "doubles"
@@ -56,10 +56,10 @@ class Misfit:
     """How far a link is from where the merged map has put its nodes.
 
     Attributes:
-        merged_a_from_b: where b stands in a by everything that is joined.
+        merged_a_from_b: pose of b in a in the merged map.
         off: (3,) m, m, rad: from the link's b to the merged one, in the link's b.
         strain2: `off` in the link's own uncertainty, chi-square with 3 degrees of freedom.
-        alone: whether nothing but this link says how the two stand to each other.
+        alone: whether only this link connects the two.
     """
 
     merged_a_from_b: PoseGaussian
@@ -77,7 +77,7 @@ class PairExplanation:
         b: the greater id.
         standing: what has become of them.
         reason: in words.
-        matches: (M, 2) int64, landmarks of a and of b that look alike, each the other's best.
+        matches: (M, 2) int64, mutually best matches of the landmarks of a and of b.
         shared: (K, 2) int64, of these, those that agree on one pose.
         residuals_px: (K,) px, how far these are from where the pose predicts them (NaN: behind the image).
         a_from_b: the pose that the landmarks give; None if they agree on none.
@@ -86,9 +86,9 @@ class PairExplanation:
             without a pose, or where nothing joins the two.
         misfit: against the merged map; None if nothing joins the two.
         witnesses: other links between the same two pieces of map.
-        claims: what the robots themselves say of the two by their edges, whether the servo could drive them,
-            and which of the two another node stands for; one sentence each.
-        rulings: what people have ruled about these two or their maps, in order.
+        claims: what the robots' own edges say about the two, whether the servo could drive them, and which of
+            the two is superseded; one sentence each.
+        rulings: manual constraints on these two or their maps, in order.
     """
 
     a: Node
@@ -114,9 +114,9 @@ class NearMiss:
     Attributes:
         a: node of the first map.
         b: node of the second.
-        matches: landmarks that look alike.
+        matches: matched landmarks.
         inliers: of these, those that agree on the best pose.
-        lacks: what it lacks, in words; of a link that stands, whether routes may use it.
+        lacks: what it lacks, in words; of an accepted link, whether routes may use it.
     """
 
     a: NodeId
@@ -138,10 +138,10 @@ class MapsExplanation:
         links: between the two.
         landmarks: behind these.
         refused: links that were found and refused.
-        unverified: pairs that looked alike and showed no common pose.
+        unverified: candidate pairs without a common pose.
         nearest: pairs that came nearest to a link, best first; of links that were refused, then of others. Of
             two maps that are one the links with the fewest landmarks behind them, weakest first.
-        rulings: what people have ruled about the two maps, in order.
+        rulings: manual constraints on the two maps, in order.
     """
 
     first: MapId
@@ -163,8 +163,8 @@ class Hop:
     Attributes:
         a: from here.
         b: to there.
-        kind: of the edge, see mapweave.hybridmap.node.EdgeKind; `near` if the two stand in one place,
-            `superseded` if one stands for the other.
+        kind: of the edge, see mapweave.hybridmap.node.EdgeKind; `near` if the two are at one place,
+            `superseded` if one is superseded by the other.
         distance: m, between the two.
         turn: rad, between their headings, signed.
         cost: what it adds to the cost of a route, m.
@@ -190,9 +190,9 @@ class RouteExplanation:
         found: whether there is a way.
         reason: in words.
         hops: of the way, in order.
-        gaps: what robots cannot, or should not, drive. Of a way that is found: on the cheapest one if all
-            could be driven; of one that is not: on the one that lacks least. Empty if nothing better is
-            known, or if nothing joins the two.
+        gaps: what robots cannot, or should not, drive. Of a route: on the cheapest way if all could be
+            driven; without a route: on the way that lacks least. Empty if there is no better way, or if
+            nothing connects the two.
         apart: of two maps that would have to be one first; of several, those that came nearest to it.
     """
 

@@ -1,4 +1,4 @@
-"""Kernels: NumPy code that numba compiles where it is installed, and that runs as it stands elsewhere.
+"""Kernels: NumPy code that numba compiles where it is installed, and that runs uncompiled elsewhere.
 
     @for_each
     def square(n: Index, rows: Matrix, out: Vector) -> None:
@@ -10,12 +10,12 @@
         square(len(rows), rows, out)
         return np.sqrt(out)
 
-What is computed alike for each of many is written once, for number n, and called with how many there are.
-numba loops over n; without it n is a slice, all of them, and each operation is one on arrays. So such a
-function has masks in place of branches.
+What is computed for each of many is written once, for number n, and called with their count. numba loops over
+n; without it n is a slice, all of them, and each operation is one on arrays. So such a function has masks in
+place of branches.
 
 A kernel is compiled by `load` or when it is first called, for the types that its annotations name, and kept
-on disk beside its module. To see whether what was kept still holds, numba looks at that one file: a kernel
+on disk next to its module. numba checks only that file for changes: a kernel
 uses only constants, and calls only kernels, of its own module.
 """
 

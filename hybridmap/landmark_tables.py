@@ -1,7 +1,7 @@
 """The fixed tables of compact landmarks: how SIFT is projected and rounded, and how often which step occurs.
 
 They are part of the wire format: every robot and server of a fleet must hold the same ones. They are made by
-`python -m benchmarks.train_descriptor --write` and carry a version, which stands in every message.
+`python -m benchmarks.train_descriptor --write` and carry a version, which every message contains.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FILE = "landmarks_v2.npz"
 
 @dataclass(frozen=True, eq=False)
 class LandmarkTables:
-    """What turns SIFT and depths into small whole numbers, and says how many bits those cost.
+    """Quantization of SIFT descriptors and depths to small integers, and the bits that those cost.
 
     Attributes:
         mean: (128,) float32, mean RootSIFT descriptor.

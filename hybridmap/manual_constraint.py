@@ -1,4 +1,4 @@
-"""Rulings: what a person has decided of links and maps, against or again with what the robots saw."""
+"""Manual constraints: decisions of a person on links and maps, which override the robots' measurements."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ManualConstraint:
     Attributes:
         ends: what it is about. Of two maps it holds for every link between them, also for those to come. The
             same map twice: the map is retired, and takes no part in anything.
-        apart: whether they shall not be linked; False takes back what was ruled before.
+        apart: whether they shall not be linked; False withdraws an earlier constraint.
         who: has decided.
         stamp_ns: when, wall time since 1970.
         because: why, in that one's words; may be empty.
@@ -47,7 +47,7 @@ class ManualConstraint:
         """
         first, second = sorted(self.ends)
         if len(first) != len(second) or (first == second and isinstance(first, NodeId)):
-            raise InvalidValue("a ruling needs two different nodes, or two maps")
+            raise InvalidValue("a manual constraint needs two different nodes, or two maps")
         for words in (self.who, self.because):
             if len(words) > MOST_WORDS or not words.isprintable():
                 raise InvalidValue(f"who and why must be one printable line, at most {MOST_WORDS} characters")
@@ -61,12 +61,12 @@ class ManualConstraint:
 
 
 class ManualConstraints:
-    """All rulings in the order in which they were made; of those about the same ends the last holds."""
+    """All manual constraints in the order of their dates; for the same ends the last holds."""
 
     def __init__(self, made: Iterable[ManualConstraint] = ()) -> None:
         """Take them over; the same one twice counts once."""
         self.made = tuple(dict.fromkeys(made))
-        self._last = {ruling.ends: ruling for ruling in self.made}
+        self._last = {constraint.ends: constraint for constraint in self.made}
 
     def __add__(self, other: ManualConstraints) -> ManualConstraints:
         """Both, by the time when they were made."""
@@ -81,34 +81,36 @@ class ManualConstraints:
 
     @property
     def retired(self) -> dict[MapId, ManualConstraint]:
-        """Maps that are retired, with the rulings that say so."""
-        return {one.retires: one for one in self.in_force if one.retires is not None}
+        """Retired maps, with the constraints that retire them."""
+        return {
+            constraint.retires: constraint for constraint in self.in_force if constraint.retires is not None
+        }
 
     def against(self, a: NodeId, b: NodeId) -> ManualConstraint | None:
-        """The ruling by which two nodes shall not be linked; None if there is none in force."""
+        """The constraint by which two nodes shall not be linked; None if there is none in force."""
         for ends in (_ordered(a, b), _ordered(a.map, b.map), (a.map, a.map), (b.map, b.map)):
-            found = self._last.get(ends)
-            if found is not None and found.apart:
-                return found
+            latest = self._last.get(ends)
+            if latest is not None and latest.apart:
+                return latest
         return None
 
     def about(self, first: NodeId | MapId, second: NodeId | MapId) -> tuple[ManualConstraint, ...]:
-        """Every ruling that was ever made of these two, or of the maps of these two nodes."""
+        """Every constraint on these two, or on the maps of these two nodes."""
         ends = [_ordered(first, second)]
-        maps = [one.map if isinstance(one, NodeId) else one for one in (first, second)]
-        ends += [_ordered(*maps), *((one, one) for one in maps)]
-        return tuple(ruling for ruling in self.made if ruling.ends in ends)
+        maps = [end.map if isinstance(end, NodeId) else end for end in (first, second)]
+        ends += [_ordered(*maps), *((end, end) for end in maps)]
+        return tuple(constraint for constraint in self.made if constraint.ends in ends)
 
 
-def reason_of(ruling: ManualConstraint) -> str:
+def reason_of(constraint: ManualConstraint) -> str:
     """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
-    when = datetime.fromtimestamp(ruling.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    first, second = ruling.ends
-    what = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
-    why = f': "{ruling.because}"' if ruling.because else ""
-    if ruling.retires is not None:
-        return f"map {ruling.retires} is retired by {ruling.who or 'somebody'} on {when}{why}"
-    return f"undone{what} by {ruling.who or 'somebody'} on {when}{why}"
+    when = datetime.fromtimestamp(constraint.stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    first, second = constraint.ends
+    scope = "" if isinstance(first, NodeId) else f" with all links between {first} and {second}"
+    why = f': "{constraint.because}"' if constraint.because else ""
+    if constraint.retires is not None:
+        return f"map {constraint.retires} is retired by {constraint.who or 'a person'} on {when}{why}"
+    return f"undone{scope} by {constraint.who or 'a person'} on {when}{why}"
 
 
 def read_ends(first: str, second: str) -> Ends:
@@ -117,12 +119,12 @@ def read_ends(first: str, second: str) -> Ends:
     Raises:
         InvalidValue: they are neither.
     """
-    one, other = read_end(first), read_end(second)
-    if isinstance(one, NodeId) and isinstance(other, NodeId):
-        return one, other
-    if isinstance(one, NodeId) or isinstance(other, NodeId):
+    a, b = read_end(first), read_end(second)
+    if isinstance(a, NodeId) and isinstance(b, NodeId):
+        return a, b
+    if isinstance(a, NodeId) or isinstance(b, NodeId):
         raise InvalidValue(f"{first} and {second} are a node and a map: {EXAMPLE}")
-    return one, other
+    return a, b
 
 
 def read_end(word: str) -> NodeId | MapId:

@@ -11,9 +11,9 @@ class MapEventKind(StrEnum):
 
     JOINED = "joined"
     PARTED = "parted"
-    """What was one map is no longer; the words say what took its links away."""
+    """A component has split; the words say what removed its links."""
     KEPT_APART = "kept apart"
-    """Links between two maps were found, and refused: two robots cannot have been where they say."""
+    """Links between two maps were found, and refused: they put two robots in one place."""
     SET_APART = "set apart"
     """The merge fails with a map, and is made without it; or it is taken in again."""
     RULED = "ruled"

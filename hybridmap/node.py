@@ -26,7 +26,7 @@ UNMEASURED_SCALE = 0.2
 that is known worse than to 0.25, and some of a drive's are always known much better."""
 
 HELD_TILT = 0.02
-"""rad; where nobody measured the scale the camera was held by hand, and neither level nor at its height."""
+"""rad; without a measured scale the camera was hand-held, neither level nor at its height."""
 
 LEAST_DEPTH_SHARE = 0.03
 """What a depth is off by alone, as a share of it, where what it shares with the others is taken apart: the
@@ -41,7 +41,7 @@ NUMBER = re.compile(r"[0-9]{1,20}")
 
 
 def check_name(name: str) -> str:
-    """Return the name, or raise InvalidValue if it cannot stand in a key."""
+    """Return the name, or raise InvalidValue if it cannot be part of a key."""
     if not NAME.fullmatch(name):
         raise InvalidValue(f"name {name!r}: use 1 to 32 of a-z, 0-9, '-' and '_'")
     return name
@@ -129,7 +129,7 @@ class Landmarks:
 
     @cached_property
     def scale_share(self) -> float:
-        """Share by which all depths may be off together, as they are where nobody has measured the scale.
+        """Common relative error of all depths, as of a map whose scale was not measured.
 
         A drive knows it by the wheels, so that some depths are known well. Photographs leave it open: there
         the best known depth is as uncertain as the scale.
@@ -198,9 +198,9 @@ class Node:
         camera: intrinsics and mount of the camera that took the image.
         landmarks: what is in the image.
         clock: what `stamp_ns` was read from. Times of two robots can be compared only if it is the same;
-            empty if nobody knows.
+            empty if unknown.
         radius: of the robot's footprint, m: two robots are never nearer to each other than both of theirs. 0
-            if nobody knows.
+            if unknown.
         ranges: what the proximity sensors saw from there at that time; empty if it has none.
         wake: where the robot was before and after, and what the same sensors saw there.
     """
@@ -255,7 +255,7 @@ class Edge:
     """The robot can servo between two nodes.
 
     Attributes:
-        id: of the agent (or server) that says so.
+        id: of the agent (or server) that made it.
         a: one end.
         b: the other end; for edges within a map the later node.
         a_from_b: pose of b's robot frame in a's.
@@ -274,5 +274,5 @@ class Edge:
 
     @property
     def within(self) -> bool:
-        """Whether it joins two nodes of the very map that tells it."""
+        """Whether it joins two nodes of the map that it belongs to."""
         return self.a[:2] == self.b[:2] == self.id[:2]

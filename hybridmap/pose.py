@@ -22,7 +22,7 @@ def wrap_angle(angle: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Pose2:
-    """A pose in the plane: where frame b stands in frame a. Name it `a_from_b`.
+    """A pose in the plane: pose of frame b in frame a. Name it `a_from_b`.
 
     Attributes:
         x: m, in a.
@@ -171,8 +171,8 @@ def _is_covariance(*p: float) -> bool:
 def averaged(poses: Sequence[PoseGaussian]) -> PoseGaussian:
     """One pose from several estimates of it, each weighted by its information.
 
-    The covariance is the estimates' own on average: what they err by alike does not average out, and how much
-    that is nobody knows.
+    The covariance is the mean of the estimates' own: their common errors do not average out, and their size
+    is unknown.
 
     Args:
         poses: at least one, near to each other.

@@ -1,12 +1,12 @@
 """The grid on which landmarks are kept and sent: pixels, depths and their uncertainty as small whole numbers.
 
-A robot rounds a node's landmarks when it makes the node (`settle`), so it works with the very numbers that
-everybody else will get, and they stand in the order in which they cost least: by rows.
+A robot rounds a node's landmarks when it makes the node (`settle`), so it works with the same numbers as all
+receivers, and stores them in the order that costs least: by rows.
 
     x, y     steps of 1/8 px, or what fits into 16 bits, from half an image left of and above the image
     share    0: depth not known; else sigma = depth * SHARE_LEAST * exp((share - 1) / 8)
     depth    whole steps from 1 cm in its logarithm, 4 * 2^k to a factor of e; k is the least with steps of at
-             most a third of sigma / depth. What nobody knows need not be kept
+             most a third of sigma / depth. An uncertain depth needs fewer bits
 
 Errors: pixel half a step, sigma 6.5 % of itself, depth a sixth of its sigma at most, a tenth on average.
 """
@@ -126,17 +126,17 @@ def round_depths(depths: NDArray[Any], sigmas: NDArray[Any]) -> tuple[NDArray[np
     depths, sigmas = np.asarray(depths, np.float64), np.asarray(sigmas, np.float64)
     if (depths <= 0).any():
         raise InvalidValue("landmarks: a depth is not positive")
-    known = (depths >= DEPTH_LEAST) & (depths < DEPTH_MOST)
-    some, spread = depths[known], sigmas[known]
+    measured = (depths >= DEPTH_LEAST) & (depths < DEPTH_MOST)
+    some, spread = depths[measured], sigmas[measured]
     if not (np.isfinite(spread) & (spread >= 0)).all():
         raise InvalidValue("landmarks: a depth has no finite sigma")
     share, depth = np.zeros(len(depths), np.int64), np.zeros(len(depths), np.int64)
     with np.errstate(divide="ignore"):
         steps = 1 + np.rint(SHARES_PER_E * np.log(spread / some / SHARE_LEAST))
-    share[known] = np.clip(steps, 1, SYMBOLS - 1).astype(np.int64)
-    steps_a_cell = 1 << FINE_BITS[share[known]]
+    share[measured] = np.clip(steps, 1, SYMBOLS - 1).astype(np.int64)
+    steps_a_cell = 1 << FINE_BITS[share[measured]]
     steps = np.floor(np.log(some / DEPTH_LEAST) * CELLS_PER_E * steps_a_cell)
-    depth[known] = np.clip(steps, 0, CELLS * steps_a_cell - 1).astype(np.int64)
+    depth[measured] = np.clip(steps, 0, CELLS * steps_a_cell - 1).astype(np.int64)
     return share, depth
 
 
@@ -160,13 +160,13 @@ def round_landmarks(landmarks: Landmarks, camera: Camera) -> QuantizedLandmarks:
 
 
 def restore_landmarks(rounded: QuantizedLandmarks, codes: NDArray[np.uint8], camera: Camera) -> Landmarks:
-    """What everybody has of rounded landmarks."""
+    """Rounded landmarks as all receivers have them."""
     pixels = PixelGrid.of(camera).restore(rounded.x, rounded.y)
     return Landmarks(pixels, codes, *restore_depths(rounded.share, rounded.depth))
 
 
 def snap(landmarks: Landmarks, camera: Camera) -> Landmarks:
-    """Landmarks as everybody will have them, in the order in which edges refer to them.
+    """Landmarks as all receivers will have them, in the order in which edges refer to them.
 
     Raises:
         InvalidValue: see `round_landmarks`.

@@ -33,11 +33,11 @@ class View:
 
 
 class Certainty(StrEnum):
-    """What a relocalization says of itself."""
+    """Certainty of a relocalization."""
 
     FOUND = "found"
     PLACE = "place"
-    """The place is known, but not how far from its node the view was taken: nobody has measured its scale."""
+    """The place is known, but not how far from its node the view was taken: its scale was not measured."""
     AMBIGUOUS = "ambiguous"
     UNKNOWN = "unknown"
 
@@ -53,7 +53,7 @@ class Whereabouts:
         component: number of the node's component in the merged map.
         inliers: landmarks that agree.
         probability: that this place is the right one, 0 to 1.
-        distance_known: if not, nobody has measured the node's scale, and the covariance says as much.
+        distance_known: if not, the node's scale was not measured, and the covariance includes that.
     """
 
     node: NodeId
@@ -67,7 +67,7 @@ class Whereabouts:
 
 @dataclass(frozen=True, eq=False)
 class RelocalizeAnswer:
-    """Where a view was taken: candidates best first, and a reason in words whatever the outcome."""
+    """Where a view was taken: candidates best first, and the reason of the outcome, in words."""
 
     certainty: Certainty
     candidates: tuple[Whereabouts, ...]
@@ -102,9 +102,9 @@ class KnownAnswer:
     """What others have mapped around a position of a robot's own map.
 
     Attributes:
-        views: (N, 4) [x m, y m, heading rad, horizontal semi-aperture rad], in the map that was asked about:
-            from where, into which direction and how widely the others' nodes look, nearest first.
-        reason: in words, whatever the outcome.
+        views: (N, 4) [x m, y m, heading rad, horizontal semi-aperture rad], in the map of the question: the
+            other robots' nodes and their fields of view, nearest first.
+        reason: of the outcome, in words.
     """
 
     views: Array

@@ -1,4 +1,4 @@
-"""Reachability: which edges the servo could drive, and which only say how two nodes stand to each other.
+"""Reachability: which edges the servo could drive, and which only give the relative pose of two nodes.
 
 An edge that a robot drove or turned along while its landmarks were followed can be driven again. One that was
 only recognised may join two views of one thing from the two sides of a room. The servo holds on to the
@@ -25,14 +25,14 @@ FARTHEST = 2.5
 WIDEST = math.radians(45.0)
 """Rad, between their headings."""
 LEAST = 7
-"""Common landmarks that stay in view: as many as a look for the next node asks for; the servo itself holds
-on to four."""
+"""Common landmarks that stay in view: as many as the detection of the next node needs; the servo itself needs
+four."""
 STOPS = 9
 """Poses on the way at which is counted."""
 
 
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
-"""Edges that say that two nodes show the same, and not that anybody drove from one to the other."""
+"""Edges by which two nodes show the same landmarks, without a drive from one to the other."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Reachability:
 
     Attributes:
         drivable: whether routes may use it.
-        in_view: fewest common landmarks in view on the way; -1 for an edge that was driven: nobody counts.
+        in_view: fewest common landmarks in view on the way; -1 for an edge that was driven: not counted.
         reason: in words.
     """
 
@@ -58,7 +58,7 @@ class Reachability:
 def reachability_of(
     edge: Edge, a: Node, b: Node, settings: ReachabilitySettings | None = None
 ) -> Reachability:
-    """Say whether the servo could drive an edge, in either direction: what is in view there is so back.
+    """Whether the servo could drive an edge, in either direction: the same landmarks are in view both ways.
 
     Args:
         edge: between the two.
@@ -100,18 +100,18 @@ def closed_edges(hybrid_map: HybridMap, settings: ReachabilitySettings | None = 
 
 
 def left(
-    shared: NDArray[np.int64], a: Node, b: Node, gone: Sequence[NDArray[np.bool_] | None] = (None, None)
+    shared: NDArray[np.int64], a: Node, b: Node, faded: Sequence[NDArray[np.bool_] | None] = (None, None)
 ) -> NDArray[np.int64]:
-    """(K, 2) of common landmarks those that both nodes have: one may have been put anew with fewer.
+    """(K, 2) of common landmarks those that both nodes have: one may have been written again with fewer.
 
     Args:
         shared: landmarks of a and of b that are the same.
         a: one node.
         b: the other.
-        gone: which landmarks of a and of b are thought to be gone.
+        faded: which landmarks of a and of b are faded.
     """
     out: NDArray[np.int64] = shared[(shared < [len(a.landmarks), len(b.landmarks)]).all(axis=1)]
-    for side, mask in enumerate(gone):
+    for side, mask in enumerate(faded):
         if mask is not None:
             out = out[~mask[out[:, side]]]
     return out
@@ -127,7 +127,7 @@ def least_in_view(shared: NDArray[np.int64], a: Node, b: Node, a_from_b: Pose2, 
         shared: (K, 2) landmarks of a and of b that are the same.
         a: one node.
         b: the other.
-        a_from_b: how they stand.
+        a_from_b: relative pose.
         stops: poses, the ends among them.
     """
     if not len(shared):
@@ -136,7 +136,7 @@ def least_in_view(shared: NDArray[np.int64], a: Node, b: Node, a_from_b: Pose2, 
     share = np.linspace(0.0, 1.0, stops)
     poses = share[:, None] * a_from_b.vector
     seen = _visible(poses, points, a.camera) & _visible(poses, points, b.camera)
-    # What a node sees it sees, wherever noise puts the point.
+    # What a node has seen is visible there, wherever noise puts the point.
     seen[[0, -1]] = True
     return int((seen | np.isnan(points[:, 0])).sum(axis=1).min())
 
@@ -148,7 +148,7 @@ def common_points(shared: NDArray[np.int64], a: Node, b: Node, a_from_b: Pose2) 
         shared: (K, 2) landmarks of a and of b that are the same.
         a: one node.
         b: the other.
-        a_from_b: how they stand.
+        a_from_b: relative pose.
     """
     in_a, in_b = a.landmarks.take(shared[:, 0]), b.landmarks.take(shared[:, 1])
     by_a, by_b = in_a.points_in_robot(a.camera), a_from_b.apply(in_b.points_in_robot(b.camera))

@@ -1,4 +1,4 @@
-"""Reachability that was worked out before: an edge is looked at once, however many maps it comes in."""
+"""Cache of reachability: an edge is evaluated once, however many merged maps contain it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mapweave.hybridmap.reachability import Reachability, ReachabilitySettings, 
 
 
 class ReachabilityCache:
-    """What was found out of edges, from merged map to merged map: an edge is looked at once."""
+    """Keeps the reachability of edges from merged map to merged map."""
 
     def __init__(self, settings: ReachabilitySettings | None = None) -> None:
         """Start with nothing known.
@@ -22,25 +22,25 @@ class ReachabilityCache:
             settings: what the servo manages.
         """
         self._settings = settings or ReachabilitySettings()
-        self._known: dict[EdgeId, tuple[tuple[object, ...], Reachability]] = {}
+        self._cache: dict[EdgeId, tuple[tuple[object, ...], Reachability]] = {}
 
-    def reach(self, edge: Edge, a: Node, b: Node, gone: Sequence[NDArray[np.bool_] | None]) -> Reachability:
+    def reach(self, edge: Edge, a: Node, b: Node, faded: Sequence[NDArray[np.bool_] | None]) -> Reachability:
         """Whether the servo could drive an edge.
 
         Args:
             edge: between the two.
             a: node at the edge's a.
             b: node at its b.
-            gone: which landmarks of a and of b are thought to be gone: these hold no servo.
+            faded: which landmarks of a and of b are faded: the servo cannot use them.
         """
-        behind = (edge.a_from_b, a, b, *gone)
-        known = self._known.get(edge.id)
-        if known is None or any(one is not other for one, other in zip(known[0], behind, strict=True)):
-            seen = replace(edge, shared=left(edge.shared, a, b, gone))
-            known = behind, reachability_of(seen, a, b, self._settings)
-            self._known[edge.id] = known
-        return known[1]
+        behind = (edge.a_from_b, a, b, *faded)
+        cached = self._cache.get(edge.id)
+        if cached is None or any(old is not new for old, new in zip(cached[0], behind, strict=True)):
+            visible_edge = replace(edge, shared=left(edge.shared, a, b, faded))
+            cached = behind, reachability_of(visible_edge, a, b, self._settings)
+            self._cache[edge.id] = cached
+        return cached[1]
 
     def forget(self, but: Container[EdgeId]) -> None:
-        """Forget what is known of all edges but some."""
-        self._known = {edge_id: known for edge_id, known in self._known.items() if edge_id in but}
+        """Forget all edges but some."""
+        self._cache = {edge_id: entry for edge_id, entry in self._cache.items() if edge_id in but}

@@ -22,7 +22,7 @@ class RouteSettings:
         per_edge: each hop means one more recognition and one more approach.
         per_turn: a radian between the headings of two nodes.
         per_undriven: 1/m; an edge that was recognised but never driven costs more by its length times
-            this: something may stand in between, as a wall does where a room is seen through its door.
+            this: there may be an obstacle in between, as a wall where a room is seen through its door.
     """
 
     per_edge: float = 0.02
@@ -38,7 +38,7 @@ class Route:
         nodes: from start to goal; empty if there is no way.
         edges: one fewer, that lead from each node to the next.
         cost: of the whole way, m.
-        reason: in words, whatever the outcome.
+        reason: of the outcome, in words.
     """
 
     nodes: tuple[NodeId, ...]
@@ -63,8 +63,8 @@ class Ways:
     ) -> None:
         """Take a map; the arguments are those of `find_route`.
 
-        With a toll also the pairs are passed that are blocked, or that nobody could drive; it is what each
-        costs besides, m. The cheapest way then tells what stands in the way.
+        With a toll the search also passes pairs that are blocked or cannot be driven; each costs the toll in
+        addition, m. The cheapest way then shows what is in the way.
         """
         s = settings or RouteSettings()
         self._map = hybrid_map
@@ -74,7 +74,7 @@ class Ways:
         self._places = poses if poses is not None else _own_poses(hybrid_map)
         self._barred = {frozenset(pair) for pair in blocked}
         self._graph: nx.Graph = nx.Graph()
-        # In the order of ids, so that among ways of equal cost the same one is found whatever came first.
+        # In the order of ids, so that of ways of equal cost the same one is found in any order of insertion.
         for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
             barred = frozenset((edge.a, edge.b)) in self._barred
             if edge.a == edge.b or (barred and toll is None):
@@ -110,7 +110,11 @@ class Ways:
     def _cheapest(self, hop: Mapping[str, Any]) -> tuple[float, EdgeId] | None:
         """The cheapest open edge between two nodes; whether one is closed is asked only on the way."""
         choices = sorted(hop["choices"], key=lambda choice: choice[0])
-        free = None if hop["barred"] else next((one for one in choices if one[1] not in self._closed), None)
+        free = (
+            None
+            if hop["barred"]
+            else next((option for option in choices if option[1] not in self._closed), None)
+        )
         if free is None and self._toll is not None:
             cost, edge_id = choices[0]
             return cost + self._toll, edge_id
@@ -151,7 +155,7 @@ def find_route(
 
     An edge costs the Euclidean distance of its two nodes, as in the paper, by `poses`; the heuristic is
     the distance to the goal by the same poses, so it is admissible and consistent by the triangle
-    inequality, whatever is added. Where no poses are given, each node's own pose in its map is used;
+    inequality, with any additional cost. Where no poses are given, each node's own pose in its map is used;
     between nodes of two maps, whose frames have nothing in common, the heuristic is then zero and a link
     costs the distance that it measured.
 
@@ -162,7 +166,7 @@ def find_route(
         poses: all in one frame; nodes without one cannot be on the way.
         penalties: extra cost of edges, m; not negative, negative ones count as none.
         blocked: pairs of nodes, in either order, between which the robot cannot drive.
-        closed: edges that nobody could drive: they only say how nodes stand to each other, see
+        closed: edges that cannot be driven: they only give relative poses, see
             mapweave.hybridmap.reachability.
         settings: what a way costs.
 

@@ -1,4 +1,4 @@
-"""Superseded nodes: newer ones of the same place stand for them."""
+"""Superseded nodes: newer ones of the same place replace them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Superseded:
     """Why a node is no longer needed.
 
     Attributes:
-        by: the newer node that stands for it.
+        by: the newer node that replaces it.
         found: landmarks of the old node that were found again from the new one and stay in view between them.
         distance: m, between the two.
         turn: rad, between their headings.
@@ -25,7 +25,7 @@ class Superseded:
     turn: float
 
     def __str__(self) -> str:
-        """For example `r1.1.5 stands for it, 0.31 m off and turned by 12 degrees, with 34 landmarks`."""
+        """For example `r1.1.5 replaces it, 0.31 m off and turned by 12 degrees, with 34 landmarks`."""
         turned = f"turned by {math.degrees(self.turn):.0f} degrees"
         where = f"{self.distance:.2f} m off and {turned}"
-        return f"{self.by} stands for it, {where}, with {self.found} landmarks"
+        return f"{self.by} replaces it, {where}, with {self.found} landmarks"

@@ -1,4 +1,4 @@
-"""Wakes: where a robot was on its way past a node, and what its proximity sensors saw there."""
+"""Trajectory segments: where a robot was around a node, and what its proximity sensors saw there."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
 
 MOST = 24
-"""Moments of one wake."""
+"""Moments of one segment."""
 LONGEST = 300.0
-"""s; nothing longer ago or ahead belongs to a node's wake."""
+"""s; a segment covers no more time before or after its node."""
 FURTHEST = 30.0
 """m; nor anything further away."""
 
@@ -41,12 +41,12 @@ class TrajectorySegment:
         k = len(self.ages)
         shapes = (np.shape(self.ages), np.shape(self.node_from_robot), np.shape(self.distances)[:1])
         if shapes != ((k,), (k, 3), (k,)) or np.ndim(self.distances) != 2 or k > MOST:
-            raise InvalidValue(f"wake: shapes {shapes} do not belong together, or more than {MOST} moments")
+            raise InvalidValue(f"trajectory: shapes {shapes} do not agree, or more than {MOST} moments")
         if not (np.abs(self.ages) <= LONGEST).all() or (np.diff(self.ages) < 0.0).any():
-            raise InvalidValue(f"wake: ages do not ascend, or are beyond {LONGEST:g} s")
+            raise InvalidValue(f"trajectory: ages do not ascend, or are beyond {LONGEST:g} s")
         near = np.abs(self.node_from_robot[:, :2]) <= FURTHEST
         if not (near.all() and np.isfinite(self.node_from_robot).all()):
-            raise InvalidValue(f"wake: a pose is no number, or further away than {FURTHEST:g} m")
+            raise InvalidValue(f"trajectory: a pose is no number, or further away than {FURTHEST:g} m")
 
     def __len__(self) -> int:
         """How many moments."""

@@ -1,4 +1,4 @@
-"""The living places: what questions are answered from, of all that the server knows."""
+"""The active nodes, from which questions are answered."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ActiveNodes:
     """The place index without superseded and misplaced nodes and maps retired or set apart, and nodes
     without what has faded.
 
-    It stands for one merged map; make another for the next. New nodes are compared with all of the index.
+    It belongs to one merged map; make another for the next. New nodes are compared with the whole index.
     """
 
     def __init__(
@@ -28,31 +28,31 @@ class ActiveNodes:
         merged: MergedMap,
         set_apart: Iterable[NodeId] = (),
     ) -> None:
-        """Take what is known.
+        """Take a merged map and the index.
 
         Args:
-            index: of all nodes, also of such as are not in the merged map yet.
-            node_of: gives a node by its id as its robot told it.
-            merged: says what is superseded, retired, set apart or faded.
+            index: of all nodes, also of those not in the merged map yet.
+            node_of: gives a node by its id as its robot sent it.
+            merged: with the superseded, retired, set apart and faded.
             set_apart: the nodes of maps that are set apart.
         """
         self._index, self._node_of, self._merged = index, node_of, merged
         self._left_out = frozenset((*merged.rulings.retired, *merged.set_apart))
-        left_out = (node for one in self._left_out if one in merged.maps for node in merged.maps[one].nodes)
-        self._gone = frozenset((*left_out, *set_apart, *_misplaced(merged), *_out_of_range(merged)))
-        self._hidden = self._gone.union(merged.superseded)
+        left_out = (
+            node for map_id in self._left_out if map_id in merged.maps for node in merged.maps[map_id].nodes
+        )
+        self._inactive = frozenset((*left_out, *set_apart, *_misplaced(merged), *_out_of_range(merged)))
+        self._hidden = self._inactive.union(merged.superseded)
 
     def query(self, view: View, k: int = 5) -> list[tuple[NodeId, float]]:
-        """At most k living nodes with how much they look like a view, best first."""
+        """At most k active nodes with their similarity to a view, best first."""
         ranked = self._index.query(view, k, exclude=self._hidden)
         # A retired map's robot may have mapped on.
         return [(node, score) for node, score in ranked if node.map not in self._left_out]
 
     def node(self, node_id: NodeId) -> Node | None:
-        """A node with the landmarks that are thought to be there; None if it is gone, or nothing is told of
-        it.
-        """
-        if node_id in self._gone or node_id.map in self._left_out:
+        """A node without its faded landmarks; None if it is inactive or unknown."""
+        if node_id in self._inactive or node_id.map in self._left_out:
             return None
         known = self._node_of(node_id)
         return None if known is None else bounded(without_faded(known, self._merged))
@@ -61,8 +61,8 @@ class ActiveNodes:
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
     """Nodes of maps with wrong geometry that show places of other maps.
 
-    Each is the same place as the node that it is linked to, seen by a robot that has it elsewhere: no second
-    place that a robot could be at. What such a map knows alone is told as before.
+    Each is at the same place as the node that it is linked to, seen by a robot whose map has it elsewhere: it
+    is no second place where a robot could be. Unlinked nodes of such a map are still used.
     """
     for refusal in merged.refused if merged.wrong else ():
         if refusal.link is not None and not refusal.link.within:
@@ -72,7 +72,7 @@ def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
 
 
 def _out_of_range(merged: MergedMap) -> Iterator[NodeId]:
-    """Nodes that lie where no robot can be. Where the origin of a frame is says nothing; distances do."""
+    """Nodes further away than robots drive. A frame's origin is arbitrary, so distances decide."""
     for graph in merged.graphs:
         # Written so that NaN is out of range.
         away = np.abs(graph.means[:, :2] - np.median(graph.means[:, :2], axis=0))
@@ -81,9 +81,9 @@ def _out_of_range(merged: MergedMap) -> Iterator[NodeId]:
 
 
 def without_faded(node: Node, merged: MergedMap) -> Node:
-    """A node with the landmarks that are thought to be there: the very same one if all are."""
+    """A node without its faded landmarks: the same object if there are none."""
     faded = merged.faded.get(node.id)
-    # A node that has been put anew since then is taken as it is.
+    # A node that was written again since then is taken as it is.
     if faded is None or len(faded) != len(node.landmarks):
         return node
     return replace(node, landmarks=node.landmarks.take(~faded))

@@ -1,4 +1,4 @@
-"""Workers for questions that take long. Whoever would wait too long is told at once when to come again."""
+"""Workers for long questions. A question that would wait too long is refused with a time to retry."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mapweave.hybridmap.errors import Busy, SettingsError
 LATENESS = 0.5
 """Who comes so much after or before the appointment still has it, s: the way there and back takes time."""
 MOST_BOOKED = 1024
-"""Appointments that are kept in mind; beyond, nobody has precedence."""
+"""Retry appointments that are kept; beyond this number there is no precedence."""
 
 _T = TypeVar("_T")
 
@@ -76,7 +76,7 @@ class AdmissionControl:
 
         Args:
             settings: how many, and what is too long.
-            clock: tells the time, s.
+            clock: the time, s.
             executor: does the work; threads of its own if not given. It is shut down with this.
         """
         self._settings = settings or AdmissionSettings()
@@ -98,7 +98,7 @@ class AdmissionControl:
             work: to be done.
             ticket: the same when the same question comes again, and hardly ever that of another one; without
                 one it never has precedence.
-            usual: whether it takes as long as other questions do: else the desk learns nothing of it.
+            usual: whether it takes as long as other questions do: else its duration is not recorded.
 
         Returns:
             Its result, or what it raised, some time later; Busy if it has waited too long.
@@ -138,7 +138,7 @@ class AdmissionControl:
         return max(self._open - workers + 1, 0) * self._seconds / workers
 
     def _keeps_appointment(self, ticket: int | None, now: float) -> bool:
-        """Whether somebody comes when told, give or take. Who does not come in time has lost the place."""
+        """Whether a ticket comes at its appointment, within `LATENESS`. A late one loses its precedence."""
         late = [one for one, due in self._booked.items() if due < now - LATENESS]
         for one in late:
             del self._booked[one]
@@ -153,9 +153,9 @@ class AdmissionControl:
         return soon * self._seconds / self._settings.workers
 
     def _next_appointment(self, wait: float, ticket: int | None, again: bool) -> float:
-        """In how many seconds somebody may come again: when the queue is half empty, behind all others.
+        """In how many seconds to retry: when the queue is half empty, after all others.
 
-        Who has come in vain when told, or was taken on in vain, need not go to the end once more.
+        A ticket that was refused at its appointment need not go to the end again.
         """
         s, now = self._settings, self._clock()
         due = now + max(wait - 0.5 * s.in_time, 0.0) + self._seconds / s.workers

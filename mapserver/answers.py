@@ -16,13 +16,13 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """Never changed, only replaced: whoever answers keeps what it began with, whatever is merged meanwhile.
+    """Never changed, only replaced: an answer uses one merged map from beginning to end.
 
     Attributes:
         merged: the map.
-        relocalizer: says where a view was taken.
-        router: says how to get somewhere.
-        known: says what others have mapped.
+        relocalizer: finds where a view was taken.
+        router: finds routes.
+        known: what others have mapped.
     """
 
     merged: MergedMap
@@ -33,7 +33,7 @@ class Answers:
     @classmethod
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
         """Answers from a merged map; nodes that are newer, of which `node_of` knows, lie nowhere yet."""
-        set_apart = [node for one in merged.set_apart for node in merger.maps[one].nodes]
+        set_apart = [node for map_id in merged.set_apart for node in merger.maps[map_id].nodes]
         places = ActiveNodes(merger.index, node_of, merged, set_apart)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Coverage(merged))

@@ -1,4 +1,4 @@
-"""Ways that robots could not drive, kept for the others: whoever asks for a route is led around them."""
+"""Edges that robots could not drive: routes of other robots avoid them."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ class BlockageSettings:
 
 
 class Blockages:
-    """Pairs of nodes between which some robot did not get through, with when it said so. For any thread.
+    """Pairs of nodes between which some robot did not get through, with the time of its report. Thread-safe.
 
-    A robot says it in the question for its next route. That robot bars the pair for itself; for all others
-    it is only dear: what stood in one robot's way may have gone, and need not be in another's.
+    A robot reports it with the question for its next route. That robot bars the pair for itself; for all
+    others
+    it only costs more: one robot's obstacle may have moved, and need not be in another's way.
     """
 
     def __init__(self, settings: BlockageSettings | None = None) -> None:
         """Nothing is blocked."""
         self._settings = settings or BlockageSettings()
-        self._said: dict[Pair, float] = {}
+        self._reported: dict[Pair, float] = {}
         self._turn = threading.Lock()
 
     def report(self, pairs: Collection[Pair], now: float) -> None:
@@ -47,14 +48,14 @@ class Blockages:
         with self._turn:
             for a, b in pairs:
                 pair = (a, b) if a <= b else (b, a)
-                self._said.pop(pair, None)
-                self._said[pair] = now
-            while len(self._said) > self._settings.most:
-                del self._said[next(iter(self._said))]
+                self._reported.pop(pair, None)
+                self._reported[pair] = now
+            while len(self._reported) > self._settings.most:
+                del self._reported[next(iter(self._reported))]
 
     def known(self, now: float) -> list[Pair]:
         """What still counts at a time of the server's clock, s."""
         forget = self._settings.forget
         with self._turn:
-            self._said = {pair: said for pair, said in self._said.items() if now - said < forget}
-            return list(self._said)
+            self._reported = {pair: stamp for pair, stamp in self._reported.items() if now - stamp < forget}
+            return list(self._reported)

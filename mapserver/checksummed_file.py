@@ -1,6 +1,6 @@
 """Files of arrays with a digest at the end: read whole and undamaged, or not at all.
 
-a line that says what it is, arrays in NumPy's format ..., SHA-256 of all before
+a line with its kind, arrays in NumPy's format ..., SHA-256 of all before
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def unseal(path: Path, magic: bytes) -> Iterator[NDArray[Any]]:
         raise InvalidFile(f"{path}: cannot be read ({error.strerror or error})") from None
     if not data.startswith(magic):
         raise InvalidFile(f"{path}: is something else")
-    body = memoryview(data)[:-DIGEST]
-    if len(data) < len(magic) + DIGEST or hashlib.sha256(body).digest() != data[-DIGEST:]:
+    content = memoryview(data)[:-DIGEST]
+    if len(data) < len(magic) + DIGEST or hashlib.sha256(content).digest() != data[-DIGEST:]:
         raise InvalidFile(f"{path}: is damaged or cut off")
-    return _arrays(io.BytesIO(body[len(magic) :]), len(body) - len(magic))
+    return _arrays(io.BytesIO(content[len(magic) :]), len(content) - len(magic))
 
 
 def _arrays(file: io.BytesIO, size: int) -> Iterator[NDArray[Any]]:

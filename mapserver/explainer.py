@@ -54,7 +54,7 @@ class RulingBook:
             try:
                 made.append(decode_ruling(body))
             except InvalidMessage as error:
-                log.error("a ruling cannot be read (%s); it is left out", error)
+                log.error("a manual constraint cannot be read (%s); it is left out", error)
         self._rulings = ManualConstraints(made)
 
     @property

@@ -1,4 +1,4 @@
-"""Merged maps as map files, and back: a file holds the parts, so that it can be explained or merged anew."""
+"""Merged maps as map files, and back: a file holds the parts, so that it can be explained or merged again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PROBABILITY = "probability"
 
 
 def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
-    """All that a merged map is: nodes, edges, links with their probabilities, refusals, rulings, poses.
+    """A whole merged map: nodes, edges, links with their probabilities, refusals, manual constraints, poses.
 
     Args:
         merged: the map.
@@ -57,15 +57,15 @@ def maps_of(content: MapFile) -> dict[MapId, HybridMap]:
     """The robots' own maps in a file, with what was refused of their edges; links are not theirs."""
     maps: dict[MapId, HybridMap] = {}
     refused = (EdgePut(r.edge) for r in content.refused if r.edge is not None)
-    for body in (*content.changes, *refused):
-        element = element_of(body)
-        if not (isinstance(body, EdgePut) and _is_link(body.edge)):
-            maps.setdefault(element.map, HybridMap()).apply(body)
+    for change in (*content.changes, *refused):
+        element = element_of(change)
+        if not (isinstance(change, EdgePut) and _is_link(change.edge)):
+            maps.setdefault(element.map, HybridMap()).apply(change)
     return maps
 
 
 def merged_of(content: MapFile, settings: MergeSettings | None = None) -> MergedMap:
-    """The merged map that a file holds: links and refusals as they are, poses and covariances solved anew.
+    """The merged map that a file holds: links and refusals as they are, poses and covariances solved again.
 
     Nothing is judged again, so a file is explained by what was decided when it was made.
 
@@ -77,13 +77,13 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         InvalidFile: its measurements determine no poses.
     """
     s = settings or MergeSettings()
-    maps, rulings = maps_of(content), ManualConstraints(content.rulings)
-    links = tuple(_links(body.edge for body in content.changes if isinstance(body, EdgePut)))
+    maps, constraints = maps_of(content), ManualConstraints(content.rulings)
+    links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
     try:
-        parts = fragments_of(apply_constraints(maps, (), rulings).maps, s.consistency)
+        parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)
         solved = ComponentSolver(parts).solve(links)
     except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
-        # The solver's RuntimeError says that a system is singular.
+        # The solver raises RuntimeError if a system is singular.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InvalidFile(f"the poses of this map cannot be solved ({reason})") from None
     poses = {
@@ -94,7 +94,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     refused = tuple(_refused(pair) for pair in content.refused)
     components = tuple(frozenset(graph.nodes) for graph in solved)
     superseded = {node: fate for node, fate in content.superseded.items() if node in poses}
-    faded = {node: gone for node, gone in content.faded.items() if node in poses}
+    faded = {node: mask for node, mask in content.faded.items() if node in poses}
     return MergedMap(
         dict(sorted(maps.items())),
         links,
@@ -102,7 +102,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         components,
         poses,
         tuple(solved),
-        rulings,
+        constraints,
         superseded,
         faded,
     )
@@ -113,12 +113,12 @@ def _is_link(edge: Edge) -> bool:
 
 
 def _links(edges: Iterable[Edge]) -> list[Link]:
-    found = []
+    links = []
     for edge in edges:
         if _is_link(edge):
             evidence = {name: value for name, value in edge.evidence.items() if name != PROBABILITY}
-            found.append(link_of(replace(edge, evidence=evidence)))
-    return sorted(found, key=lambda link: link.pair)
+            links.append(link_of(replace(edge, evidence=evidence)))
+    return sorted(links, key=lambda link: link.pair)
 
 
 def _edge(merged: MergedMap, refused: RefusedLink) -> Edge | None:

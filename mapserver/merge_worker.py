@@ -25,16 +25,16 @@ log = logging.getLogger(__name__)
 
 READ_AT_ONCE = 1024
 """Changes of a store that are taken in at once: while these are, the next are decoded."""
-LOOK_AT_ONCE = 20
-"""Nodes for which is looked what is like them, before what has come meanwhile is taken in."""
+SEARCHES_AT_ONCE = 20
+"""Nodes whose similar nodes are searched at once, before new changes are taken in."""
 PREPARED_AT_ONCE = 4
-"""Nodes of which is found out what they look like, likewise."""
+"""Nodes whose aliasing is evaluated at once, likewise."""
 MOST_WORDS = 1000
 """Characters of an event in a status message."""
 
 
 class MergeWorker:
-    """Merges beside the questions. Only its jobs touch the merger; new answers replace those before."""
+    """Merges in the background. Only its jobs touch the merger; new answers replace the old."""
 
     def __init__(
         self,
@@ -43,28 +43,28 @@ class MergeWorker:
         index: PlaceIndex | None = None,
         merge: MergeSettings | None = None,
         keeper: VerificationCacheKeeper | None = None,
-        chronicle: MapHistory | None = None,
+        history: MapHistory | None = None,
     ) -> None:
         """Begin with nothing.
 
         Args:
             schedule: runs the work, all of it one after the other.
-            share: at most this share of the time is spent making the merged map anew.
+            share: largest share of the time that is spent merging.
             index: is filled with the nodes that come; may have them already.
             merge: how maps are merged.
             keeper: of what comparing nodes has found.
-            chronicle: of what becomes of the maps.
+            history: records what joins and parts.
         """
         self._schedule = schedule
         self._keeper = keeper
-        self._chronicle = chronicle or MapHistory()
+        self._history = history or MapHistory()
         self._share = share
         self._merger = Merger(index, MergerSettings(merging=merge or MergeSettings()))
         self._fresh: dict[NodeId, Node] = {}
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._curious = False
         self._plight = ""
-        self._merger.suspect(self._chronicle.set_apart)
+        self._merger.suspect(self._history.set_apart)
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
         schedule.idle(self._idle)
@@ -77,7 +77,7 @@ class MergeWorker:
     @property
     def event(self) -> str:
         """What holds up merging; else the newest of what has become one map, or is no longer one, and why."""
-        return (self._plight or self._chronicle.newest)[:MOST_WORDS]
+        return (self._plight or self._history.newest)[:MOST_WORDS]
 
     @property
     def settled(self) -> bool:
@@ -97,8 +97,8 @@ class MergeWorker:
     def take(self, change: Change) -> None:
         """Take note of a change, in the order of its log. Returns at once.
 
-        A new place can be found from now on, however long a merge goes on: whoever merges takes the change in
-        when its turn comes, and what it makes of the index then is what holds.
+        A new place can be found from now on, however long a merge takes: the merging thread takes
+        the change in when its turn comes, and its result for the index is final.
         """
         self._schedule.observe(change.stamp_ns)
         if isinstance(change.body, NodePut):
@@ -128,9 +128,9 @@ class MergeWorker:
         self._schedule.catch_up()
         taken.wait()
 
-    def rule(self, rulings: ManualConstraints) -> None:
-        """Heed these rulings of people from now on, and no others. Returns at once."""
-        self._post(lambda: self._merger.rule(rulings))
+    def rule(self, constraints: ManualConstraints) -> None:
+        """Apply exactly these manual constraints from now on. Returns at once."""
+        self._post(lambda: self._merger.rule(constraints))
 
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
@@ -178,7 +178,7 @@ class MergeWorker:
         if self._reading or not (self._dirty or self._curious):
             return None
         if self._merger.uncompared:
-            self._look_around()
+            self._search_pairs()
             return 0.0
         began = self._schedule.monotonic()
         if self._dirty:
@@ -198,7 +198,7 @@ class MergeWorker:
     def _end_reading(self, taken: threading.Event) -> None:
         self._reading = False
         if self._merger.uncompared:
-            self._tell_apart()
+            self._publish_parts()
         taken.set()
 
     def _take(self, change: Change) -> None:
@@ -218,7 +218,7 @@ class MergeWorker:
     def _read(self, changes: list[Change]) -> None:
         try:
             self._merger.read((change.map, change.body) for change in changes)
-        except Exception:  # a log may be replayed: whatever is wrong with one change, the others are taken
+        except Exception:  # a log may be replayed: a defect in one change must not stop the others
             log.exception("the changes in the store are taken in one by one")
             for change in changes:
                 self._apply(change)
@@ -238,29 +238,29 @@ class MergeWorker:
         """A node, also one that is not with the merger yet."""
         return self._fresh.get(node_id) or self._merger.node(node_id)
 
-    def _look_around(self) -> None:
+    def _search_pairs(self) -> None:
         """A little of what comes before the first merge: it must not hold up what comes."""
         self._plight = f"{self._merger.uncompared} nodes are still to be compared with others"
         try:
-            self._merger.look_around(LOOK_AT_ONCE)
-        except Exception:  # the merge tries again, and says so if it cannot
+            self._merger.search_pairs(SEARCHES_AT_ONCE)
+        except Exception:  # the merge tries again, and reports if it cannot
             log.exception("nodes could not be compared")
             self._merge()
 
-    def _tell_apart(self) -> None:
+    def _publish_parts(self) -> None:
         """Answer from each map by itself, as its robot made it, until all are compared with each other."""
         try:
             self._answers = self._answers_from(self._merger.apart())
         except Exception:  # as below
-            log.exception("the maps could not be told of one by one")
+            log.exception("the maps could not be published one by one")
 
     def _prepare(self, most: int) -> None:
-        """Find out what nodes look like, so that who asks where he is need not wait for that."""
+        """Evaluate the aliasing of nodes in advance, so that relocalization need not wait for it."""
         self._curious = False
         try:
             self._curious = self._answers.relocalizer.prepare(most) > 0
-        except Exception:  # it is found out when somebody asks
-            log.exception("what nodes look like could not be found out beforehand")
+        except Exception:  # it is evaluated with the next question
+            log.exception("the aliasing of nodes could not be evaluated in advance")
 
     def _merge(self) -> None:
         self._dirty = False
@@ -269,14 +269,14 @@ class MergeWorker:
             merged = self._merger.merged(lambda merged: made.append(self._answers_from(merged)))
             self._answers = made[-1] if made else self._answers_from(merged)
         except Exception:  # questions are answered from the map before; the next change is the next chance
-            log.exception("the merged map could not be made anew")
-            self._plight = "the merged map could not be made anew: see the server's log"
-            self._chronicle.failed(self._plight)
+            log.exception("merging failed")
+            self._plight = "merging failed: see the server's log"
+            self._history.failed(self._plight)
             return
         finally:
             self._done = self._applied
         self._curious, self._plight = True, ""
         try:
-            self._chronicle.follow(merged)
+            self._history.follow(merged)
         except Exception:  # a defect here must not end all merging
-            log.exception("what has become of the maps could not be told")
+            log.exception("the history of the maps could not be written")

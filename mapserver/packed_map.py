@@ -1,4 +1,4 @@
-"""The whole merged map as a file: packed once for each merge, beside all other questions.
+"""The whole merged map as a file: packed once for each merge, in the background of all other questions.
 
 Packing 1000 nodes takes seconds, in which acknowledgements, routes and status messages must go on. A question
 that comes while it is packed waits for the one pack after it, so a crowd costs no more than two.
@@ -81,9 +81,9 @@ class PackedMap:
         self._packed = weakref.ref(merged, self._forget), history, data
         return data
 
-    def _forget(self, gone: weakref.ref[MergedMap]) -> None:
+    def _forget(self, reference: weakref.ref[MergedMap]) -> None:
         packed = self._packed
-        if packed is not None and packed[0] is gone:
+        if packed is not None and packed[0] is reference:
             self._packed = None
 
     def _work(self) -> None:

@@ -1,7 +1,7 @@
-"""Tells each agent where its nodes lie in the merged map, when that has changed noticeably.
+"""Publishes to each agent the merged poses of its nodes, when they have changed noticeably.
 
-An agent's own map stays as it is: its nodes keep their poses, and routes come as answers. What it is told
-here it keeps beside its map.
+An agent's own map stays as it is: its nodes keep their poses, and routes come as answers. It stores these
+poses beside its map.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
 DISTANCE = 0.05
-"""A node that lies less far from where its agent was told that it lies is not told anew, m."""
+"""A node that has moved less than this since it was last published is not published again, m."""
 TURN = math.radians(1.0)
 """And is turned by less, rad."""
 
@@ -45,8 +45,8 @@ class PoseBroadcastSettings:
 
 
 @dataclass
-class _Told:
-    """What one agent was told."""
+class _Published:
+    """What was published to one agent."""
 
     places: dict[NodeId, MergedPose] = field(default_factory=dict)
     sequence: int = 0
@@ -54,7 +54,7 @@ class _Told:
 
 
 class PoseBroadcast:
-    """Publishes news when it is bidden to, and gives all that it has told to whoever asks."""
+    """Publishes news on request, and answers questions with all published poses."""
 
     def __init__(
         self,
@@ -78,9 +78,9 @@ class PoseBroadcast:
         self._settings = settings or PoseBroadcastSettings()
         self._run = secrets.randbits(64)
         self._lock = threading.Lock()
-        self._told: dict[str, _Told] = {}
+        self._published: dict[str, _Published] = {}
         self._graphs: tuple[PoseGraph, ...] = ()
-        self._looked = -math.inf
+        self._checked_at = -math.inf
         self._serving = bus.serve(keys.all_poses(name), self._answer)
 
     def close(self) -> None:
@@ -88,68 +88,70 @@ class PoseBroadcast:
         self._serving.close()
 
     def tell(self, merged: MergedMap, now: float | None = None) -> None:
-        """Tell what has changed since it was told, if it is time.
+        """Publish what has changed since the last time, if it is due.
 
         Args:
             merged: the newest merged map.
             now: monotonic, s.
         """
         now = self._clock() if now is None else now
-        if now - self._looked < self._settings.every:
+        if now - self._checked_at < self._settings.every:
             return
-        self._looked = now
+        self._checked_at = now
         with self._lock:
             if merged.graphs != self._graphs:
-                self._tell_news(merged, now)
-            for agent, told in self._told.items():
-                if now - told.last >= self._settings.beat:
-                    self._send(agent, PoseNews(self._run, told.sequence, told.sequence), now)
+                self._publish_news(merged, now)
+            for agent, published in self._published.items():
+                if now - published.last >= self._settings.beat:
+                    self._send(agent, PoseNews(self._run, published.sequence, published.sequence), now)
 
-    def _tell_news(self, merged: MergedMap, now: float) -> None:
-        known, there = set(map(id, self._graphs)), set(map(id, merged.graphs))
-        gone = [
+    def _publish_news(self, merged: MergedMap, now: float) -> None:
+        before, now_solved = set(map(id, self._graphs)), set(map(id, merged.graphs))
+        removed = [
             node
             for graph in self._graphs
-            if id(graph) not in there
+            if id(graph) not in now_solved
             for node in graph.nodes
             if node not in merged.poses
         ]
-        moved = self._moved(graph for graph in merged.graphs if id(graph) not in known)
+        moved = self._moved(graph for graph in merged.graphs if id(graph) not in before)
         self._graphs = merged.graphs
         news: dict[str, tuple[dict[NodeId, MergedPose], list[NodeId]]] = {}
         for node, place in moved:
             news.setdefault(node.agent, ({}, []))[0][node] = place
-        for node in gone:
+        for node in removed:
             news.setdefault(node.agent, ({}, []))[1].append(node)
         for agent, (places, lost) in sorted(news.items()):
-            told = self._told.setdefault(agent, _Told())
+            published = self._published.setdefault(agent, _Published())
             rest, left = iter(places.items()), iter(lost)
             while True:
                 some = dict(islice(rest, self._settings.most))
                 less = tuple(islice(left, self._settings.most))
                 if not some and not less:
                     break
-                told.sequence += 1
-                told.places |= some
+                published.sequence += 1
+                published.places |= some
                 for node in less:
-                    told.places.pop(node, None)
-                self._send(agent, PoseNews(self._run, told.sequence - 1, told.sequence, some, less), now)
+                    published.places.pop(node, None)
+                self._send(
+                    agent, PoseNews(self._run, published.sequence - 1, published.sequence, some, less), now
+                )
 
     def _moved(self, graphs: Iterable[PoseGraph]) -> Iterator[tuple[NodeId, MergedPose]]:
-        """Nodes that lie noticeably elsewhere than where their agents were told that they lie."""
-        _s, nobody = self._settings, _Told()
+        """Nodes that have moved noticeably since they were published."""
+        _s, nothing = self._settings, _Published()
         for graph in graphs:
             for node, (x, y, heading) in zip(graph.nodes, graph.means.tolist(), strict=True):
-                before = self._told.get(node.agent, nobody).places.get(node)
+                before = self._published.get(node.agent, nothing).places.get(node)
                 if before is not None and before.frame == graph.anchor:
                     pose = before.merged_from_node
-                    near = math.hypot(x - pose.x, y - pose.y) <= DISTANCE
-                    if near and abs(wrap_angle(heading - pose.heading)) <= TURN:
+                    close = math.hypot(x - pose.x, y - pose.y) <= DISTANCE
+                    if close and abs(wrap_angle(heading - pose.heading)) <= TURN:
                         continue
                 yield node, MergedPose(graph.anchor, Pose2(x, y, heading))
 
     def _send(self, agent: str, news: PoseNews, now: float) -> None:
-        self._told[agent].last = now
+        self._published[agent].last = now
         self._bus.publish(self._keys.poses(self._name, agent), news.encode(agent))
 
     def _answer(self, request: Request) -> None:
@@ -158,5 +160,5 @@ class PoseBroadcast:
     def _whole(self, key: str) -> bytes:
         _, agent = self._keys.parse_poses(key)
         with self._lock:
-            told = self._told.get(agent, _Told())
-            return PoseNews(self._run, 0, told.sequence, dict(told.places)).encode(agent)
+            published = self._published.get(agent, _Published())
+            return PoseNews(self._run, 0, published.sequence, dict(published.places)).encode(agent)

@@ -1,4 +1,4 @@
-"""What routes may use of a merged map: which edges can be driven, and which nodes stand for their places."""
+"""What routes may use of a merged map: edges that can be driven, and active nodes."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 NEAR, SUCCESSION = IMPLIED = ("near", "superseded")
-"""Stand for the agents in the ids of edges that follow from where nodes are."""
+"""Take the agents' place in the ids of edges that follow from the nodes' poses."""
 Faded = Mapping[NodeId, NDArray[np.bool_]]
-"""Of each node which landmarks are thought to be gone."""
+"""Of each node which landmarks have faded."""
 
 
 class ClosedEdges(Collection[EdgeId]):
-    """Edges of a map that the servo could not drive; each is looked at when it is asked about."""
+    """Edges of a map that the servo could not drive; each is evaluated on demand."""
 
     def __init__(self, union: HybridMap, faded: Faded, book: ReachabilityCache) -> None:
         """Take a map.
 
         Args:
             union: nodes and edges.
-            faded: landmarks that are thought to be gone.
-            book: what is known already.
+            faded: faded landmarks.
+            book: cache of reachability.
         """
         self._union, self._faded, self._book = union, faded, book
 
@@ -42,15 +42,15 @@ class ClosedEdges(Collection[EdgeId]):
         nodes = self._union.nodes
         if edge.a not in nodes or edge.b not in nodes:
             return False
-        gone = self._faded.get(edge.a), self._faded.get(edge.b)
-        return not self._book.reach(edge, nodes[edge.a], nodes[edge.b], gone).drivable
+        faded = self._faded.get(edge.a), self._faded.get(edge.b)
+        return not self._book.reach(edge, nodes[edge.a], nodes[edge.b], faded).drivable
 
     def __iter__(self) -> Iterator[EdgeId]:
-        """All of them: looks at every edge."""
+        """All of them: evaluates every edge."""
         return (edge_id for edge_id in self._union.edges if edge_id in self)
 
     def __len__(self) -> int:
-        """How many: looks at every edge."""
+        """How many: evaluates every edge."""
         return sum(1 for _ in self)
 
 
@@ -59,45 +59,45 @@ class Roadmap:
 
     Attributes:
         merged: the map.
-        union: its nodes and edges. Besides, nodes that stand in one place are joined, whatever they show: a
-            robot can turn there. And every superseded node is joined with the one that stands for it.
+        union: its nodes and edges. In addition, nodes at one place are joined, whatever they show: a robot
+            can turn there. And every superseded node is joined with its successor.
         closed: edges that only tie poses.
         poses: of all nodes.
-        living: of those that no other node stands for.
+        living: of the active nodes.
     """
 
-    def __init__(self, merged: MergedMap, near: float, reaches: ReachabilityCache) -> None:
+    def __init__(self, merged: MergedMap, same_place: float, reaches: ReachabilityCache) -> None:
         """Take a merged map.
 
         Args:
             merged: the map.
-            near: nodes nearer than this to each other stand in one place, m.
-            reaches: what is known of edges.
+            same_place: nodes nearer than this to each other are at one place, m.
+            reaches: cache of reachability.
         """
         self.merged = merged
         self.union: HybridMap = merged.union()
         self.closed = ClosedEdges(self.union, merged.faded, reaches)
         reaches.forget(self.union.edges)
         self.poses = {node: merged.pose(node) for node in merged.poses}
-        self.living = {node: p for node, p in self.poses.items() if node not in merged.superseded}
-        self._join_near(near)
+        self.active_poses = {node: p for node, p in self.poses.items() if node not in merged.superseded}
+        self._join_nearby(same_place)
         for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
             if node in self.poses and fate.by in self.poses:
                 self._join(EdgeId(SUCCESSION, 0, k), node, fate.by)
 
-    def _join_near(self, near: float) -> None:
+    def _join_nearby(self, same_place: float) -> None:
         for number, members in enumerate(self.merged.components):
             nodes = sorted(node for node in members if node in self.poses)
             if not nodes:
                 continue
             places = np.array([[self.poses[n].x, self.poses[n].y] for n in nodes])
-            for k, (i, j) in enumerate(sorted(cKDTree(places).query_pairs(near))):
+            for k, (i, j) in enumerate(sorted(cKDTree(places).query_pairs(same_place))):
                 if not self._drivable_between(nodes[i], nodes[j]):
                     self._join(EdgeId(NEAR, number, k), nodes[i], nodes[j])
 
     def _drivable_between(self, a: NodeId, b: NodeId) -> bool:
-        known = self.union.graph.get_edge_data(a, b) or {}
-        return any(edge_id not in self.closed for edge_id in known)
+        edges = self.union.graph.get_edge_data(a, b) or {}
+        return any(edge_id not in self.closed for edge_id in edges)
 
     def _join(self, edge_id: EdgeId, a: NodeId, b: NodeId) -> None:
         between: Pose2 = self.poses[a].inverse() @ self.poses[b]

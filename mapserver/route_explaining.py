@@ -20,22 +20,22 @@ from mapweave.merge.explanation.own_edges import reach_words
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 TOLL = 1e4
-"""What a gap costs where as few as possible are looked for, m: more than any way through a building."""
+"""Cost of a gap in the search for as few gaps as possible, m: more than any way through a building."""
 CLEARLY = 0.01
-"""A way that is not driven is told of if it is cheaper by more than this, m."""
+"""A way that is not used is mentioned if it is cheaper by more than this, m."""
 WORDS = {
     "mapped": "its robot drove here while it mapped",
     "turned": "its robot turned here on the spot",
     "driven": "a robot has driven here",
-    "near": "both stand in one place",
-    "superseded": "the one stands for the other",
+    "near": "both are at one place",
+    "superseded": "one supersedes the other",
 }
 Pairs = Collection[tuple[NodeId, NodeId]]
 
 
 @dataclass(frozen=True)
 class _Hindrances:
-    """Pairs between which somebody could not drive."""
+    """Pairs between which a robot could not drive."""
 
     blocked: frozenset[frozenset[NodeId]]
     wary: frozenset[frozenset[NodeId]]
@@ -44,7 +44,7 @@ class _Hindrances:
     def words(self, pair: frozenset[NodeId]) -> str:
         """Of a pair; empty if it is none."""
         if pair in self.blocked:
-            return "said to be blocked"
+            return "reported as blocked"
         if pair in self.wary:
             return f"a robot did not get through of late: {self.wary_cost:g} m dearer"
         return ""
@@ -72,61 +72,65 @@ def explain_route(
         return _apart(merged, start, goal, missing)
     if start == goal:
         return RouteExplanation(start, goal, True, "start and goal are one node")
-    known = _Hindrances(frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), WARY_COST)
-    found, why_not = Route((), (), 0.0, ""), ""
+    hindrances = _Hindrances(frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), WARY_COST)
+    route, why_not = Route((), (), 0.0, ""), ""
     poses: Mapping[NodeId, Pose2] = {}
     for poses in router.choices(start, goal):
-        found = router.ways(poses, blocked, wary).find(start, goal)
-        if found.nodes:
+        route = router.ways(poses, blocked, wary).find(start, goal)
+        if route.nodes:
             break
-        why_not = found.reason
-    if not found.nodes:
+        why_not = route.reason
+    if not route.nodes:
         least = router.ways(poses, blocked, wary, TOLL).find(start, goal)
-        gaps = _gaps(router, least, poses, known)
+        gaps = _gaps(router, least, poses, hindrances)
         many = "1 gap is" if len(gaps) == 1 else f"{len(gaps)} gaps are"
         more = f"; {many} on the way that lacks least" if gaps else ""
         return RouteExplanation(start, goal, False, f"{why_not}{more}", gaps=gaps)
     best = router.ways(poses, toll=0.0).find(start, goal)
-    gaps = _gaps(router, best, poses, known) if best.cost < found.cost - CLEARLY else ()
-    hops = tuple(_hops(router, found, poses, known))
-    return RouteExplanation(start, goal, True, _why(router, found, best, hops, gaps), hops, gaps)
+    gaps = _gaps(router, best, poses, hindrances) if best.cost < route.cost - CLEARLY else ()
+    hops = tuple(_hops(router, route, poses, hindrances))
+    return RouteExplanation(start, goal, True, _why(router, route, best, hops, gaps), hops, gaps)
 
 
-def _why(router: Router, found: Route, best: Route, hops: tuple[Hop, ...], gaps: tuple[Hop, ...]) -> str:
+def _why(router: Router, route: Route, best: Route, hops: tuple[Hop, ...], gaps: tuple[Hop, ...]) -> str:
     """Of a way that was found."""
     steps = "1 step" if len(hops) == 1 else f"{len(hops)} steps"
     length = sum(hop.distance for hop in hops)
-    reason = f"{steps} over {length:.1f} m, cost {found.cost:.2f} m"
+    reason = f"{steps} over {length:.1f} m, cost {route.cost:.2f} m"
     if gaps:
         many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         reason += f"; a way for {best.cost:.2f} m has {many} that robots do not drive"
     else:
-        reason += "; no cheaper one is known, not even over what nobody drives"
-    older = sum(node in router.merged.superseded for node in found.nodes[1:-1])
+        reason += "; no cheaper one is known, not even over edges that cannot be driven"
+    older = sum(node in router.merged.superseded for node in route.nodes[1:-1])
     if older:
-        reason += f"; {older} of its nodes are passed although others stand for them: nothing else joins it"
+        reason += f"; {older} of its nodes are superseded: nothing else connects it"
     return reason
 
 
-def _hops(router: Router, way: Route, poses: Mapping[NodeId, Pose2], known: _Hindrances) -> Iterator[Hop]:
+def _hops(
+    router: Router, way: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances
+) -> Iterator[Hop]:
     edges = router.roads.union.edges
     for (a, b), edge_id in zip(pairwise(way.nodes), way.edges, strict=True):
-        edge, words = edges[edge_id], known.words(frozenset((a, b)))
+        edge, words = edges[edge_id], hindrances.words(frozenset((a, b)))
         more = WARY_COST if words else 0.0
-        told = _hop(router, edge, a, b, poses, more)
-        yield told if not words else replace(told, words=f"{told.words}; {words}")
+        hop = _hop(router, edge, a, b, poses, more)
+        yield hop if not words else replace(hop, words=f"{hop.words}; {words}")
 
 
-def _gaps(router: Router, way: Route, poses: Mapping[NodeId, Pose2], known: _Hindrances) -> tuple[Hop, ...]:
+def _gaps(
+    router: Router, way: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances
+) -> tuple[Hop, ...]:
     """Those hops of a way that robots do not drive, or had better not."""
     roads, out = router.roads, []
     for a, b in pairwise(way.nodes):
         between = [roads.union.edges[key] for key in roads.union.graph.get_edge_data(a, b)]
         best = min(between, key=lambda e: (edge_cost(e, poses, True, router.settings.route), e.id))
-        words = known.words(frozenset((a, b)))
+        words = hindrances.words(frozenset((a, b)))
         if words or all(edge.id in roads.closed for edge in between):
-            told = _hop(router, best, a, b, poses, 0.0)
-            out.append(replace(told, words=words) if words else told)
+            hop = _hop(router, best, a, b, poses, 0.0)
+            out.append(replace(hop, words=words) if words else hop)
     return tuple(out)
 
 
@@ -146,13 +150,13 @@ def _apart(merged: MergedMap, start: NodeId, goal: NodeId, missing: str) -> Rout
         return RouteExplanation(start, goal, False, missing)
     apart = _nearest_maps(merged, start, goal, first, second)
     if apart is None:
-        torn = [str(one) for one in sorted({start.map, goal.map}) if _pieces(merged, one) > 1]
+        torn = [str(map_id) for map_id in sorted({start.map, goal.map}) if _pieces(merged, map_id) > 1]
         missing += f"; {' and '.join(torn)} {'is' if len(torn) == 1 else 'are'} in pieces"
     return RouteExplanation(start, goal, False, missing, apart=apart)
 
 
-def _pieces(merged: MergedMap, one: MapId) -> int:
-    return sum(any(node.map == one for node in component) for component in merged.components)
+def _pieces(merged: MergedMap, hybrid_map: MapId) -> int:
+    return sum(any(node.map == hybrid_map for node in component) for component in merged.components)
 
 
 def _nearest_maps(
@@ -160,7 +164,7 @@ def _nearest_maps(
 ) -> MapsExplanation | None:
     """Two maps, one of each part, between which most was found; None if one map lies in both parts."""
     sides = [merged.components[number] for number in (first, second)]
-    part_of = {one: part for part in joined_maps(merged) for one in part}
+    part_of = {node: part for part in joined_maps(merged) for node in part}
     if part_of[start.map] == part_of[goal.map]:
         return None
     between: Counter[tuple[MapId, MapId]] = Counter({(start.map, goal.map): 0})

@@ -21,14 +21,14 @@ from mapweave.mapserver.roadmap import Roadmap
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 NEAR = 0.5
-"""Nodes nearer than this to each other count as joined, whatever they show, m: less than what two robots
-keep apart on the two sides of a wall."""
+"""Nodes nearer than this to each other count as joined, whatever they show, m: less than the distance that
+two robots keep on the two sides of a wall."""
 ENTRY_REACH = 1.5
 """A robot may enter the map at nodes nearer than this, m."""
 ENTRY_COST = 3.0
-"""What a metre from the robot to its first node costs: nobody has driven it yet."""
+"""Cost of a metre from the robot to its first node: no robot has driven it yet."""
 ON_EDGE = 0.25
-"""A robot this near to an edge that was driven stands on it, m: along it a metre costs a metre, so that it
+"""A robot this near to an edge that was driven is on it, m: along it a metre costs a metre, so that it
 need not turn back to the edge's beginning."""
 WARY_COST = 4.0
 """What it costs to try again where another robot did not get through, m."""
@@ -50,7 +50,7 @@ class RouterSettings:
 
 
 class Router:
-    """Answers how to get from node to node. It stands for one merged map; make another for the next."""
+    """Finds routes from node to node. It belongs to one merged map; make another for the next."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class Router:
         Args:
             merged: the map.
             settings: how routes are chosen.
-            reaches: what is known of edges from maps before; it is written to.
+            reaches: cache of reachability from earlier maps; it is filled.
         """
         self.merged = merged
         self.settings = settings or RouterSettings()
@@ -96,7 +96,7 @@ class Router:
             wary: pairs of nodes, in either order, between which another robot did not get through: they are
                 driven only where every other way is much longer.
             start_from_robot: where the robot is. It may see the start node from afar, then the route begins
-                at a node that is nearer and better placed; None if it stands at the start node.
+                at a node that is nearer and better placed; None if it is at the start node.
 
         Returns:
             The legs. Their relative poses are those of the optimised graph: each is the best estimate
@@ -112,7 +112,7 @@ class Router:
         return RouteAnswer((), reason or f"every way into the map near {start} is blocked")
 
     def missing(self, start: NodeId, goal: NodeId) -> str:
-        """Why there is no way whatever can be driven, in words; empty if there may be one."""
+        """Why no route can exist, in words; empty if there may be one."""
         for name, node in (("start", start), ("goal", goal)):
             if node not in self.merged.poses:
                 retired = self.merged.rulings.retired.get(node.map)
@@ -125,11 +125,11 @@ class Router:
         return ""
 
     def choices(self, start: NodeId, goal: NodeId) -> Iterator[Mapping[NodeId, Pose2]]:
-        """Poses of nodes over which a way is looked for, one after the other.
+        """Sets of nodes over which a way is searched, one after the other.
 
-        Nodes that others stand for are passed only where it must be.
+        Superseded nodes are passed only where necessary.
         """
-        yield self.roads.living | {node: self.roads.poses[node] for node in (start, goal)}
+        yield self.roads.active_poses | {node: self.roads.poses[node] for node in (start, goal)}
         yield self.roads.poses
 
     def ways(
@@ -161,10 +161,10 @@ class Router:
         for entry, cost in self._entries(start, poses, start_from_robot, blocked):
             if cost >= best_cost:
                 break
-            found = ways.find(entry, goal)
-            reason = reason or found.reason
-            if found.nodes and cost + found.cost < best_cost:
-                best, best_cost = found, cost + found.cost
+            route = ways.find(entry, goal)
+            reason = reason or route.reason
+            if route.nodes and cost + route.cost < best_cost:
+                best, best_cost = route, cost + route.cost
         return best, reason
 
     def _answer(self, start: NodeId, best: Route) -> RouteAnswer:
@@ -186,31 +186,31 @@ class Router:
         """Nodes where the route may begin with what it costs to get there, cheapest first."""
         if start_from_robot is None:
             return [(start, 0.0)]
-        here = poses[start] @ start_from_robot
+        pose = poses[start] @ start_from_robot
         component = self.merged.component_of(start)
         barred = {frozenset(pair) for pair in blocked}
         members = self.merged.components[component or 0]
-        near = sorted((here.distance(poses[n]), n) for n in members if n in poses)
+        nearest = sorted((pose.distance(poses[n]), n) for n in members if n in poses)
         entries = [
-            (node, ENTRY_COST * distance - self._saved(here, node, distance, barred))
-            for distance, node in near
+            (node, ENTRY_COST * distance - self._saved(pose, node, distance, barred))
+            for distance, node in nearest
             if (distance <= ENTRY_REACH or node == start) and frozenset((start, node)) not in barred
         ]
         return sorted(entries, key=lambda entry: entry[1])[:ENTRIES]
 
-    def _saved(self, here: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
-        """By how much it is cheaper to get to a node for a robot that stands on an edge to it, m."""
+    def _saved(self, pose: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
+        """By how much it is cheaper to get to a node for a robot that is on an edge to it, m."""
         _s, roads = self.settings, self.roads
         target = roads.poses[node]
         goal = np.array([target.x, target.y])
-        at = np.array([here.x, here.y])
+        at = np.array([pose.x, pose.y])
         saved = 0.0
-        for _, other, edge_id in roads.union.graph.edges(node, keys=True):
-            if roads.union.edges[edge_id].kind in RECOGNISED or frozenset((node, other)) in barred:
+        for _, neighbour, edge_id in roads.union.graph.edges(node, keys=True):
+            if roads.union.edges[edge_id].kind in RECOGNISED or frozenset((node, neighbour)) in barred:
                 continue
-            if other not in roads.poses:
+            if neighbour not in roads.poses:
                 continue
-            along = np.array([roads.poses[other].x, roads.poses[other].y]) - goal
+            along = np.array([roads.poses[neighbour].x, roads.poses[neighbour].y]) - goal
             share = float(np.clip((at - goal) @ along / max(along @ along, 1e-9), 0.0, 1.0))
             off = float(np.linalg.norm(at - goal - share * along))
             if off <= ON_EDGE and share < 1.0:

@@ -1,4 +1,4 @@
-"""What people have ruled, told in order with what has become of the maps by itself."""
+"""The history of the maps: manual constraints and the merge's own events, in order."""
 
 from __future__ import annotations
 
@@ -8,17 +8,24 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 
 
-def with_rulings(happenings: Iterable[MapEvent], rulings: ManualConstraints) -> tuple[MapEvent, ...]:
-    """What has happened by itself and what people have ruled, in order."""
-    ruled = [MapEvent(ruling.stamp_ns, MapEventKind.RULED, said_of(ruling)) for ruling in rulings.made]
+def with_rulings(happenings: Iterable[MapEvent], constraints: ManualConstraints) -> tuple[MapEvent, ...]:
+    """Events of the merge and manual constraints, in order."""
+    ruled = [
+        MapEvent(constraint.stamp_ns, MapEventKind.RULED, said_of(constraint))
+        for constraint in constraints.made
+    ]
     return tuple(sorted([*ruled, *happenings], key=lambda one: one.stamp_ns))
 
 
-def said_of(ruling: ManualConstraint) -> str:
-    """What has come of a ruling, in one sentence."""
-    first, second = ruling.ends
-    who = ruling.who or "somebody"
-    if ruling.retires is not None:
-        return reason_of(ruling) if ruling.apart else f"map {ruling.retires} is in use again, says {who}"
-    words = reason_of(ruling) if ruling.apart else f"may be linked again, says {who}"
+def said_of(constraint: ManualConstraint) -> str:
+    """A manual constraint as an event, in one sentence."""
+    first, second = constraint.ends
+    who = constraint.who or "a person"
+    if constraint.retires is not None:
+        return (
+            reason_of(constraint)
+            if constraint.apart
+            else f"map {constraint.retires} is in use again, by {who}"
+        )
+    words = reason_of(constraint) if constraint.apart else f"may be linked again, by {who}"
     return f"{first} and {second}: {words}"

@@ -1,8 +1,8 @@
 """When the server's work runs and what time it is: on threads by the machine's clock, or in lock-step.
 
-The parts of the server know neither threads nor `time`: they hand their work to a schedule. Robots get
-`LiveSchedule`. A repeatable simulation drives the same parts by `LockstepSchedule`, where time stands still
-and work runs in the thread of whoever asks, in the order in which it was handed over.
+The parts of the server use neither threads nor `time`: they hand their work to a schedule. Robots get
+`LiveSchedule`. A repeatable simulation drives the same parts by `LockstepSchedule`, where time stops and work
+runs in the calling thread, in the order in which it was handed over.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Schedule(Protocol):
         ...
 
     def idle(self, job: IdleJob) -> None:
-        """Have one job run in the background whenever no posted job waits. There is one such job."""
+        """Run a job in the background whenever no posted job waits. There is one such job."""
         ...
 
     def every(self, period: float, job: Job) -> None:
@@ -59,7 +59,7 @@ class Schedule(Protocol):
         ...
 
     def spawn(self, job: Job) -> None:
-        """Have a long job run beside all others."""
+        """Run a long job in parallel to all others."""
         ...
 
     def executor(self, workers: int) -> Executor:
@@ -142,7 +142,7 @@ class LiveSchedule:
         return ThreadPoolExecutor(workers, thread_name_prefix="answer")
 
     def catch_up(self) -> None:
-        """Nothing: questions are answered from what is merged, and merging goes on beside them."""
+        """Nothing: questions are answered from the last merged map, and merging goes on in parallel."""
 
     def start(self) -> None:
         """Start the threads."""
@@ -205,7 +205,7 @@ class _Inline(Executor):
             self._catch_up()
             try:
                 future.set_result(work(*args, **kwargs))
-            except Exception as error:  # noqa: BLE001 - goes to whoever asks for the result, as a worker's does
+            except Exception as error:  # noqa: BLE001 - raised where the result is read, as with a worker
                 future.set_exception(error)
         return future
 
@@ -217,7 +217,7 @@ class LockstepSchedule:
     """
 
     def __init__(self) -> None:
-        """Time stands at zero."""
+        """Start at time zero."""
         self._turn = threading.RLock()
         self._inbox: deque[Job] = deque()
         self._idle: IdleJob | None = None
@@ -238,7 +238,7 @@ class LockstepSchedule:
             self._stamp_ns = max(self._stamp_ns, stamp_ns)
 
     def post(self, job: Job) -> None:
-        """Have a job run when somebody catches up."""
+        """Run a job at the next catch-up."""
         self._inbox.append(job)
 
     def idle(self, job: IdleJob) -> None:
@@ -246,7 +246,7 @@ class LockstepSchedule:
         self._idle = job
 
     def every(self, period: float, job: Job) -> None:
-        """Have a job run when somebody catches up and so much simulated time has passed."""
+        """Run a job at a catch-up after so much simulated time has passed."""
         self._periodic.append(_Periodic(period, job, self.monotonic() + period))
 
     def spawn(self, job: Job) -> None:
@@ -265,13 +265,13 @@ class LockstepSchedule:
                     _run(self._inbox.popleft())
                 if (self._idle is None or self._idle() is None) and not self._inbox:
                     break
-            for one in self._periodic:
-                if one.due <= self.monotonic():
-                    one.due = self.monotonic() + one.period
-                    _run(one.job)
+            for job in self._periodic:
+                if job.due <= self.monotonic():
+                    job.due = self.monotonic() + job.period
+                    _run(job.job)
 
     def start(self) -> None:
-        """Nothing: work runs when somebody asks."""
+        """Nothing: work runs with the next question."""
 
     def close(self) -> None:
         """Do what was posted."""

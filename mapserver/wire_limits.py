@@ -1,7 +1,7 @@
-"""What cannot be said on the wire is left out of answers: it must not cost the answer.
+"""Values that messages cannot hold are left out of answers: they must not cost the answer.
 
-A map may have its nodes as far away as its robot says, and a camera may have its principal point anywhere.
-What follows from such numbers may be out of the range that messages have.
+A map may have its nodes anywhere, and a camera may have its principal point anywhere. Results from such
+numbers may be out of the range of messages.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ there."""
 LONGEST_LEG = 1e3
 """No robot drives farther from node to node, m."""
 MOST_DETOURS = 8
-"""Ways around legs that cannot be told, before it is said that there is none."""
+"""Alternative routes around legs out of range that are tried."""
 
 Pairs = tuple[tuple[NodeId, NodeId], ...]
 
@@ -36,11 +36,11 @@ def can_be_said(pose: PoseGaussian | None) -> bool:
 
 
 def said(answer: RelocalizeAnswer) -> RelocalizeAnswer:
-    """An answer without candidates that cannot be said. One of which only the merged pose cannot stays
-    without.
+    """An answer without candidates that are out of range.
 
-    The certainty stays: where the robot may be at a place that cannot be said, it is not sure to be at the
-    other. If it is the very place where the robot is that cannot be said, the answer is that it is not known.
+    A candidate of which only the merged pose is out of range keeps the rest. The certainty stays: if the
+    robot may be at a place that is left out, it is not certain to be at the other. If the robot's own place
+    is out of range, the answer is that it is unknown.
     """
     fine = [can_be_said(one.node_from_robot) for one in answer.candidates]
     told = tuple(
@@ -58,7 +58,7 @@ def said(answer: RelocalizeAnswer) -> RelocalizeAnswer:
 def drivable(
     route: Callable[[Pairs], RouteAnswer], blocked: Collection[tuple[NodeId, NodeId]]
 ) -> RouteAnswer:
-    """A way of which every leg can be said, and is no longer than robots drive.
+    """A route of which every leg is within the range of messages, and no longer than robots drive.
 
     Args:
         route: finds the best way that passes none of some pairs of nodes.

@@ -22,7 +22,7 @@ from mapweave.hybridmap.explanation import (
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.pose import Array, PoseGaussian
 
-MOST_WITNESSES = 12
+MOST_LINKS = 12
 """Lines of other links; `--json` has all."""
 WIDTH = 110
 """Columns of a line of numbers."""
@@ -35,47 +35,49 @@ TITLES = {
 }
 
 
-def pair_words(told: PairExplanation) -> list[str]:
+def pair_words(explanation: PairExplanation) -> list[str]:
     """The explanation of two nodes, line by line."""
-    lines = [f"{told.a.id} and {told.b.id} {TITLES[told.standing]}: {told.reason}"]
-    # What a robot followed on its way need not look alike at both ends.
-    followed = told.standing is Standing.OWN and "inliers" not in told.evidence
+    lines = [
+        f"{explanation.a.id} and {explanation.b.id} {TITLES[explanation.standing]}: {explanation.reason}"
+    ]
+    # Landmarks that a robot tracked on its way need not match at both ends.
+    followed = explanation.standing is Standing.OWN and "inliers" not in explanation.evidence
     agree = "were followed on the way" if followed else "agree on one pose"
     lines.append(
-        f"  landmarks     {len(told.a.landmarks)} and {len(told.b.landmarks)}; "
-        f"{len(told.matches)} look alike, {len(told.shared)} {agree}{_doubles(told)}"
+        f"  landmarks     {len(explanation.a.landmarks)} and {len(explanation.b.landmarks)}; "
+        f"{len(explanation.matches)} match, {len(explanation.shared)} {agree}{_aliased(explanation)}"
     )
-    if told.a_from_b is not None:
-        lines.append(f"  b seen from a {_pose(told.a_from_b)}")
-        off = told.residuals_px[np.isfinite(told.residuals_px)]
+    if explanation.a_from_b is not None:
+        lines.append(f"  b seen from a {_pose(explanation.a_from_b)}")
+        off = explanation.residuals_px[np.isfinite(explanation.residuals_px)]
         if len(off):
-            rest = f"; {told.evidence['rms_px']:.1f} px" if "rms_px" in told.evidence else ""
-            rest += " if depths may be off as far as they are uncertain" if rest else ""
+            rest = f"; {explanation.evidence['rms_px']:.1f} px" if "rms_px" in explanation.evidence else ""
+            rest += " with depths adjusted within their uncertainty" if rest else ""
             lines.append(f"  residuals     median {np.median(off):.1f} px, worst {off.max():.1f} px{rest}")
-        lines += _evidence(told.evidence)
-    if told.misfit is not None:
-        misfit = told.misfit
+        lines += _evidence(explanation.evidence)
+    if explanation.misfit is not None:
+        misfit = explanation.misfit
         lines.append(f"  in the map    {_pose(misfit.merged_a_from_b)}")
-        rest = "nothing else says how they stand" if misfit.alone else "others say it too"
+        rest = "nothing else connects them" if misfit.alone else "others say it too"
         lines.append(f"  off by        {_vector(misfit.off)}, {_sigmas(misfit.strain2)}; {rest}")
-    elif told.a_from_b is not None:
+    elif explanation.a_from_b is not None:
         lines.append("  in the map    nothing joins the two")
-    if told.probability is not None:
-        percent = _percent(told.probability)
+    if explanation.probability is not None:
+        percent = _percent(explanation.probability)
         lines.append(f"  probability   {percent} that it is right, judged for itself by the rest of the map")
-    if told.witnesses:
-        count = sum(witness.agrees for witness in told.witnesses)
+    if explanation.witnesses:
+        count = sum(link.agrees for link in explanation.witnesses)
         lines.append(
-            f"  other links   {count} of {len(told.witnesses)} between the same pieces of map agree:"
+            f"  other links   {count} of {len(explanation.witnesses)} between the same pieces of map agree:"
         )
-    for witness in _telling(told.witnesses):
-        word = "agrees" if witness.agrees else "contradicts"
-        kept = "stands" if witness.kept else "refused"
-        lines.append(f"    {witness.a} - {witness.b}: {word}, {_sigmas(witness.distance2)}, {kept}")
-    if len(told.witnesses) > MOST_WITNESSES:
-        lines.append(f"    and {len(told.witnesses) - MOST_WITNESSES} more; --json tells all")
-    lines += [f"  {claim}" for claim in told.claims]
-    lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
+    for link in _selection(explanation.witnesses):
+        word = "agrees" if link.agrees else "contradicts"
+        kept = "stands" if link.kept else "refused"
+        lines.append(f"    {link.a} - {link.b}: {word}, {_sigmas(link.distance2)}, {kept}")
+    if len(explanation.witnesses) > MOST_LINKS:
+        lines.append(f"    and {len(explanation.witnesses) - MOST_LINKS} more; --json lists all")
+    lines += [f"  {claim}" for claim in explanation.claims]
+    lines += [f"  {_constraint(constraint)}" for constraint in explanation.rulings]
     return lines
 
 
@@ -87,37 +89,40 @@ def _evidence(evidence: Mapping[str, float]) -> list[str]:
     return [line.replace(tied, " ") for line in lines]
 
 
-def _telling(witnesses: Sequence[Witness]) -> list[Witness]:
-    """Those that are told, nearest first: of many that agree some leave their lines to those that do not."""
-    ranked = sorted(witnesses, key=lambda w: w.distance2)
+def _selection(links: Sequence[Witness]) -> list[Witness]:
+    """The links that are listed, nearest first: both agreeing and contradicting ones get lines."""
+    ranked = sorted(links, key=lambda w: w.distance2)
     against = [w for w in ranked if not w.agrees]
-    agree = [w for w in ranked if w.agrees][: MOST_WITNESSES - min(len(against), MOST_WITNESSES // 2)]
-    return [*agree, *against[: MOST_WITNESSES - len(agree)]]
+    agree = [w for w in ranked if w.agrees][: MOST_LINKS - min(len(against), MOST_LINKS // 2)]
+    return [*agree, *against[: MOST_LINKS - len(agree)]]
 
 
-def maps_words(told: MapsExplanation) -> list[str]:
+def maps_words(explanation: MapsExplanation) -> list[str]:
     """The explanation of two maps, line by line."""
-    lines = [told.reason]
-    if not told.joined:
-        lines.append(f"  {told.refused} links refused, {told.unverified} alike pairs without a common pose")
-    if told.nearest:
-        lines.append("  weakest links:" if told.joined else "  nearest to a link:")
-    lines += [f"    {_near(near, told.reason)}" for near in told.nearest]
-    lines += [f"  {_ruling(ruling)}" for ruling in told.rulings]
+    lines = [explanation.reason]
+    if not explanation.joined:
+        lines.append(
+            f"  {explanation.refused} links refused, "
+            f"{explanation.unverified} candidate pairs without a common pose"
+        )
+    if explanation.nearest:
+        lines.append("  weakest links:" if explanation.joined else "  nearest to a link:")
+    lines += [f"    {_near(near_miss, explanation.reason)}" for near_miss in explanation.nearest]
+    lines += [f"  {_constraint(constraint)}" for constraint in explanation.rulings]
     return lines
 
 
-def route_words(told: RouteExplanation) -> list[str]:
+def route_words(explanation: RouteExplanation) -> list[str]:
     """The explanation of a route, line by line."""
-    way = "the way leads so" if told.found else "there is no way"
-    lines = [f"{told.start} to {told.goal}: {way}: {told.reason}"]
-    lines += [f"  {_hop(hop)}" for hop in told.hops]
-    if told.gaps:
-        lines.append("  not driven, and so not taken:" if told.found else "  what is missing:")
-    lines += [f"    {_hop(hop)}" for hop in told.gaps[:MOST_WITNESSES]]
-    if len(told.gaps) > MOST_WITNESSES:
-        lines.append(f"    and {len(told.gaps) - MOST_WITNESSES} more; --json tells all")
-    return lines + [f"  {line}" for line in (maps_words(told.apart) if told.apart else ())]
+    way = "the route is" if explanation.found else "there is no way"
+    lines = [f"{explanation.start} to {explanation.goal}: {way}: {explanation.reason}"]
+    lines += [f"  {_hop(hop)}" for hop in explanation.hops]
+    if explanation.gaps:
+        lines.append("  not driven, and so not taken:" if explanation.found else "  what is missing:")
+    lines += [f"    {_hop(hop)}" for hop in explanation.gaps[:MOST_LINKS]]
+    if len(explanation.gaps) > MOST_LINKS:
+        lines.append(f"    and {len(explanation.gaps) - MOST_LINKS} more; --json lists all")
+    return lines + [f"  {line}" for line in (maps_words(explanation.apart) if explanation.apart else ())]
 
 
 def _hop(hop: Hop) -> str:
@@ -135,8 +140,8 @@ def _vector(vector: Array) -> str:
     return f"{vector[0]:+.3f} m ahead, {vector[1]:+.3f} m left, {math.degrees(vector[2]):+.1f} deg"
 
 
-def _doubles(told: PairExplanation) -> str:
-    count = int(told.evidence.get(DOUBLES, 0.0))
+def _aliased(explanation: PairExplanation) -> str:
+    count = int(explanation.evidence.get(DOUBLES, 0.0))
     return f", {count} of these are found at other places too" if count else ""
 
 
@@ -150,17 +155,25 @@ def _percent(probability: float) -> str:
     return f"{probability:.2%}" if probability > 0.0001 else f"{100.0 * probability:.2g}%"
 
 
-def _near(near: NearMiss, known: str) -> str:
-    """What is said above already of all of them is not said again of each."""
-    lacks = "".join(f"; {words}" for words in near.lacks.split("; ") if words not in known)
-    return f"{near.a} - {near.b}: {near.matches} look alike, {near.inliers} agree{lacks}"
+def _near(near_miss: NearMiss, reason: str) -> str:
+    """The common reason is not repeated for each."""
+    lacks = "".join(f"; {words}" for words in near_miss.lacks.split("; ") if words not in reason)
+    return f"{near_miss.a} - {near_miss.b}: {near_miss.matches} match, {near_miss.inliers} agree{lacks}"
 
 
-def _ruling(ruling: ManualConstraint) -> str:
-    when = datetime.fromtimestamp(ruling.stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    word = "ruled that they shall not be linked" if ruling.apart else "ruled that they may be linked again"
-    why = f': "{ruling.because}"' if ruling.because else ""
-    if ruling.retires is not None:
-        word = "ruled that it is retired" if ruling.apart else "ruled that it is in use again"
-    ends = f"{ruling.ends[0]} and {ruling.ends[1]}" if ruling.retires is None else f"map {ruling.retires}"
-    return f"{when} {ruling.who or 'somebody'} {word} ({ends}){why}"
+def _constraint(constraint: ManualConstraint) -> str:
+    when = datetime.fromtimestamp(constraint.stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    word = (
+        "decided that they shall not be linked"
+        if constraint.apart
+        else "decided that they may be linked again"
+    )
+    why = f': "{constraint.because}"' if constraint.because else ""
+    if constraint.retires is not None:
+        word = "decided that it is retired" if constraint.apart else "decided that it is in use again"
+    ends = (
+        f"{constraint.ends[0]} and {constraint.ends[1]}"
+        if constraint.retires is None
+        else f"map {constraint.retires}"
+    )
+    return f"{when} {constraint.who or 'a person'} {word} ({ends}){why}"

@@ -37,7 +37,7 @@ class Extracted:
 
 
 def extract_maps(source: Path, folder: Path) -> tuple[list[Extracted], str]:
-    """Write every map of a journal or store into a file of a folder. Nobody else may have the source open.
+    """Write every map of a journal or store into a file of a folder. The source must not be in use.
 
     Args:
         source: journal or store.
@@ -72,31 +72,33 @@ def _read(source: Path) -> tuple[dict[MapId, tuple[tuple[ChangeBody, ...], str]]
     if kind == journal.APPLICATION_ID:
         with closing(journal.Journal(source)) as of_agent:
             kept = {map_id: RetainedMap.of(of_agent, map_id) for map_id in of_agent.maps()}
-        return {map_id: (one.contents, one.complaint) for map_id, one in kept.items()}, ""
+        return {map_id: (extracted.contents, extracted.complaint) for map_id, extracted in kept.items()}, ""
     if kind == store.APPLICATION_ID:
-        found = salvage(source)
-        maps = {map_id: (tuple(hybrid.contents()), "") for map_id, hybrid in sorted(found.maps.items())}
-        return maps, _lost(source, found)
+        salvaged = salvage(source)
+        maps = {map_id: (tuple(hybrid.contents()), "") for map_id, hybrid in sorted(salvaged.maps.items())}
+        return maps, _lost(source, salvaged)
     raise InvalidFile(f"{source}: is neither an agent's journal nor a server's store")
 
 
-def _lost(source: Path, found: Salvage) -> str:
+def _lost(source: Path, salvaged: Salvage) -> str:
     """What of a store is missing in the files, in one line; empty if nothing is."""
-    if found.whole and not found.damaged:
+    if salvaged.whole and not salvaged.damaged:
         return ""
-    lost = f"{found.damaged} damaged changes" if found.damaged else "no damaged change"
-    pages = "" if found.whole else ", and pages that cannot be read: how many changes they had is not known"
+    lost = f"{salvaged.damaged} damaged changes" if salvaged.damaged else "no damaged change"
+    pages = (
+        "" if salvaged.whole else ", and pages that cannot be read: how many changes they had is not known"
+    )
     return f"{source} had {lost}{pages}"
 
 
 def _application_id(source: Path) -> int:
-    """What kind of SQLite file it is; 0 if nobody says."""
+    """What kind of SQLite file it is; 0 if unknown."""
     if not source.is_file():
         raise InvalidFile(f"{source}: no such file")
     try:
-        # By SQLite itself: what was committed last may stand in the file beside it only.
+        # By SQLite itself: the last commits may be only in the file next to it.
         with closing(sqlite3.connect(source)) as connection:
             return int(connection.execute("PRAGMA application_id").fetchone()[0])
     except sqlite3.Error as error:
-        what = "is in use by another process" if "locked" in str(error) else f"cannot be read ({error})"
-        raise InvalidFile(f"{source}: {what}") from None
+        reason = "is in use by another process" if "locked" in str(error) else f"cannot be read ({error})"
+        raise InvalidFile(f"{source}: {reason}") from None

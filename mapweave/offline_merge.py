@@ -19,7 +19,7 @@ from mapweave.storage.map_file import MapFile
 from mapweave.wire.codec import encode_body
 
 Progress = Callable[[int, int], None]
-"""Told how many of how many nodes and edges are taken in."""
+"""Called with how many of how many nodes and edges are read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class Parts:
 
     Attributes:
         maps: the robots' own, by id.
-        rulings: all that people have ruled in any of the files.
-        notes: what was left aside, one sentence each.
-        history: what any of the files tells that has become of the maps, in order.
+        rulings: manual constraints in any of the files.
+        notes: what was left out, one sentence each.
+        history: history of the maps in any of the files, in order.
     """
 
     maps: dict[MapId, HybridMap]
@@ -40,41 +40,40 @@ class Parts:
 
 
 def parts_of(files: Mapping[Path, MapFile]) -> Parts:
-    """The robots' own maps in some files, and all that people have ruled in any of them.
+    """The robots' own maps in some files, and the manual constraints in any of them.
 
     The same map twice is taken once. Of an older and a newer state of it the newer one counts: numbers are
-    never reused, so it is the one that has come further.
+    never reused, so the longer one is newer.
 
     Raises:
-        InvalidFile: two files hold maps of one name that are different maps, or of which nobody can tell
-            which is newer.
+        InvalidFile: two files hold different maps of one name, or it cannot be decided which is newer.
     """
     maps: dict[MapId, HybridMap] = {}
     origin: dict[MapId, Path] = {}
-    rulings = ManualConstraints()
+    constraints = ManualConstraints()
     notes: list[str] = []
     for path, content in sorted(files.items()):
         if not content.changes:
             notes.append(f"there is nothing in {path}")
-        for map_id, one in sorted(maps_of(content).items()):
+        for map_id, hybrid_map in sorted(maps_of(content).items()):
             if map_id in maps:
-                known, there = maps[map_id], origin[map_id]
-                if _length(known) > _length(one):
-                    (known, there), (one, path) = (one, path), (known, there)
-                if objection := _objection(known, one):
-                    raise InvalidFile(f"map {map_id} is in {there} and in {path}: {objection}")
-                if _length(known) < _length(one):
-                    notes.append(f"map {map_id} is taken from {path}, since that in {there} is older")
-            maps[map_id], origin[map_id] = one, path
-        rulings += ManualConstraints(content.rulings)
-    told = {one for content in files.values() for one in content.history}
-    history = sorted(told, key=lambda one: (one.stamp_ns, one.kind, one.words))
-    return Parts(maps, rulings, tuple(notes), tuple(history))
+                kept, kept_path = maps[map_id], origin[map_id]
+                if _length(kept) > _length(hybrid_map):
+                    (kept, kept_path), (hybrid_map, path) = (hybrid_map, path), (kept, kept_path)
+                if objection := _objection(kept, hybrid_map):
+                    raise InvalidFile(f"map {map_id} is in {kept_path} and in {path}: {objection}")
+                if _length(kept) < _length(hybrid_map):
+                    notes.append(f"map {map_id} is taken from {path}, since that in {kept_path} is older")
+            maps[map_id], origin[map_id] = hybrid_map, path
+        constraints += ManualConstraints(content.rulings)
+    events = {hybrid_map for content in files.values() for hybrid_map in content.history}
+    history = sorted(events, key=lambda hybrid_map: (hybrid_map.stamp_ns, hybrid_map.kind, hybrid_map.words))
+    return Parts(maps, constraints, tuple(notes), tuple(history))
 
 
-def _length(one: HybridMap) -> int:
+def _length(hybrid_map: HybridMap) -> int:
     """How far a map has come: its greatest number."""
-    return max((own.number for own in (*one.nodes, *one.edges)), default=0)
+    return max((own.number for own in (*hybrid_map.nodes, *hybrid_map.edges)), default=0)
 
 
 def _objection(older: HybridMap, newer: HybridMap) -> str:
@@ -83,17 +82,17 @@ def _objection(older: HybridMap, newer: HybridMap) -> str:
     if (older.nodes and not both) or any(older.nodes[n].stamp_ns != newer.nodes[n].stamp_ns for n in both):
         return "these are two maps of one name, made at different times: leave one of them out"
     if _length(older) == _length(newer) and _bytes(older) != _bytes(newer):
-        return "nobody can tell which is newer: leave one of them out"
+        return "it cannot be decided which is newer: leave one of them out"
     return ""
 
 
-def _bytes(one: HybridMap) -> list[bytes]:
-    return sorted(encode_body(body) for body in one.contents())
+def _bytes(hybrid_map: HybridMap) -> list[bytes]:
+    return sorted(encode_body(change) for change in hybrid_map.contents())
 
 
 def merge_parts(
     maps: Mapping[MapId, HybridMap],
-    rulings: ManualConstraints,
+    constraints: ManualConstraints,
     progress: Progress = lambda done, of: None,
     settings: MergeSettings | None = None,
 ) -> MergedMap:
@@ -101,19 +100,21 @@ def merge_parts(
 
     Args:
         maps: by id; they are not changed.
-        rulings: of people.
-        progress: told how far it is.
+        constraints: manual constraints.
+        progress: see `Progress`.
         settings: how they are merged.
 
     Raises:
-        InvalidValue: a map cannot be merged; nobody must lose it by writing the others.
+        InvalidValue: a map cannot be merged; writing the others would lose it.
     """
     merger = Merger(settings=MergerSettings(merging=settings or MergeSettings()))
-    merger.rule(rulings)
-    bodies = [(map_id, body) for map_id, one in sorted(maps.items()) for body in one.contents()]
-    for k, (map_id, body) in enumerate(bodies):
-        merger.apply(map_id, body)
-        progress(k + 1, len(bodies))
+    merger.rule(constraints)
+    changes = [
+        (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
+    ]
+    for k, (map_id, change) in enumerate(changes):
+        merger.apply(map_id, change)
+        progress(k + 1, len(changes))
     merged = merger.merged()
     for map_id, reason in merged.set_apart.items():
         raise InvalidValue(f"map {map_id} cannot be merged: {reason}; leave its file out, or retire it")

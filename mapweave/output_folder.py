@@ -14,9 +14,9 @@ def check_output(folder: Path) -> Path:
     Raises:
         SettingsError: a file is in the way, or nothing may be written there.
     """
-    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
-    if not there.is_dir():
-        raise SettingsError(f"{there}: is a file; give a folder, or a place where one can be made")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise SettingsError(f"{there}: nothing may be written there; choose another folder")
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise SettingsError(f"{existing}: is a file; give a folder, or a place where one can be made")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise SettingsError(f"{existing}: nothing may be written there; choose another folder")
     return folder

@@ -132,7 +132,7 @@ def send_map(
 
 
 def _level(structure: Structure, k: int) -> Pose2:
-    """Where the k-th camera stood over the floor, and where it looked."""
+    """Position of the k-th camera over the floor, and its heading."""
     axis = structure.rotations[k][:, 2]
     x, y, _ = structure.centres[k]
     return Pose2(float(x), float(y), math.atan2(axis[1], axis[0]))
@@ -143,11 +143,11 @@ def _landmarks(
 ) -> tuple[Landmarks, NDArray[np.int64]]:
     """What the k-th photograph shows, as a level camera at the stated height sees it; and which points."""
     points = np.flatnonzero(structure.features[k] >= 0)
-    here = structure.points[points].copy()
-    here[:, :2] = level.inverse().apply(here[:, :2])
-    here[:, 0] += camera.mount_forward
-    depths = here[:, 0] - camera.mount_forward
-    pixels = camera.project(here)
+    points_here = structure.points[points].copy()
+    points_here[:, :2] = level.inverse().apply(points_here[:, :2])
+    points_here[:, 0] += camera.mount_forward
+    depths = points_here[:, 0] - camera.mount_forward
+    pixels = camera.project(points_here)
     sigmas = np.hypot(_depth_sigmas(structure, k, points, camera), SCALE_SHARE * depths)
     good = camera.contains(pixels, -min(camera.width, camera.height) / 4) & (
         sigmas < 2 * SCALE_SHARE * depths
@@ -157,8 +157,8 @@ def _landmarks(
     landmarks = Landmarks(
         pixels.astype(np.float32), codes[features], depths.astype(np.float32), sigmas.astype(np.float32)
     )
-    seen = (structure.features[:, points] >= 0).mean(axis=0)
-    kept = choose(landmarks, worth(seen, features / len(codes)), camera)
+    visible_share = (structure.features[:, points] >= 0).mean(axis=0)
+    kept = choose(landmarks, worth(visible_share, features / len(codes)), camera)
     landmarks, order = settle(landmarks.take(kept), camera)
     return landmarks, points[kept[order]].astype(np.int64)
 
@@ -166,17 +166,17 @@ def _landmarks(
 def _depth_sigmas(structure: Structure, k: int, points: NDArray[np.intp], camera: Camera) -> Array:
     """(M,) m, standard deviations of points along the k-th axis, the cameras taken as true."""
     toward = structure.points[points] - structure.centres[:, None]
-    seen = structure.features[:, points] >= 0
+    visible = structure.features[:, points] >= 0
     distance = np.linalg.norm(toward, axis=2)
     rays = toward / distance[..., None]
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
-    weight = np.where(seen, (camera.fx / PIXEL_SIGMA / distance) ** 2, 0.0)
+    weight = np.where(visible, (camera.fx / PIXEL_SIGMA / distance) ** 2, 0.0)
     covariances = np.linalg.inv(np.einsum("kn,knij->nij", weight, across))
     axis = structure.rotations[k][:, 2]
     return np.asarray(np.sqrt(np.einsum("i,nij,j->n", axis, covariances, axis)), np.float64)
 
 
 def _uncertain(way: Pose2) -> PoseGaussian:
-    """A way with what nobody knows of its scale."""
+    """A trajectory with its unknown scale."""
     sigmas = [np.hypot(SCALE_SHARE * way.x, FLOOR[0]), np.hypot(SCALE_SHARE * way.y, FLOOR[0]), FLOOR[1]]
     return PoseGaussian(way, np.diag(np.square(sigmas)))

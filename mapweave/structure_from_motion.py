@@ -27,10 +27,10 @@ PIXEL_SIGMA = 0.7
 """px, of a SIFT feature; as in triangulation."""
 
 GATE_PX = 3.0
-"""px; a feature that misses its point by more is no sighting of it."""
+"""px; a feature that misses its point by more is an outlier."""
 
 TILT_SIGMA = math.radians(2.0)
-"""By which a camera in the hand is off level, pitch and roll alike, rad."""
+"""Standard deviation of a hand-held camera's pitch and roll, rad."""
 
 HEIGHT_SHARE = 0.1
 """By which it is off its height, as a share of the height."""
@@ -54,7 +54,7 @@ LEAST_PARALLAX = math.radians(1.0)
 """Angle between the rays to a point, rad; with less its depth is not known to a quarter."""
 
 FREE, FIXED = 1e3, 1e-3
-"""Standard deviations of what nobody knows, and of where the map's frame begins, m and rad."""
+"""Standard deviations of unknown values, and of the map's origin, m and rad."""
 
 CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """(3, 3) from x forward, y left, z up to x right, y down, z forward."""
@@ -62,7 +62,7 @@ CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """N points seen in K photographs, in a level frame with z up; its unit is the metre as far as known.
+    """N points seen in K photographs, in a level frame with z up; in metres, up to the unknown scale.
 
     Attributes:
         rotations: (K, 3, 3) world_from_camera; NaN where a camera has not been placed yet.
@@ -87,7 +87,7 @@ def reconstruct(views: Sequence[View], spacing: float) -> Structure:
 
     Args:
         views: of one camera, in the order in which they were taken.
-        spacing: how far apart, on average, m: the scale, of which photographs tell nothing.
+        spacing: how far apart, on average, m: the scale, which photographs do not have.
 
     Returns:
         All cameras, and the points that are determined.
@@ -152,7 +152,7 @@ def _start(
 def _extended(
     views: Sequence[View], structure: Structure, relations: dict[tuple[int, int], _Relation]
 ) -> Structure:
-    """One camera more beside those that are placed: by the points that it shows, or as far on as the last."""
+    """Add a camera: by the points that it shows, or by the last camera's step."""
     placed = np.flatnonzero(structure.placed)
     low, high = int(placed[0]), int(placed[-1])
     visible = (structure.features >= 0) & np.isfinite(structure.points[:, 0])
@@ -162,13 +162,13 @@ def _extended(
         key=lambda camera: int(visible[camera].sum()),
     )
     rotations, centres = structure.rotations.copy(), structure.centres.copy()
-    seen, camera = np.flatnonzero(visible[k]), views[k].camera
-    pixels = views[k].pixels[structure.features[k, seen]].astype(np.float64)
+    visible_points, camera = np.flatnonzero(visible[k]), views[k].camera
+    pixels = views[k].pixels[structure.features[k, visible_points]].astype(np.float64)
     cv2.setRNGSeed(0)
     fits, inside = False, None
-    if len(seen) >= LEAST_POINTS:
+    if len(visible_points) >= LEAST_POINTS:
         fits, turn, shift, inside = cv2.solvePnPRansac(
-            structure.points[seen],
+            structure.points[visible_points],
             pixels,
             _matrix(camera),
             None,
@@ -179,15 +179,15 @@ def _extended(
         rotations[k] = cv2.Rodrigues(turn)[0].T
         centres[k] = -rotations[k] @ shift[:, 0]
     else:
-        near = high if k > high else (low if k < low else k - 1)
-        step = relations[min(k, near), max(k, near)]
+        neighbour = high if k > high else (low if k < low else k - 1)
+        step = relations[min(k, neighbour), max(k, neighbour)]
         length = float(np.linalg.norm(centres[high] - centres[low])) / (high - low)
-        if k > near:
-            centres[k] = centres[near] + length * rotations[near] @ step.direction
-            rotations[k] = rotations[near] @ step.rotation
+        if k > neighbour:
+            centres[k] = centres[neighbour] + length * rotations[neighbour] @ step.direction
+            rotations[k] = rotations[neighbour] @ step.rotation
         else:
-            rotations[k] = rotations[near] @ step.rotation.T
-            centres[k] = centres[near] - length * rotations[k] @ step.direction
+            rotations[k] = rotations[neighbour] @ step.rotation.T
+            centres[k] = centres[neighbour] - length * rotations[k] @ step.direction
     return replace(structure, rotations=rotations, centres=centres)
 
 
@@ -254,43 +254,45 @@ def _rays(views: Sequence[View], structure: Structure) -> Array:
     camera = views[0].camera
     rays = np.full((*structure.features.shape, 3), np.nan)
     for k, view in enumerate(views):
-        seen = np.flatnonzero(structure.features[k] >= 0)
-        pixels = view.pixels[structure.features[k, seen]]
+        visible_points = np.flatnonzero(structure.features[k] >= 0)
+        pixels = view.pixels[structure.features[k, visible_points]]
         slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-        ray = np.column_stack([slopes, np.ones(len(seen))]) @ structure.rotations[k].T
-        rays[k, seen] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        ray = np.column_stack([slopes, np.ones(len(visible_points))]) @ structure.rotations[k].T
+        rays[k, visible_points] = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     return rays
 
 
 def _triangulated(views: Sequence[View], structure: Structure) -> Structure:
     """With points where the rays meet best; NaN for those without parallax, or behind a camera."""
     rays = _rays(views, structure)
-    seen = np.isfinite(rays[..., 0])
+    visible = np.isfinite(rays[..., 0])
     filled = np.nan_to_num(rays)
     # Each ray r through c holds the point p to (1 - r r^T)(p - c) = 0.
-    across = (np.eye(3) - filled[..., :, None] * filled[..., None, :]) * seen[..., None, None]
+    across = (np.eye(3) - filled[..., :, None] * filled[..., None, :]) * visible[..., None, None]
     normal = across.sum(axis=0) + 1e-9 * np.eye(3)
     centres = np.nan_to_num(structure.centres)
     points = np.linalg.solve(normal, np.einsum("knij,kj->ni", across, centres)[..., None])[..., 0]
     toward = points - centres[:, None]
-    ahead = (np.einsum("kni,kni->kn", toward, filled) > 0.0) | ~seen
+    ahead = (np.einsum("kni,kni->kn", toward, filled) > 0.0) | ~visible
     cosine = np.einsum("kni,lni->nkl", filled, filled)
-    both = seen.T[:, :, None] & seen.T[:, None, :]
+    both = visible.T[:, :, None] & visible.T[:, None, :]
     parallax = np.arccos(np.clip(np.where(both, cosine, 1.0).min(axis=(1, 2)), -1.0, 1.0))
-    good = (seen.sum(axis=0) >= 2) & ahead.all(axis=0) & (parallax > LEAST_PARALLAX)
+    good = (visible.sum(axis=0) >= 2) & ahead.all(axis=0) & (parallax > LEAST_PARALLAX)
     return replace(structure, points=np.where(good[:, None], points, np.nan))
 
 
 def _misses(views: Sequence[View], structure: Structure) -> Array:
-    """(K, N) px by which sightings miss their points; NaN where there are none, or nothing is known."""
+    """(K, N) px reprojection errors; NaN where there is no feature, or no point."""
     camera = views[0].camera
     misses = np.full(structure.features.shape, np.nan)
     for k, view in enumerate(views):
-        seen = np.flatnonzero(structure.features[k] >= 0)
-        local = (structure.points[seen] - structure.centres[k]) @ structure.rotations[k]
+        visible_points = np.flatnonzero(structure.features[k] >= 0)
+        local = (structure.points[visible_points] - structure.centres[k]) @ structure.rotations[k]
         ahead = np.where(local[:, 2] > 0.05, local[:, 2], np.nan)
         expected = local[:, :2] / ahead[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        misses[k, seen] = np.linalg.norm(expected - view.pixels[structure.features[k, seen]], axis=1)
+        misses[k, visible_points] = np.linalg.norm(
+            expected - view.pixels[structure.features[k, visible_points]], axis=1
+        )
     return misses
 
 

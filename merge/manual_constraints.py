@@ -1,4 +1,4 @@
-"""Undoing: links that a person has ruled out take no part in the merge, and say who, when and why."""
+"""Apply manual constraints: excluded links take no part in the merge; refusals say who, when and why."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class AppliedConstraints:
     """What is left to merge.
 
     Attributes:
-        maps: without the claims that are ruled out; maps with none of these are the very same objects.
-        links: without those that are ruled out.
+        maps: without the edges that are excluded; maps with none of these are the very same objects.
+        links: without those that are excluded.
         refused: what was taken away, with reasons.
         whole: the maps as they came.
-        rulings: of people, in force or not.
+        rulings: manual constraints, in force or not.
     """
 
     maps: Mapping[MapId, HybridMap]
@@ -34,7 +34,7 @@ class AppliedConstraints:
     rulings: ManualConstraints
 
     def completed(self, merged: MergedMap) -> MergedMap:
-        """The merge of what was left, holding the maps as they came, so that a ruling can be taken back.
+        """The merge of the rest, with the original maps, so that a constraint can be withdrawn.
 
         Args:
             merged: the merge of `maps`, `links` and `refused`.
@@ -43,80 +43,85 @@ class AppliedConstraints:
 
 
 def apply_constraints(
-    maps: Mapping[MapId, HybridMap], links: Iterable[Link], rulings: ManualConstraints
+    maps: Mapping[MapId, HybridMap], links: Iterable[Link], constraints: ManualConstraints
 ) -> AppliedConstraints:
-    """Take away what is ruled out: retired maps, links, and what a robot itself claims to have recognised.
+    """Remove what is excluded: retired maps, links, and a robot's own loop closures.
 
-    How a robot drove and turned while it mapped is measured and stands.
+    Drives and turns that a robot measured while it mapped are kept.
 
     Args:
         maps: by id; they are not changed.
         links: verified.
-        rulings: of people.
+        constraints: manual constraints.
     """
-    if not rulings.in_force:
-        return AppliedConstraints(maps, tuple(links), (), maps, rulings)
+    if not constraints.in_force:
+        return AppliedConstraints(maps, tuple(links), (), maps, constraints)
     kept: list[Link] = []
     refused: list[RefusedLink] = []
     for link in links:
-        ruling = rulings.against(*link.pair)
-        if ruling is None:
+        constraint = constraints.against(*link.pair)
+        if constraint is None:
             kept.append(link)
         else:
-            refused.append(refuse(link, reason_of(ruling)))
-    retired = rulings.retired
-    left = {map_id: one for map_id, one in maps.items() if map_id not in retired}
+            refused.append(refuse(link, reason_of(constraint)))
+    retired = constraints.retired
+    left = {map_id: hybrid_map for map_id, hybrid_map in maps.items() if map_id not in retired}
     kept = [link for link in kept if link.a.map not in retired and link.b.map not in retired]
-    for map_id, one in tuple(left.items()):
+    for map_id, hybrid_map in tuple(left.items()):
         out = [
-            (edge, ruling)
-            for edge in one.edges.values()
-            if edge.kind in CLAIMS and (ruling := rulings.against(edge.a, edge.b)) is not None
+            (edge, constraint)
+            for edge in hybrid_map.edges.values()
+            if edge.kind in CLAIMS and (constraint := constraints.against(edge.a, edge.b)) is not None
         ]
         if out:
-            gone = {edge.id for edge, _ in out}
-            refused += [refuse_edge(edge, reason_of(ruling)) for edge, ruling in out]
+            removed = {edge.id for edge, _ in out}
+            refused += [refuse_edge(edge, reason_of(constraint)) for edge, constraint in out]
             left[map_id] = HybridMap(
-                body for body in one.contents() if not (isinstance(body, EdgePut) and body.edge.id in gone)
+                change
+                for change in hybrid_map.contents()
+                if not (isinstance(change, EdgePut) and change.edge.id in removed)
             )
-    return AppliedConstraints(left, tuple(kept), tuple(refused), maps, rulings)
+    return AppliedConstraints(left, tuple(kept), tuple(refused), maps, constraints)
 
 
 def check_manual_constraint(
-    merged: MergedMap, rulings: ManualConstraints, ruling: ManualConstraint, known_maps: Container[MapId] = ()
+    merged: MergedMap,
+    constraints: ManualConstraints,
+    constraint: ManualConstraint,
+    existing_maps: Container[MapId] = (),
 ) -> None:
-    """Refuse a ruling that would change nothing: it is meant otherwise.
+    """Refuse a constraint that would change nothing: it is a mistake.
 
     Args:
         merged: what it is made about.
-        rulings: that were made before, merged already or not.
-        ruling: the new one.
-        known_maps: that are there, in the merged map or not: any of them can be retired.
+        constraints: earlier constraints, merged already or not.
+        constraint: the new one.
+        existing_maps: that are there, in the merged map or not: any of them can be retired.
 
     Raises:
         InvalidValue: there is nothing to undo, or nothing to take back.
     """
-    first, second = ruling.ends
-    known = next((r for r in rulings.in_force if r.ends == ruling.ends), None)
-    if ruling.retires is not None:
-        if ruling.retires not in known_maps:
-            merged.check(ruling.retires)
-        _check_retirement(known, ruling, ruling.retires)
+    first, second = constraint.ends
+    in_force = next((r for r in constraints.in_force if r.ends == constraint.ends), None)
+    if constraint.retires is not None:
+        if constraint.retires not in existing_maps:
+            merged.check(constraint.retires)
+        _check_retirement(in_force, constraint, constraint.retires)
         return
-    if not ruling.apart:
-        if known is None:
-            raise InvalidValue(f"nothing that people have ruled keeps {first} and {second} apart")
+    if not constraint.apart:
+        if in_force is None:
+            raise InvalidValue(f"no manual constraint keeps {first} and {second} apart")
         return
-    if known is not None:
-        raise InvalidValue(f"{first} and {second} are apart already: {reason_of(known)}")
+    if in_force is not None:
+        raise InvalidValue(f"{first} and {second} are apart already: {reason_of(in_force)}")
     for end in (first, second):
         merged.check(end)
     pairs = [link.pair for link in merged.links]
     false = {refusal.edge for refusal in merged.refused}
     pairs += [
         (edge.a, edge.b)
-        for one in merged.maps.values()
-        for edge in one.edges.values()
+        for hybrid_map in merged.maps.values()
+        for edge in hybrid_map.edges.values()
         if edge.kind in CLAIMS and edge.id not in false
     ]
     for a, b in pairs:
@@ -126,14 +131,14 @@ def check_manual_constraint(
         if {edge.a, edge.b} == {first, second} and edge.kind not in CLAIMS:
             way = f"their robot's way (edge {edge.id}, {edge.kind})"
             raise InvalidValue(
-                f"{first} and {second} are joined by {way}, and what was measured on it stands; a map "
+                f"{first} and {second} are joined by {way}, and that measurement cannot be undone; a map "
                 "that is wrong as a whole can be retired"
             )
     raise InvalidValue(f"no link joins {first} and {second}: there is nothing to undo")
 
 
-def _check_retirement(known: ManualConstraint | None, ruling: ManualConstraint, which: MapId) -> None:
-    if ruling.apart and known is not None:
-        raise InvalidValue(f"map {which} is retired already: {reason_of(known)}")
-    if not ruling.apart and known is None:
+def _check_retirement(in_force: ManualConstraint | None, constraint: ManualConstraint, which: MapId) -> None:
+    if constraint.apart and in_force is not None:
+        raise InvalidValue(f"map {which} is retired already: {reason_of(in_force)}")
+    if not constraint.apart and in_force is None:
         raise InvalidValue(f"map {which} is not retired")

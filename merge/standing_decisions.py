@@ -25,7 +25,7 @@ class StandingDecisions:
         weighed: the same with the landmarks that are known to be found elsewhere too.
         believed: which of them join maps.
         refused: the others, with reasons.
-        refuted: those of them that robots' bodies speak against.
+        refuted: those of them that mutual exclusion refutes.
         graphs: the components.
         fragments: the pieces of map that these are made of.
         size: links that there were when all were decided together.
@@ -55,13 +55,13 @@ class StandingDecisions:
         """Of maps that nothing tied together before."""
         some = list(parts)
         return StandingDecisions(
-            {pair: link for one in some for pair, link in one.given.items()},
-            {pair: link for one in some for pair, link in one.weighed.items()},
-            frozenset().union(*(one.believed for one in some)),
-            {pair: refusal for one in some for pair, refusal in one.refused.items()},
-            frozenset().union(*(one.refuted for one in some)),
-            tuple(graph for one in some for graph in one.graphs),
-            tuple(fragment for one in some for fragment in one.fragments),
-            sum(one.size for one in some),
-            sum(one.changed for one in some),
+            {pair: link for decisions in some for pair, link in decisions.given.items()},
+            {pair: link for decisions in some for pair, link in decisions.weighed.items()},
+            frozenset().union(*(decisions.believed for decisions in some)),
+            {pair: refusal for decisions in some for pair, refusal in decisions.refused.items()},
+            frozenset().union(*(decisions.refuted for decisions in some)),
+            tuple(graph for decisions in some for graph in decisions.graphs),
+            tuple(fragment for decisions in some for fragment in decisions.fragments),
+            sum(decisions.size for decisions in some),
+            sum(decisions.changed for decisions in some),
         )

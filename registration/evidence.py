@@ -1,4 +1,4 @@
-"""Numbers that speak for or against a recognition, beside the number of inliers."""
+"""Evidence for or against a recognition, in addition to the number of inliers."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def gather(
     usable: int,
     fix: PlanarFix,
 ) -> dict[str, float]:
-    """The numbers that speak for a pose; all finite.
+    """The evidence for a pose; all finite.
 
     Args:
-        a: landmarks of the one side.
+        a: landmarks of the first side.
         camera_a: its camera.
         b: landmarks of the other side.
         camera_b: its camera.
@@ -40,20 +40,20 @@ def gather(
         usable: of these, with a depth on either side.
         fix: the pose `a_from_b`.
     """
-    seen_a, seen_b = a.take(inliers[:, 0]), b.take(inliers[:, 1])
-    depths = np.where(seen_a.has_depth, seen_a.depths, seen_b.depths)
+    landmarks_a, landmarks_b = a.take(inliers[:, 0]), b.take(inliers[:, 1])
+    depths = np.where(landmarks_a.has_depth, landmarks_a.depths, landmarks_b.depths)
     sigmas = np.sqrt(np.linalg.eigvalsh(fix.node_from_robot.covariance[:2, :2]))
     return {
         "inliers": float(len(inliers)),
-        "inliers_a": float(seen_a.has_depth.sum()),
-        "inliers_b": float(seen_b.has_depth.sum()),
-        "inliers_3d": float((seen_a.has_depth & seen_b.has_depth).sum()),
+        "inliers_a": float(landmarks_a.has_depth.sum()),
+        "inliers_b": float(landmarks_b.has_depth.sum()),
+        "inliers_3d": float((landmarks_a.has_depth & landmarks_b.has_depth).sum()),
         "matches": float(matches),
         "share": len(inliers) / usable,
-        "cells": float(min(cells(seen_a.pixels, camera_a), cells(seen_b.pixels, camera_b))),
+        "cells": float(min(cells(landmarks_a.pixels, camera_a), cells(landmarks_b.pixels, camera_b))),
         "seen": max(
-            _seen(a, camera_a, camera_b, fix.node_from_robot.mean, inliers[:, 0]),
-            _seen(b, camera_b, camera_a, fix.node_from_robot.mean.inverse(), inliers[:, 1]),
+            _visible(a, camera_a, camera_b, fix.node_from_robot.mean, inliers[:, 0]),
+            _visible(b, camera_b, camera_a, fix.node_from_robot.mean.inverse(), inliers[:, 1]),
         ),
         "log_evidence": fix.log_evidence,
         "mean_square": fix.mean_square,
@@ -64,13 +64,17 @@ def gather(
     }
 
 
-def _seen(
-    known: Landmarks, camera: Camera, other: Camera, known_from_other: Pose2, inliers: NDArray[np.int64]
+def _visible(
+    landmarks: Landmarks,
+    camera: Camera,
+    view_camera: Camera,
+    landmarks_from_view: Pose2,
+    inliers: NDArray[np.int64],
 ) -> float:
     """Share of the landmarks that should be in the other image, by their depth, that are inliers."""
-    points = known_from_other.inverse().apply(known.points_in_robot(camera))
-    expected = int(other.contains(other.project(points)).sum())
-    return min(float(known.has_depth[inliers].sum()) / max(expected, 1), 1.0)
+    points = landmarks_from_view.inverse().apply(landmarks.points_in_robot(camera))
+    expected = int(view_camera.contains(view_camera.project(points)).sum())
+    return min(float(landmarks.has_depth[inliers].sum()) / max(expected, 1), 1.0)
 
 
 def depth_agreement(forward: Sightings, fix: PlanarFix) -> float:

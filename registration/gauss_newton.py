@@ -31,7 +31,7 @@ DEPTH_GATE = 11.34
 """Chi-square 99 % point for 3 degrees of freedom."""
 
 NO_DEPTH_SIGMA = 1e3
-"""Stands for "depth not measured", m."""
+"""Marks "depth not measured", m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class PlanarFix:
 
 
 def stack_sightings(parts: Sequence[Sightings]) -> Stack:
-    """Put the sightings of one problem one after the other."""
+    """Concatenate the sightings of one problem."""
     measured = np.concatenate([part.depth_measured for part in parts])
     depths = np.where(measured, np.concatenate([part.depths for part in parts]), 0.0)
     sigmas = np.where(measured, np.concatenate([part.depth_sigmas for part in parts]), NO_DEPTH_SIGMA)
@@ -105,7 +105,7 @@ def refine(
     rounds: int,
     shift_sigma: float = 0.0,
 ) -> PlanarFix | None:
-    """Bring a pose to its best and say how certain it is.
+    """Refine a pose and compute its covariance.
 
     The covariance is the inverse information, larger where the residuals are larger than they should be,
     and larger by what does not average out: a common scale error of the points, or of the measured depths,

@@ -1,8 +1,8 @@
 """A photograph taken by hand, brought to level by a robot that sees the same.
 
-A camera in the hand is off level and off its height by amounts that nobody knows, and all that it shows is
-off by them alike. A robot's camera is level and at its height. So the photograph's pitch, roll and rise are
-found together with the robot's pose, by Gauss-Newton on the landmarks that were recognised.
+A hand-held camera has an unknown pitch, roll and height, and errors by them are common to all its pixels. A
+robot's camera is level and at its height. So the photograph's pitch, roll and rise are estimated together
+with the robot's pose, by Gauss-Newton on the recognised landmarks.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def level(node: Node, view: View, recognition: Recognition) -> Levelled:
         view: the image's features.
         recognition: of the node in the view, by landmarks that have a depth.
     """
-    seen = recognition.pairs[node.landmarks.has_depth[recognition.pairs[:, 0]]]
-    landmarks, pixels = node.landmarks.take(seen[:, 0]), view.pixels[seen[:, 1]].astype(np.float64)
+    pairs = recognition.pairs[node.landmarks.has_depth[recognition.pairs[:, 0]]]
+    landmarks, pixels = node.landmarks.take(pairs[:, 0]), view.pixels[pairs[:, 1]].astype(np.float64)
 
     def expected(state: Array, longer: float) -> Array:
         depths = landmarks.depths * np.float32(1.0 + longer)

@@ -4,8 +4,8 @@ With the camera at (tx, ty, heading) of the points' frame, c and s the heading's
     X = c px + s py - A,   Y = -s px + c py - B,   A = c tx + s ty,   B = -s tx + c ty.
 - Three bearings: Y = a X for a pixel with slope a is linear in (c, s, A, B). Two differences of three such
   rows lose B, and their cross product is (c, s, A) up to scale.
-- Two points with depth: height over the camera and the pixel's row give a depth (or the image measures one),
-  so both points are known in both frames.
+- Two points with depth: height over the camera and the pixel's row give a depth (or the image measures it),
+  - Two points with depth: height over the camera and the pixel's row give a depth (or the image measures it),
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from mapweave.registration.sightings import Sightings
 
 def hypotheses(sightings: Sightings, count: int, rng: np.random.Generator) -> Array:
     """(H, 3) wanted poses from minimal sets of sightings; degenerate sets are left out."""
-    found = []
+    minimal_poses = []
     if len(sightings) >= 3:
-        found.append(_from_three_bearings(sightings, rng.integers(0, len(sightings), (count, 3))))
+        minimal_poses.append(_from_three_bearings(sightings, rng.integers(0, len(sightings), (count, 3))))
     depths, sigmas = _depths(sightings)
     good = np.flatnonzero(sigmas < 0.3 * depths)
     if len(good) >= 2:
         chosen = good[rng.integers(0, len(good), (count, 2))]
-        found.append(_from_two_depths(sightings, chosen, depths))
-    if not found:
+        minimal_poses.append(_from_two_depths(sightings, chosen, depths))
+    if not minimal_poses:
         return np.zeros((0, 3))
-    poses = np.concatenate(found)
+    poses = np.concatenate(minimal_poses)
     poses = poses[np.isfinite(poses).all(axis=1)]
     return inverse_poses(poses) if sightings.inverted else poses
 

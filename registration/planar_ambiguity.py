@@ -1,9 +1,9 @@
-"""The second pose from which a flat thing looks almost the same.
+"""The second pose from which a flat object looks almost the same.
 
-Seen from afar a wall with prints looks the same from a place as far to the other side of its middle: what
-tells the two apart is perspective, second order in its size over its distance (the two-fold ambiguity of
-planar pose; Schweighofer and Pinz 2006, Collins and Bartoli 2014). Refinement from the one does not find the
-other, so it has to be looked for.
+From afar a wall with prints looks the same from a mirrored position on the other side of its middle: only
+perspective distinguishes the two, which is second order in its size over its distance (the two-fold ambiguity
+of planar pose; Schweighofer and Pinz 2006, Collins and Bartoli 2014). Refinement from one pose does not reach
+the other, so it is tried explicitly.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def mirrored(pose: Pose2, points: NDArray[Any]) -> Pose2:
     middle = points.mean(axis=0)
     line = np.linalg.svd(points - middle, full_matrices=False)[2][0]
     away = np.array([pose.x, pose.y]) - middle
-    there = away - 2.0 * float(away @ line) * line
-    turned = math.atan2(there[1], there[0]) - math.atan2(away[1], away[0])
-    x, y = middle + there
+    mirrored_position = away - 2.0 * float(away @ line) * line
+    turned = math.atan2(mirrored_position[1], mirrored_position[0]) - math.atan2(away[1], away[0])
+    x, y = middle + mirrored_position
     return Pose2(float(x), float(y), wrap_angle(pose.heading + turned))

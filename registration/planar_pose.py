@@ -1,4 +1,4 @@
-"""Where a planar robot stood when it saw known points: three degrees of freedom, robust.
+"""Pose of a planar robot from an image of known points: three degrees of freedom, robust.
 
 Static localization of the paper's section 6 (least squares on n >= 4 known points), made robust: many
 poses are solved at once from two or three sightings each, scored by likelihood, and the best refined.
@@ -64,13 +64,13 @@ def solve_planar_pose(
     settings: PlanarPoseSettings | None = None,
     prior: PoseGaussian | None = None,
 ) -> PlanarFix | None:
-    """Find where the robot stood, from matches of which some may be wrong.
+    """Estimate the robot's pose from matches of which some may be wrong.
 
     Args:
         points: (N, 3) m, in the node's robot frame; rows that are not finite are never inliers.
         pixels: (N, 2) px, where the robot sees them.
         camera: the robot's.
-        rng: draws the hypotheses.
+        rng: for the hypotheses.
         point_covariances: (N, 3, 3) m^2; exact points without.
         settings: how.
         prior: what is known of the pose already; counts as a measurement.
@@ -107,7 +107,7 @@ def solve_sightings(
     settings: PlanarPoseSettings,
     prior: PoseGaussian | None = None,
 ) -> PlanarFix | None:
-    """The same for sightings in either direction; `inliers` is over all parts one after the other."""
+    """The same for sightings in either direction; `inliers` is over the concatenated parts."""
     parts = [part for part in parts if len(part)]
     total = sum(len(part) for part in parts)
     if total < settings.least_inliers:
@@ -120,12 +120,12 @@ def solve_sightings(
         return None
     stack = stack_sightings(parts)
     if total > 2 * PREVIEW:
-        # Most hypotheses are wrong, which a part of the sightings shows as well as all of them.
+        # Most hypotheses are wrong, and a part of the sightings is enough to reject them.
         few = [part.take(slice(None, None, total // PREVIEW)) for part in parts]
         poses = poses[np.argsort(-_scores(few, poses), kind="stable")[: max(len(poses) // 5, 10)]]
     finalists = np.argsort(-_scores(parts, poses), kind="stable")[:FINALISTS]
     improved = [improve(stack, Pose2.from_vector(poses[k]), prior, rounds=2) for k in finalists]
-    kept = [one[0] for one in improved if one is not None]
+    kept = [candidate[0] for candidate in improved if candidate is not None]
     if not kept:
         return None
     best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
@@ -142,25 +142,25 @@ def _weighed(
     s: PlanarPoseSettings,
     prior: PoseGaussian | None,
 ) -> PlanarFix:
-    """The better of a pose and the one mirrored in what it sees, with how the other compares."""
-    seen = fix.inliers & ~stack.inverted
-    if int(seen.sum()) < s.least_inliers:
+    """The better of a pose and its mirror image, with the score of the other."""
+    inliers = fix.inliers & ~stack.inverted
+    if int(inliers.sum()) < s.least_inliers:
         return fix
     mean = fix.node_from_robot.mean
-    other = improve(stack, mirrored(mean, stack.points[seen, :2]), prior, rounds=PLANAR_POSE_ROUNDS)
-    if other is None or other[0].distance(mean) < APART:
+    mirror = improve(stack, mirrored(mean, stack.points[inliers, :2]), prior, rounds=PLANAR_POSE_ROUNDS)
+    if mirror is None or mirror[0].distance(mean) < APART:
         return fix
-    ours, theirs = _scores(parts, np.stack([mean.vector, other[0].vector])).tolist()
-    if theirs <= ours:
-        return replace(fix, rival=max(theirs, 0.0) / ours if ours > 0.0 else 1.0)
-    better = refine(stack, other[0], s.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
+    score, mirror_score = _scores(parts, np.stack([mean.vector, mirror[0].vector])).tolist()
+    if mirror_score <= score:
+        return replace(fix, rival=max(mirror_score, 0.0) / score if score > 0.0 else 1.0)
+    better = refine(stack, mirror[0], s.scale_sigma, prior, rounds=PLANAR_POSE_ROUNDS)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
         return replace(fix, rival=1.0)
-    return replace(better, rival=max(ours, 0.0) / theirs)
+    return replace(better, rival=max(score, 0.0) / mirror_score)
 
 
 def _scores(parts: Sequence[Sightings], poses: Array) -> Array:
-    """(H,) nats: how much better each of the (H, 3) poses explains the sightings than chance does."""
+    """(H,) nats: log likelihood ratio of each of the (H, 3) poses against chance."""
     scores = np.zeros(len(poses))
     for part in parts:
         scores += part.log_ratios(poses).sum(axis=1)

@@ -72,7 +72,7 @@ class PoseGaussians:
         try:
             solved = np.linalg.solve(self.covariances, off[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
-            # Rounding beside a huge variance may leave a covariance singular.
+            # Rounding next to a huge variance may make a covariance singular.
             solved = (np.linalg.pinv(self.covariances, hermitian=True) @ off[:, :, None])[:, :, 0]
         out: Array = (off * solved).sum(axis=1)
         return out

@@ -19,11 +19,11 @@ from mapweave.registration.recognition import Recognition, of_unknown_scale
 from mapweave.registration.sightings import Sightings
 
 LEAST_SIGMA, ROUNDS = 0.1, 3
-"""px, pixels are rounded in a node; and how often the noise is measured anew."""
+"""px, pixels are rounded in a node; and how often the noise is estimated again."""
 
 PRIOR_COUNT, PRIOR_SIGMA = 8, 0.5
-"""What is thought of a pixel's noise before, as if by so many pixels, px: few that happen to agree do not
-make a sharp image."""
+"""Prior of a pixel's noise, as if from so many pixels, px: few pixels that happen to agree do not make a
+sharp image."""
 
 SHIFT_SIGMA = 0.1
 """px, what is left of a lens and of where features settle in a pixel, the same for a whole image."""
@@ -32,7 +32,7 @@ MAD_TO_SIGMA = 1.4826
 """A Gaussian's standard deviation over the median of its absolute values."""
 
 
-def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSettings) -> PoseGaussian:
+def refine_pose(node: Node, view: View, recognition: Recognition, pose: PlanarPoseSettings) -> PoseGaussian:
     """Where the view was taken, by the landmarks that were recognised, weighted by what they are worth.
 
     The noise of a pixel is the median of what is left of all, so that a few wrong ones do not count; its
@@ -41,20 +41,20 @@ def look_closer(node: Node, view: View, found: Recognition, pose: PlanarPoseSett
     Args:
         node: the place.
         view: the image's features.
-        found: that the view shows the node, by landmarks of the node that have a depth.
+        recognition: that the view shows the node, by landmarks of the node that have a depth.
         pose: how poses are found.
 
     Returns:
         `node_from_robot`; that of the recognition where there is nothing to add.
     """
-    landmarks = node.landmarks.take(found.pairs[:, 0])
-    pixels = view.pixels[found.pairs[:, 1]].astype(np.float64)
-    known = landmarks.has_depth
-    if int(known.sum()) < pose.least_inliers:
-        return found.node_from_robot
-    landmarks, pixels = landmarks.take(known), pixels[known]
+    landmarks = node.landmarks.take(recognition.pairs[:, 0])
+    pixels = view.pixels[recognition.pairs[:, 1]].astype(np.float64)
+    has_depth = landmarks.has_depth
+    if int(has_depth.sum()) < pose.least_inliers:
+        return recognition.node_from_robot
+    landmarks, pixels = landmarks.take(has_depth), pixels[has_depth]
     points = landmarks.points_in_robot(node.camera)
-    best, sigma = found.node_from_robot, pose.pixel_sigma
+    best, sigma = recognition.node_from_robot, pose.pixel_sigma
     scale_share, tilt_sigma = node.landmarks.scale_share, node.landmarks.tilt_sigma
     for _ in range(ROUNDS):
         fresh = min(max(_noise(points, pixels, view, best), LEAST_SIGMA), pose.pixel_sigma)

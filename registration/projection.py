@@ -5,7 +5,7 @@ With q the point in the axes of a robot at (x, y, heading), forward, left and up
     X = q_x - mount_forward,  a = q_y / X,  b = (q_z - mount_height) / X,  u = cx - fx a,  v = cy - fy b.
 By the point, in the robot's axes, du = (fx a, -fx, 0) / X and dv = (fy b, 0, -fy) / X.
 
-These are kernels (mapweave.hybridmap.jit): what is written for sighting n runs for each in turn or for all
+These are kernels (mapweave.hybridmap.jit): the code for sighting n runs for each in turn or for all
 at once.
 """
 
@@ -78,7 +78,7 @@ class Poses(NamedTuple):
 
 @for_each_pair
 def _log_ratio(h: Index, n: Index, seen: Seen, poses: Poses) -> Vector:
-    """How much likelier sighting n is under pose h than as a wrong match, nats; see `log_ratios`."""
+    """Log likelihood ratio of sighting n under pose h against a wrong match, nats; see `log_ratios`."""
     optics, p = seen.optics, seen.covariances
     c, s = poses.cos[h], poses.sin[h]
     dx, dy = seen.points[n, 0] - poses.x[h], seen.points[n, 1] - poses.y[h]
@@ -112,7 +112,7 @@ def _log_ratio(h: Index, n: Index, seen: Seen, poses: Poses) -> Vector:
 
 @compiled
 def log_ratios(seen: Seen, poses: Poses) -> Matrix:
-    """(H, N) how much likelier sightings are under poses than as wrong matches, nats; 0 where the point is
+    """(H, N) log likelihood ratios of sightings under poses against wrong matches, nats; 0 where the point is
     behind the camera or outside the 99 % gate.
     """
     return _log_ratio(len(poses.x), len(seen.points), seen, poses)
@@ -160,7 +160,7 @@ class Linear(NamedTuple):
         distance2: (N,) squared normalised residuals.
         log_ratios: (N,) nats against a wrong match, not cut.
         inliers: (N,).
-        weights: (N,) probability that a sighting is right, 0 of those that are no inliers.
+        weights: (N,) probability that a sighting is right, 0 for outliers.
     """
 
     reprojection_px: Matrix
@@ -176,10 +176,10 @@ class Linear(NamedTuple):
 
 @for_each
 def _linearise(n: Index, stack: Stack, pose: Vector, points: Matrix, out: Linear) -> None:
-    """Fill in what `linearise` says of sighting n."""
+    """Fill in the result of `linearise` for sighting n."""
     fx, fy, cx, cy = stack.optics[n, 0], stack.optics[n, 1], stack.optics[n, 2], stack.optics[n, 3]
     x, y, cos, sin = pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2])
-    # Where the robot whose camera it is stands in the points' frame: at the pose, or at its inverse.
+    # Pose of the camera's robot in the points' frame: the pose, or its inverse.
     inverse = 1.0 * stack.inverted[n]
     direct = 1.0 - inverse
     c, s = cos, sin * (direct - inverse)
@@ -270,7 +270,7 @@ def normal_equations(linear: Linear) -> Matrix:
 
 @compiled
 def determined(information: Matrix) -> bool:
-    """Whether a pose's (3, 3) information is far from singular; lengths and angles count alike at 1 m."""
+    """Whether a pose's (3, 3) information is well conditioned; lengths are compared with angles at 1 m."""
     if not np.isfinite(information).all():
         return False
     values = np.linalg.eigvalsh(information)

@@ -117,7 +117,7 @@ class Refusal:
 def recognise(
     node: Node, view: View, settings: RecognitionSettings | None, rng: np.random.Generator
 ) -> Recognition | None:
-    """Find where a view was taken near a node, or None; `examine_view` says why not."""
+    """Pose of a view with respect to a node, or None; `examine_view` gives the reason."""
     verdict = examine_view(node, view, settings, rng)
     return verdict if isinstance(verdict, Recognition) else None
 
@@ -125,7 +125,7 @@ def recognise(
 def register(
     a: Node, b: Node, settings: RecognitionSettings | None, rng: np.random.Generator
 ) -> Recognition | None:
-    """Find `a_from_b` from what two nodes both see, or None; `examine_nodes` says why not."""
+    """`a_from_b` from the common landmarks of two nodes, or None; `examine_nodes` gives the reason."""
     verdict = examine_nodes(a, b, settings, rng)
     return verdict if isinstance(verdict, Recognition) else None
 
@@ -139,7 +139,7 @@ def examine_view(
         node: the place.
         view: the image's features.
         settings: when an image counts as recognised; None for the defaults.
-        rng: draws hypotheses.
+        rng: for the hypotheses.
 
     Returns:
         A recognition, or why there is none.
@@ -162,7 +162,7 @@ def examine_matches(
         view: the image's features.
         pairs: (K, 2), landmark of the node and feature of the view; no index twice in a column.
         settings: when an image counts as recognised; None for the defaults.
-        rng: draws hypotheses.
+        rng: for the hypotheses.
 
     Returns:
         A recognition, or why there is none.
@@ -185,7 +185,7 @@ def examine_nodes(
         a: one place.
         b: the other.
         settings: when two nodes count as the same place; None for the defaults.
-        rng: draws hypotheses.
+        rng: for the hypotheses.
 
     Returns:
         A recognition whose `node_from_robot` is `a_from_b`, or why there is none.
@@ -250,26 +250,28 @@ def of_unknown_scale(pose: PoseGaussian, share: float, of_node: Camera, of_view:
 
 
 def _sightings(
-    known: Landmarks,
-    known_camera: Camera,
-    seen: Landmarks,
-    seen_camera: Camera,
+    landmarks: Landmarks,
+    landmarks_camera: Camera,
+    view: Landmarks,
+    view_camera: Camera,
     pairs: NDArray[Any],
     s: RecognitionSettings,
     inverted: bool,
     scale_share: float,
 ) -> Sightings:
     """Points of the known side, pixels and depths of the seen side."""
-    tilt_sigma = known.tilt_sigma
-    known, seen = known.take(pairs[:, 0]), seen.take(pairs[:, 1])
+    tilt_sigma = landmarks.tilt_sigma
+    landmarks, view = landmarks.take(pairs[:, 0]), view.take(pairs[:, 1])
     return Sightings.build(
-        known.points_in_robot(known_camera),
-        seen.pixels,
-        seen_camera,
-        covariances=known.covariances_in_robot(known_camera, s.pose.pixel_sigma, scale_share, tilt_sigma),
+        landmarks.points_in_robot(landmarks_camera),
+        view.pixels,
+        view_camera,
+        covariances=landmarks.covariances_in_robot(
+            landmarks_camera, s.pose.pixel_sigma, scale_share, tilt_sigma
+        ),
         pixel_sigma=s.pose.pixel_sigma,
-        depths=seen.depths,
-        depth_sigmas=seen.depth_sigmas,
+        depths=view.depths,
+        depth_sigmas=view.depth_sigmas,
         inverted=inverted,
     )
 

@@ -1,8 +1,8 @@
 """Which landmarks a node keeps: those that will be found again, all over the image, and unlike each other.
 
-A landmark's worth is given by who has followed it. What else is kept already lowers it: a second landmark
-at the same spot adds little, for a pose is determined by spread. So they are chosen one by one, always
-the one that is worth most then, until the node has cost what it may.
+A landmark's worth depends on how well it was tracked, and is lowered by those already selected: a second
+landmark at the same spot adds little, since a pose is determined by spread. So they are selected greedily,
+always the one of highest worth, until the node's byte budget is used.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LANE_BITS = 3.25
 """What a landmark costs at most beyond the logarithms of its numbers: whole bits, and the row it is in."""
 
 DOUBT = 0.3
-"""A landmark that was not seen again is not worthless: the robot may just have looked elsewhere."""
+"""A landmark that was not seen again keeps some worth: the robot may just have turned away."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def distinctness(landmarks: Landmarks, alike: float) -> Array:
 
 
 def _ranked(places: Array, value: Array, crowd: float) -> NDArray[np.int64]:
-    """All indices, each time the one that is worth most by what is there before it."""
+    """All indices in greedy order of worth, given those before."""
     away = ((places[:, None] - places[None]) ** 2).sum(axis=2)
     nearness = np.exp(-away / (2 * crowd**2))
     crowded, left = np.ones(len(places)), np.array(value, np.float64)
@@ -116,9 +116,9 @@ def _bytes_of_first(landmarks: Landmarks, camera: Camera) -> Array:
     """(N,) what a node with the first 1, 2 ... N landmarks costs at most."""
     t, steps = landmark_tables(), 2.0 ** PixelGrid.of(camera).shift
     share, depth = round_depths(landmarks.depths, landmarks.depth_sigmas)
-    fine, known = FINE_BITS[share], share > 0
+    fine, with_depth = FINE_BITS[share], share > 0
     codes = (TOTAL_BITS - np.log2(t.codes[np.arange(DIMENSIONS), landmarks.codes])).sum(axis=1)
-    cells = np.where(known, TOTAL_BITS - np.log2(np.maximum(t.cells[depth >> fine], 1)) + fine, 0.0)
+    cells = np.where(with_depth, TOTAL_BITS - np.log2(np.maximum(t.cells[depth >> fine], 1)) + fine, 0.0)
     shares = TOTAL_BITS - np.log2(t.shares[share])
     count = np.arange(1, len(landmarks) + 1)
     # By rows, a landmark's y costs its share of the image only.

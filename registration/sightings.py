@@ -1,7 +1,7 @@
 """Known points seen in an image of a planar robot: prediction, uncertainty and likelihood.
 
-Geometry, for a robot at (x, y, heading) of the points' frame whose camera stands `mount_forward` ahead of the
-axle and looks along the robot's x axis: with q the point in the robot frame,
+Geometry, for a robot at (x, y, heading) of the points' frame whose camera is `mount_forward` ahead of the
+axle and faces along the robot's x axis: with q the point in the robot frame,
     X = q_x - mount_forward,  Y = q_y,  u = cx - fx Y / X,  v = cy - fy (q_z - mount_height) / X.
 """
 
@@ -98,7 +98,7 @@ class Sightings:
         return np.isfinite(self.depths) & np.isfinite(self.depth_sigmas)
 
     def log_ratios(self, poses: Array) -> Array:
-        """How much likelier each sighting is under each pose than as a wrong match.
+        """Log likelihood ratio of each sighting under each pose against a wrong match.
 
         A right match is Gaussian around the point's projection, with the point's covariance carried into
         the image and the pixel's noise added; a wrong one is anywhere in the image. So a point that is hardly

@@ -25,7 +25,7 @@ AHEAD = 0.5
 PATIENCE_TICKS = 20
 """Who had to wait so long turns back."""
 GAP = 0.05
-"""Nobody comes nearer to a robot's side than this, m."""
+"""No actor comes nearer to a robot's side than this, m."""
 TEXELS_PER_METRE = 300
 
 
@@ -53,7 +53,7 @@ FIGURES = {"person": Figure(0.3, 0.45, 1.75), "box": Figure(0.4, 0.4, 0.4)}
 
 
 class Actor:
-    """Somebody on a path, to and fro.
+    """A person or thing that moves to and fro on a path.
 
     Attributes:
         what: a name of `FIGURES`.
@@ -63,12 +63,12 @@ class Actor:
     """
 
     def __init__(
-        self, what: str, path: Points, speed: float, until: int, robots: Array, radius: float
+        self, kind: str, path: Points, speed: float, until: int, robots: Array, radius: float
     ) -> None:
         """Appear at the first place of the path where no robot is.
 
         Args:
-            what: a name of `FIGURES`.
+            kind: a name of `FIGURES`.
             path: ((x m, y m), ...) in world, at least two different points.
             speed: m/s.
             until: the last tick.
@@ -78,10 +78,10 @@ class Actor:
         Raises:
             InvalidValue: robots stand all along the path.
         """
-        self.what = what
+        self.what = kind
         self.path = tuple(path)
         self.until = until
-        self.figure = FIGURES[what]
+        self.figure = FIGURES[kind]
         self._speed = speed
         self._radius = radius
         self._lengths = [math.dist(a, b) for a, b in pairwise(self.path)]
@@ -141,10 +141,10 @@ class Actor:
         return bool((distances_to([zone], robots) < self._radius).any())
 
 
-def figure_panels(what: str, seed: Sequence[int]) -> PanelSet:
+def figure_panels(kind: str, seed: Sequence[int]) -> PanelSet:
     """What a figure looks like, in its own frame."""
-    figure = FIGURES[what]
-    painter = clothes if what == "person" else surface.crate
+    figure = FIGURES[kind]
+    painter = clothes if kind == "person" else surface.crate
     height_px = round(figure.height * TEXELS_PER_METRE)
     widths = (figure.width, figure.length, figure.width, figure.length)
     sides = [
@@ -154,11 +154,11 @@ def figure_panels(what: str, seed: Sequence[int]) -> PanelSet:
     size = [round(side * TEXELS_PER_METRE) for side in (figure.length, figure.width)]
     top = Texture(size[0], size[1], (*seed, 4), surface.crate)
     block = Block(Rectangle(0.0, 0.0, figure.length, figure.width), 0.0, figure.height)
-    return PanelSet.of(block_panels(block, sides, top if what == "box" else None))
+    return PanelSet.of(block_panels(block, sides, top if kind == "box" else None))
 
 
 def clothes(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
-    """Somebody upright: shoes, trousers with creases, a patterned jacket, a head."""
+    """A person: shoes, trousers with creases, a patterned jacket, a head."""
     grain = clouds(rng, width_px, height_px, 1.4)
     canvas: NDArray[np.float32] = np.full((height_px, width_px), 90.0, np.float32)
     head, waist, shoes = (round(share * height_px) for share in (0.14, 0.53, 0.95))

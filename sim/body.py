@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mapweave.sim.physics import Physics
 
 WHEEL_RADIUS = 0.05
-"""Nominal, m: what the robot believes."""
+"""Nominal, m: as the robot assumes."""
 BODY_HEIGHT = 0.2
 """Top of the footprint's cylinder, m; the camera stands on a mast above."""
 CASTER_AT = 0.11
@@ -36,7 +36,7 @@ EPISODE_TICKS = 10
 
 @dataclass(frozen=True)
 class BodySettings:
-    """How a body differs from the ideal.
+    """How a robot's body differs from the ideal.
 
     Attributes:
         radius_error: standard deviation of each wheel's true radius, as a share.
@@ -73,7 +73,7 @@ class BodySettings:
     def wheel_noise(self, tick: float) -> float:
         """What a calibration drive would give for a wheel's noise, as a share of the way of a tick (s).
 
-        Slip is alike from tick to tick; over a way its errors add up as those of so much noise that is not.
+        Slip is correlated from tick to tick; over a way it has the effect of so much white noise.
         """
         return self.slip * math.sqrt(2.0 * SLIP_WANDERS / tick)
 
@@ -102,7 +102,7 @@ class Body:
             physics: where it lives.
             floor: number of the floor's body.
             pose: world_from_robot.
-            description: what the robot is believed to be; its true wheels and axle differ a little.
+            description: of the robot, nominal; its true wheels and axle differ a little.
             seed: of the differences and of slip.
             settings: how much they may differ.
         """
@@ -136,7 +136,7 @@ class Body:
             collisionFramePosition=[0, 0, 0.03 + height / 2 - WHEEL_RADIUS],
         )  # fmt: skip
         half = self._axle / 2
-        # Suspended such that wheels of any size end at the same height: the robot stands level.
+        # Suspended such that wheels of any size end at the same height: the robot is level.
         left, right = (self._radii - WHEEL_RADIUS).tolist()
         places = [
             [0, half, left], [0, -half, right], [CASTER_AT, 0, CASTER_GAP], [-CASTER_AT, 0, CASTER_GAP],
@@ -156,8 +156,8 @@ class Body:
         )  # fmt: skip
         for wheel in (0, 1):
             p.changeDynamics(number, wheel, lateralFriction=1.0, jointDamping=0.0)
-        for other in (2, 3, -1):
-            p.changeDynamics(number, other, lateralFriction=0.0)
+        for other_link in (2, 3, -1):
+            p.changeDynamics(number, other_link, lateralFriction=0.0)
         p.changeDynamics(number, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
         return number
 
@@ -195,7 +195,7 @@ class Body:
         self._free_ticks = 0 if self.bumped else self._free_ticks + 1
 
     def odometry(self) -> Odometry:
-        """What the encoders say since the last call, by the nominal wheels and axle."""
+        """What the encoders measured since the last call, by the nominal wheels and axle."""
         per_turn = self._settings.ticks_per_turn
         ticks = np.round(self._turned / (2 * math.pi) * per_turn)
         left, right = (ticks - self._ticks) / per_turn * 2 * math.pi * WHEEL_RADIUS
@@ -236,7 +236,7 @@ class Body:
 
 
 def body_panels(number: int) -> PanelSet:
-    """What a robot looks like to others, in its own frame: a low crate with its own prints."""
+    """A robot's appearance to others, in its own frame: a low crate with its own prints."""
     side = 0.21
     textures = [
         Texture(round(side * 300), round(0.17 * 300), (0xB0D1, number, k), surface.crate) for k in range(4)

@@ -29,14 +29,14 @@ from mapweave.wire.bus import Bus, Request
 log = logging.getLogger(__name__)
 
 POLL = 0.1
-"""How often a bridge that has nothing to do looks whether it shall stop or lose its patience, s."""
+"""How often an idle bridge checks for its end and its time limits, s."""
 
 
 class SimBridge:
     """Serves every robot of a simulation, and the control key.
 
-    The bus's thread only puts questions into an inbox. The simulation is touched by the thread that calls
-    `run` and by nobody else, so it needs no locks, and interventions happen between ticks.
+    The bus's thread only puts questions into an inbox. Only the thread that calls `run` touches the
+    simulation, so it needs no locks, and interventions happen between ticks.
     """
 
     def __init__(
@@ -57,8 +57,8 @@ class SimBridge:
             fleet: which fleet.
             patience: how long the other robots wait for one that does not ask, s.
             expected: how many robots must have asked before the first tick; all if not given.
-            held: let no time pass before somebody asks for it (see SimControl.advance).
-            farewell: how long `close` waits for agents that have not heard yet that the end has come, s.
+            held: let no time pass until a client asks for it (see SimControl.advance).
+            farewell: how long `close` waits for agents that do not know of the end yet, s.
         """
         keys = SimKeys(fleet)
         self._keys = keys
@@ -66,14 +66,16 @@ class SimBridge:
         self._farewell = farewell
         self._lockstep = Lockstep(simulation.robots, patience, expected)
         self._wall = dict.fromkeys(("waiting", "replying", "control"), 0.0)
-        self._desk = GroundTruthService(simulation, lambda: self._lockstep.active, self._wall, self._stop)
+        self._ground_truth = GroundTruthService(
+            simulation, lambda: self._lockstep.active, self._wall, self._stop
+        )
         self._changed = threading.Condition()
         self._inbox: deque[Callable[[], None]] = deque()
         self._limit: int | None = 0 if held else None
         self._advancing: Request | None = None
         self._stopping = False
         self._ended = False
-        self._told: set[str] = set()
+        self._announced: set[str] = set()
         self._declared = [bus.watch(keys.robot_drivers(), self._presence)]
         for name in simulation.robots:
             self._declared.append(bus.serve(keys.robot_describe(name), self._describer(name)))
@@ -83,7 +85,7 @@ class SimBridge:
         self._declared.append(bus.announce(keys.sim_alive()))
 
     def run(self, stop: threading.Event) -> None:
-        """Simulate until told to stop, here or by a control message; then refuse whoever still asks.
+        """Simulate until stopped, here or by a control message; then refuse further questions.
 
         Raises:
             MapweaveError: the simulation fails.
@@ -94,7 +96,7 @@ class SimBridge:
                 seats = self._lockstep.due(time.monotonic())
                 asking = [seat for seat in seats if isinstance(seat.step, Rendezvous)]
                 if asking:
-                    # Everybody has finished the tick: these may ask the fleet now, the others wait for them.
+                    # All have finished the tick: these may ask the fleet now, the others wait for them.
                     for seat in asking:
                         self._lockstep.answer(seat, b"", time.monotonic())
                 elif self._may_advance(seats):
@@ -107,13 +109,13 @@ class SimBridge:
             self._end()
 
     def close(self) -> None:
-        """Tell the agents that the simulation has ended, then leave the bus. Twice is no error."""
+        """Announce the end to the agents, then leave the bus. Idempotent."""
         self._end()
         with self._changed:
-            if not self._changed.wait_for(lambda: self._lockstep.active <= self._told, self._farewell):
-                untold = sorted(self._lockstep.active - self._told)
+            if not self._changed.wait_for(lambda: self._lockstep.active <= self._announced, self._farewell):
+                untold = sorted(self._lockstep.active - self._announced)
                 log.info("these robots' agents have not asked since the end: %s", ", ".join(untold))
-                self._told.update(untold)
+                self._announced.update(untold)
         for declared in self._declared:
             declared.close()
 
@@ -132,20 +134,20 @@ class SimBridge:
                 self._lockstep.answer(seat, encode_observation(observation), time.monotonic())
 
     def _may_advance(self, seats: list[Seat]) -> bool:
-        """Whether to tick: when all have asked, or nobody drives and somebody wants time to pass."""
+        """Whether to tick: when all have asked, or no robot is driven and a client wants time to pass."""
         if self._limit is None:
             return bool(seats)
         return self._simulation.tick < self._limit and (bool(seats) or not self._lockstep.active)
 
     def _reached(self) -> None:
-        """All that was to be simulated is, and every robot has finished: say so to who waits for it."""
+        """The requested time is simulated, and every robot has finished: answer the waiting clients."""
         if self._advancing is not None:
-            self._advancing.reply(self._desk.reached())
+            self._advancing.reply(self._ground_truth.reached())
             self._advancing = None
 
     def _advance(self, tick: int, request: Request) -> None:
         if self._advancing is not None:
-            self._advancing.refuse(f"asked anew, {AGAIN}")
+            self._advancing.refuse(f"asked again, {AGAIN}")
         self._limit, self._advancing = tick, request
 
     def _read_inbox(self) -> None:
@@ -159,11 +161,11 @@ class SimBridge:
     def _answer_control(self, request: Request) -> None:
         with self._timed("control"):
             try:
-                tick = self._desk.advances_to(request.payload)
+                tick = self._ground_truth.advances_to(request.payload)
                 if tick is not None:
                     self._advance(tick, request)
                     return
-                request.reply(self._desk.answer(request.payload))
+                request.reply(self._ground_truth.answer(request.payload))
             except MapweaveError as error:
                 request.refuse(str(error))
 
@@ -180,7 +182,7 @@ class SimBridge:
         if self._advancing is not None:
             self._advancing.refuse(ENDED)
             self._advancing = None
-        self._tell(self._lockstep.refuse_all(ENDED))
+        self._announce(self._lockstep.refuse_all(ENDED))
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
@@ -203,7 +205,7 @@ class SimBridge:
             step = decode(request.payload)
             if not self._put(lambda: self._receive(name, step, request)):
                 request.refuse(ENDED)
-                self._tell({name})
+                self._announce({name})
 
         return take
 
@@ -217,7 +219,7 @@ class SimBridge:
     def _presence(self, key: str, alive: bool) -> None:
         robot, driver = self._keys.parse_robot_driver(key)
         if not self._put(lambda: self._lockstep.presence(robot, driver, alive)) and not alive:
-            self._tell({robot})
+            self._announce({robot})
 
     def _put(self, task: Callable[[], None]) -> bool:
         """Leave a task for the simulation's thread; False if that has ended."""
@@ -228,8 +230,8 @@ class SimBridge:
             self._changed.notify_all()
             return True
 
-    def _tell(self, names: set[str]) -> None:
+    def _announce(self, names: set[str]) -> None:
         """Remember who knows of the end, or needs to know no more."""
         with self._changed:
-            self._told |= names
+            self._announced |= names
             self._changed.notify_all()

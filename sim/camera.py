@@ -122,8 +122,8 @@ class CameraSetup:
         again, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)
         if np.abs(again.reshape(-1, 2) - pixels.reshape(-1, 2)).max() > 0.05:
             return False
-        # From the axis to every pixel the picture must grow, and not hardly: between the pixels that are
-        # looked at here it would fold, or Newton's method find no way.
+        # The distorted radius must grow clearly from the axis to every pixel: between the pixels that are
+        # tested here it would fold otherwise, or Newton's method not converge.
         shares = np.linspace(0.0, 1.0, 40)[:, None, None]
         return bool((_jacobian(shares * rays, lens)[3] > LEAST_GROWTH).all())
 
@@ -167,14 +167,14 @@ def _jacobian(rays: Array, lens: NDArray[Any]) -> tuple[Array, Array, Array, Arr
     return xx, xy, yy, xx * yy - xy * xy
 
 
-def check_range(what: str, value: float, low: float, high: float) -> None:
+def check_range(name: str, value: float, low: float, high: float) -> None:
     """Refuse a number.
 
     Raises:
         InvalidValue: it is not finite or not between the limits.
     """
     if not (math.isfinite(value) and low <= value <= high):
-        raise InvalidValue(f"{what} is {value:g}, must be between {low:g} and {high:g}")
+        raise InvalidValue(f"{name} is {value:g}, must be between {low:g} and {high:g}")
 
 
 CAMERAS: dict[str, CameraSetup] = {

@@ -27,7 +27,7 @@ class EventExecutor:
 
         Args:
             stage: where things happen.
-            robots: whom they happen to, by name.
+            robots: of the simulation, by name.
             seed: of everything that an event leaves open.
         """
         self._stage = stage
@@ -64,9 +64,9 @@ class EventExecutor:
     def _kidnap(self, event: Kidnap, rng: np.random.Generator) -> str:
         robot, plan = self._robot(event.robot), self._stage.world.plan
         radius = robot.description.radius + SPACE
-        others = [(r.pose.x, r.pose.y) for name, r in self._robots.items() if name != event.robot]
-        others += [(actor.pose.x, actor.pose.y) for actor in self._stage.actors]
-        taken = np.array(others).reshape(-1, 2)
+        occupied = [(r.pose.x, r.pose.y) for name, r in self._robots.items() if name != event.robot]
+        occupied += [(actor.pose.x, actor.pose.y) for actor in self._stage.actors]
+        taken = np.array(occupied).reshape(-1, 2)
         if event.near:
             if event.near == event.robot:
                 raise InvalidValue(f"kidnap: {event.robot} cannot be put near itself")
@@ -106,7 +106,7 @@ class EventExecutor:
         self._stage.rearrange(after)
         pairs = zip(before.plan.furniture, after.plan.furniture, strict=True)
         moved = sum(old != new for old, new in pairs)
-        return f"{moved} of {len(after.plan.furniture)} pieces of furniture stand elsewhere"
+        return f"{moved} of {len(after.plan.furniture)} pieces of furniture have moved"
 
     def _ticks(self, seconds: float, least: int) -> int:
         tick = next(iter(self._robots.values())).description.tick

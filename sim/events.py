@@ -77,7 +77,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Walk:
-    """Somebody, or something, goes to and fro for a while, then is gone.
+    """A person or thing goes to and fro for a while, then leaves.
 
     Attributes:
         what: "person" or "box".
@@ -114,7 +114,7 @@ class Walk:
 
 @dataclass(frozen=True)
 class MoveFurniture:
-    """Furniture stands elsewhere from now on.
+    """Some furniture moves to other places.
 
     Attributes:
         share: of the pieces, more than 0.

@@ -1,4 +1,4 @@
-"""Sensors that fail for a while: what they then say instead of the truth."""
+"""Sensors that fail for a while: what they then return instead of the truth."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Faults:
         return round(self._amounts["camera", "blocked"])
 
     def odometry(self, true: Odometry, tick: int) -> Odometry:
-        """What the encoders say."""
+        """What the encoders return."""
         jump, self._jump = self._jump, 0.0
         wheels = np.array([-0.5, 0.5]) * self._axle * true.turn + true.forward
         if self.active("encoders", "scale", tick):
@@ -68,7 +68,7 @@ class Faults:
         return Odometry((left + right) / 2 + jump, (right - left) / self._axle)
 
     def ranges(self, true: Array, reach: float, tick: int) -> Array:
-        """What the rangers say, (K,) m."""
+        """What the rangers return, (K,) m."""
         if self.active("rangers", "drop", tick):
             return np.full(len(true), reach)
         if not self.active("rangers", "spike", tick):
@@ -77,13 +77,13 @@ class Faults:
         return np.where(wrong, true * self._rng.random(len(true)), true)
 
     def bumped(self, true: bool, tick: int) -> bool:
-        """What the bumper says."""
+        """What the bumper returns."""
         if self.active("bumper", "stuck", tick):
             return True
         return true and not self.active("bumper", "dead", tick)
 
     def _any(self, sensor: str, tick: int) -> bool:
-        return any(tick <= until for (one, _), until in self._until.items() if one == sensor)
+        return any(tick <= until for (failed, _), until in self._until.items() if failed == sensor)
 
 
 def describe(fault: Fail) -> str:

@@ -1,4 +1,4 @@
-"""The floor plan: what stands where, for clearance queries and for drawing."""
+"""The floor plan: walls and furniture, for clearance queries and for drawing."""
 
 from __future__ import annotations
 
@@ -238,8 +238,8 @@ class Grid:
     def add(self, box: Rectangle) -> None:
         """One more solid thing, in place."""
         cells = _around(self.centres, box, REACH)
-        here = self.clearances[cells]
-        np.minimum(here, _distances(box, self.centres[cells]), out=here)
+        clearances = self.clearances[cells]
+        np.minimum(clearances, _distances(box, self.centres[cells]), out=clearances)
 
 
 def _around(centres: Array, box: Rectangle, margin: float) -> tuple[slice, slice]:

@@ -1,4 +1,4 @@
-"""Where furniture can stand so that robots still get everywhere and are caught nowhere."""
+"""Placement of furniture such that robots reach every place and get stuck nowhere."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GAP = 0.02
 AROUND = 1.3
 """Whether a piece is in the way is decided within so much of its room, m."""
 AWAY = 0.5
-"""Furniture that moves stands at least this far from where it stood, m."""
+"""Furniture that moves moves at least this far, m."""
 TRIES = 40
 """Places that are tried for one piece."""
 
@@ -45,16 +45,16 @@ class Site:
         """Measure the free floor.
 
         Args:
-            plan: with all that stands already.
+            plan: with the furniture so far.
             room: upright, of the plan.
             most_regions: into which what a piece leaves of the floor may fall, if fewer than now.
         """
         x, y = room.length / 2 + AROUND, room.width / 2 + AROUND
         window = (room.x - x, room.y - y, room.x + x, room.y + y)
-        near = Rectangle.spanning(*window)
+        window_rectangle = Rectangle.spanning(*window)
         self.room = room
-        self._solids = [s for s in (*plan.walls, *plan.furniture) if _near(s, near)]
-        rooms = [r for r in plan.rooms if _near(r, near)]
+        self._solids = [s for s in (*plan.walls, *plan.furniture) if _near(s, window_rectangle)]
+        rooms = [r for r in plan.rooms if _near(r, window_rectangle)]
         self._grid = Grid.of(rooms, self._solids, plan.bounds, window)
         self._middles = [cells for r in rooms if (cells := self._middle(r)).any()]
         self.regions = _components(self._grid, ROBOT)[0]
@@ -67,7 +67,7 @@ class Site:
         return self._fits(piece) and self._leaves_way(piece)
 
     def add(self, piece: Rectangle) -> None:
-        """The piece stands there from now on."""
+        """Add the piece to the plan."""
         self._grid.add(piece)
         self._solids.append(piece)
         self.regions = _components(self._grid, ROBOT)[0]
@@ -100,7 +100,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Move:
-    """A piece of furniture that stands elsewhere.
+    """A piece of furniture at another place.
 
     Attributes:
         index: in the plan's furniture.
@@ -143,7 +143,7 @@ def rearrange(
             continue
         room = plan.room(name)
         others = (*plan.furniture[:index], *plan.furniture[index + 1 :])
-        # Where the piece stood it may have filled a corner that now must not become a trap.
+        # The piece may have filled a corner that must not become a trap without it.
         site = Site(replace(plan, furniture=others), room, most_regions=Site(plan, room).regions)
         for _ in range(TRIES):
             place = (against_wall if rng.random() < 0.6 else standing)(rng, room, piece)
@@ -181,8 +181,8 @@ def standing(rng: np.random.Generator, room: Rectangle, piece: Rectangle) -> Rec
 def overlap(piece: Rectangle, others: Iterable[Rectangle]) -> bool:
     """Whether a piece covers any of several rectangles in part."""
     box = _box(piece)
-    near = (_box(other) for other in others if _near(piece, other))
-    return any(cv2.rotatedRectangleIntersection(box, other)[0] != cv2.INTERSECT_NONE for other in near)
+    boxes = (_box(other) for other in others if _near(piece, other))
+    return any(cv2.rotatedRectangleIntersection(box, other)[0] != cv2.INTERSECT_NONE for other in boxes)
 
 
 def _components(grid: Grid, radius: float) -> tuple[int, NDArray[np.int32]]:

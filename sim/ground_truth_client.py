@@ -1,4 +1,4 @@
-"""Truth and intervention, for whoever scores a run: robots and servers never ask here.
+"""Ground truth and intervention, for scoring a run: robots and servers never use it.
 
 The questions that `mapweave.sim.ground_truth_service` answers, as methods.
 """
@@ -117,7 +117,7 @@ class SimControl:
         return stamps, _read_poses(reader, len(stamps))
 
     def plan(self) -> FloorPlan:
-        """What stands where."""
+        """The floor plan."""
         reader = self._ask("plan")
         rooms, walls, furniture = (
             tuple(_read_rectangle(reader, value) for value in reader.array(name, MAX_RECTANGLES))
@@ -126,11 +126,11 @@ class SimControl:
         return FloorPlan(rooms, walls, furniture)
 
     def apply(self, event: Mapping[str, object]) -> str:
-        """Let something happen, as a scenario's table says it; returns what has happened, in words."""
+        """Execute an event given as a scenario's table; returns what has happened, in words."""
         return self._ask("apply", event=dict(event)).text("said", 500)
 
     def advance(self, tick: int, patience: float) -> bool:
-        """Let time pass until a tick is over and every robot has finished with it; then time stands still.
+        """Let time pass until a tick is over and every robot has finished with it; then time stops.
 
         From the first call on time passes only so. Asking again for the same tick is no error.
 
@@ -171,13 +171,13 @@ class SimControl:
         )
 
     def stop(self) -> None:
-        """End the simulation; its agents are told."""
+        """End the simulation and notify its agents."""
         self._ask("stop")
 
     def _ask(self, operation: str, **fields: object) -> Reader:
         replies = self._bus.ask(self._key, pack({"op": operation, **fields}), self._timeout)
         if not replies:
-            raise NotConnected(f"{self._key}: nobody answers; start the simulator with: mapweave sim serve")
+            raise NotConnected(f"{self._key}: no answer; start the simulator with: mapweave sim serve")
         if replies[0].error:
             raise InvalidValue(f"the simulator refuses {operation}: {replies[0].error}")
         return Reader(replies[0].payload, f"answer to {operation}", MAX_BYTES, MAX_VALUES)

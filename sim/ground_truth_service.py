@@ -1,4 +1,4 @@
-"""Answers whoever scores a run: truth and intervention. Robots and servers never ask here.
+"""Ground truth and intervention, for scoring a run. Robots and servers never use it.
 
 One question on the key `sim/ground_truth_client`, a MessagePack map with the operation in `op`;
 `mapweave.sim.ground_truth_client` asks.
@@ -34,12 +34,12 @@ class GroundTruthService:
         wall: Mapping[str, float],
         stop: Callable[[], None],
     ) -> None:
-        """Put the desk in front of a simulation.
+        """Serve the ground truth of a simulation.
 
         Args:
-            simulation: whose truth is told.
+            simulation: whose truth is served.
             active: names of the robots that take part now.
-            wall: s by part beside the simulation's own, kept by the caller.
+            wall: s by part, in addition to the simulation's own, kept by the caller.
             stop: ends the run.
         """
         self._simulation = simulation

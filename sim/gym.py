@@ -175,7 +175,7 @@ class MapweaveEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self._simulation
 
     def _choose_goal(self, world: World) -> Pose2 | None:
-        """A free place in sight of the start, with a way there, looking roughly as the robot looks now."""
+        """A free place visible from the start, with a way there, and about the robot's present heading."""
         start = self._world_from_start
         radius = self._setup.describe().radius + 0.1
         for _ in range(50):
@@ -196,15 +196,17 @@ class MapweaveEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         distance, angle = self._off()
         return distance + ANGLE_WORTH * abs(angle)
 
-    def _seen(self, observation: Observation) -> Seen:
-        if observation.image is not None:
-            self._image = observation.image
+    def _seen(self, agent_observation: Observation) -> Seen:
+        if agent_observation.image is not None:
+            self._image = agent_observation.image
         goal = self._world_from_start.inverse() @ self._world_from_goal
         return {
             "image": self._image.copy(),
-            "odometry": np.array([observation.odometry.forward, observation.odometry.turn], np.float32),
-            "proximity": observation.proximity.astype(np.float32),
-            "bumped": np.int64(observation.bumped),
+            "odometry": np.array(
+                [agent_observation.odometry.forward, agent_observation.odometry.turn], np.float32
+            ),
+            "proximity": agent_observation.proximity.astype(np.float32),
+            "bumped": np.int64(agent_observation.bumped),
             "goal": goal.vector.astype(np.float32),
         }
 

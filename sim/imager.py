@@ -54,7 +54,7 @@ class Imager:
         self._falloff = _falloff(camera, setup.exposure.vignetting) if setup.exposure.vignetting else None
         self._log_gain = 0.0
         self._mean: float | None = None
-        self._seen_tick = 0
+        self._image_tick = 0
 
     @property
     def gain(self) -> float:
@@ -126,9 +126,9 @@ class Imager:
         for angle in turned * ((np.arange(layers) + 0.5) / layers - 0.5):
             c, s = math.cos(angle), math.sin(angle)
             # A robot that turns left by an angle sees things move right.
-            seen = intrinsics @ [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]] @ np.linalg.inv(intrinsics)
+            homography = intrinsics @ [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]] @ np.linalg.inv(intrinsics)
             layer = cv2.warpPerspective(
-                image, seen, (camera.width, camera.height),
+                image, homography, (camera.width, camera.height),
                 flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
             )  # fmt: skip
             cv2.add(total, layer, dst=total, dtype=cv2.CV_16U)
@@ -174,7 +174,7 @@ def _lens(camera: Camera, distortion: Distortion) -> tuple[Camera, NDArray[np.in
     """An ideal camera that sees all that the lens shows, and where in its picture each pixel is.
 
     Returns:
-        The camera, with the same focal length, and cv2.remap's maps: each pixel of the real image looks up
+        The camera, with the same focal length, and cv2.remap's maps: each pixel of the real image samples
         the ideal ray that the lens shows there.
     """
     u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))

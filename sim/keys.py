@@ -1,4 +1,4 @@
-"""Keys of the simulator: nothing of a robot or a server stands here, and nothing of these in `wire`."""
+"""Keys of the simulator; `wire` has those of robots and servers."""
 
 from __future__ import annotations
 

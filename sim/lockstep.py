@@ -18,7 +18,7 @@ from mapweave.wire.bus import Request
 log = logging.getLogger(__name__)
 
 SOON = 3.0
-"""After what time those who wait for the beginning are told for whom, s."""
+"""After this time it is logged for which robots the beginning waits, s."""
 
 
 @dataclass(slots=True, eq=False)
@@ -54,7 +54,7 @@ class Lockstep:
     """Collects the robots' steps and says when a tick is due. Times are of any clock that only grows, s."""
 
     def __init__(self, robots: Sequence[str], patience: float, expected: int | None = None) -> None:
-        """Nobody has asked yet.
+        """Start before the first question.
 
         Args:
             robots: names.
@@ -68,7 +68,7 @@ class Lockstep:
         self._seats = {name: Seat(name) for name in sorted(robots)}
         self._patience = patience
         self._expected = len(self._seats) if expected is None else expected
-        self._begun = self._told = False
+        self._begun = self._reported = False
         if len(self._seats) != len(robots) or not 0 <= self._expected <= len(robots):
             raise InvalidValue(f"lock-step: {expected} of the robots {', '.join(robots)} cannot be expected")
 
@@ -96,7 +96,7 @@ class Lockstep:
         seat.active = seat.asked = True
 
     def presence(self, name: str, driver: int, alive: bool) -> None:
-        """Take the news that a driver came or went; time does not wait for a robot that nobody drives."""
+        """Note that a driver came or went; time does not wait for a robot without a driver."""
         seat = self._seats.get(name)
         if seat is None:
             return
@@ -111,7 +111,7 @@ class Lockstep:
             seat.step = seat.request = None
 
     def due(self, now: float) -> list[Seat]:
-        """The robots that have asked, by name, if a tick is due; else nobody."""
+        """The robots that have asked, by name, if a tick is due; else none."""
         waiting = [seat for seat in self._seats.values() if seat.step is not None]
         if not waiting:
             return []
@@ -157,8 +157,8 @@ class Lockstep:
         if len(self._seats) - len(missing) >= self._expected:
             return True
         if waited < self._patience:
-            if waited >= SOON and not self._told:
-                self._told = True
+            if waited >= SOON and not self._reported:
+                self._reported = True
                 names = ", ".join(missing)
                 log.info("time waits for the agents of %s, %g s at the longest", names, self._patience)
             return False

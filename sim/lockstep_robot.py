@@ -41,7 +41,7 @@ def decode_rendezvous(data: bytes) -> Rendezvous:
 
 
 class LockstepRobot(RemoteRobot):
-    """A simulated body behind Zenoh keys."""
+    """A simulated robot behind Zenoh keys."""
 
     def __init__(self, bus: Bus, fleet: str, name: str, patience: float = PATIENCE) -> None:
         """Nothing is asked yet; see RemoteRobot."""
@@ -52,7 +52,7 @@ class LockstepRobot(RemoteRobot):
         """Wait until every other robot of the simulation has finished this tick; no time passes.
 
         Raises:
-            DeviceError: nobody answers, or not properly.
+            DeviceError: no answer, or a malformed one.
         """
         if self._closed.is_set():
             return

@@ -1,4 +1,4 @@
-"""Somebody walks through a world before the robots come, and takes photographs of the way."""
+"""A person walks through a world before the robots start, and takes photographs of the way."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ CORNER = math.radians(35.0)
 TRIES = 4000
 
 ASIDE, YAW, TILT, RISE, STEP = 0.03, math.radians(3.0), math.radians(1.5), 0.02, 0.2
-"""Standard deviations of a camera in the hand: m beside the way, rad to the side, rad of pitch and of roll, m
-above or below its height; and by which share of it a step is longer or shorter at most."""
+"""Standard deviations of a hand-held camera: m across the way, rad of yaw, rad of pitch and of roll, m of
+height; and the largest relative change of a step's length."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A picture, and where it was really taken: below the camera, which looked along the pose's x axis."""
+    """A picture, and where it was really taken: below the camera, which faced along the pose's x axis."""
 
     image: Image
     world_from_camera: Pose2
@@ -41,7 +41,7 @@ def walk(world: World, camera: CameraSetup, count: int, spacing: float, seed: in
     """Take photographs along a free way that the seed chooses.
 
     Args:
-        world: as it stands when no robot is there.
+        world: without robots.
         camera: that is carried, at its height.
         count: of photographs.
         spacing: m between two of them, about.
@@ -56,8 +56,8 @@ def walk(world: World, camera: CameraSetup, count: int, spacing: float, seed: in
     imager = Imager(camera, world.background, (seed, 0xF070))
     steps = spacing * rng.uniform(1.0 - STEP, 1.0 + STEP, count - 1)
     photographs = []
-    for gone in np.concatenate([[0.0], np.cumsum(steps)]).tolist():
-        held = way.at(gone) @ Pose2(0.0, rng.normal(0.0, ASIDE), rng.normal(0.0, YAW))
+    for distance in np.concatenate([[0.0], np.cumsum(steps)]).tolist():
+        held = way.at(distance) @ Pose2(0.0, rng.normal(0.0, ASIDE), rng.normal(0.0, YAW))
         pitch, roll = rng.normal(0.0, TILT, 2)
         rotation = _rotation(held.heading, pitch, roll)
         height = camera.intrinsics.mount_height
@@ -76,11 +76,11 @@ class _Way:
     leg: float
     bend: float
 
-    def at(self, gone: float) -> Pose2:
+    def at(self, distance: float) -> Pose2:
         """After so many m."""
-        if gone < self.leg:
-            return self.start @ Pose2(gone)
-        return self.start @ Pose2(self.leg, 0.0, self.bend) @ Pose2(gone - self.leg)
+        if distance < self.leg:
+            return self.start @ Pose2(distance)
+        return self.start @ Pose2(self.leg, 0.0, self.bend) @ Pose2(distance - self.leg)
 
 
 def _way(plan: FloorPlan, length: float, rng: np.random.Generator) -> _Way:
@@ -93,7 +93,7 @@ def _way(plan: FloorPlan, length: float, rng: np.random.Generator) -> _Way:
         end = way.at(longest)
         if not plan.is_free(end.x, end.y, CLEARANCE):
             continue
-        along = [way.at(gone) for gone in np.arange(0.0, longest + VIEW, 0.05).tolist()]
+        along = [way.at(distance) for distance in np.arange(0.0, longest + VIEW, 0.05).tolist()]
         clearances = plan.clearances(np.array([[place.x, place.y] for place in along]))
         walked = round(longest / 0.05)
         if clearances[:walked].min() >= CLEARANCE and clearances.min() > 0.0:
@@ -102,7 +102,7 @@ def _way(plan: FloorPlan, length: float, rng: np.random.Generator) -> _Way:
 
 
 def _rotation(yaw: float, pitch: float, roll: float) -> Array:
-    """(3, 3) from the camera's body axes (x ahead, y left, z up) to world."""
+    """(3, 3) from the camera's axes (x ahead, y left, z up) to world."""
     (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     turned = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
     nodded = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])

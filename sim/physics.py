@@ -22,11 +22,11 @@ class Physics:
 
     def __getattr__(self, name: str) -> Any:
         """PyBullet's function or constant of this name; a function is bound to this physics once."""
-        found = getattr(pybullet, name)
-        if inspect.isbuiltin(found):
-            found = functools.partial(found, physicsClientId=self._client)
-        setattr(self, name, found)
-        return found
+        attribute = getattr(pybullet, name)
+        if inspect.isbuiltin(attribute):
+            attribute = functools.partial(attribute, physicsClientId=self._client)
+        setattr(self, name, attribute)
+        return attribute
 
     def close(self) -> None:
         """Let everything go. Twice is no error."""

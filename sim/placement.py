@@ -1,4 +1,4 @@
-"""Where in a building robots start or can be put, and where somebody can walk."""
+"""Where in a building robots start or can be put, and where a person can walk."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from mapweave.sim.robots import RobotSetup
 from mapweave.sim.world import World
 
 STEP = 0.04
-"""Legs of a path are looked at every so often, m."""
+"""Legs of a path are sampled at this distance, m."""
 APART = 0.45
-"""Middles of two robots, or of a robot and somebody who walks, are at least so far apart, m."""
+"""Least distance between the middles of two robots, or of a robot and a person, m."""
 AHEAD = tuple(math.radians(deg) for deg in (0, 12, -12, 25, -25))
 AROUND = tuple(math.radians(deg) for deg in (50, -50, 90, -90, 135, -135, 180))
-"""Directions from a robot in which somebody might walk past: before its camera if possible, else beside."""
+"""Directions from a robot in which a person may walk past: in front of its camera if possible."""
 SLANTS = (0.0, 0.9, -0.9)
 """Across what the robot sees if there is room, else obliquely, rad."""
 
@@ -60,7 +60,7 @@ def starting_places(world: World, setups: Sequence[RobotSetup], seed: int) -> tu
 
 
 def put_down(plan: FloorPlan, wanted: Pose2, radius: float, taken: NDArray[np.float64]) -> Pose2:
-    """The wanted place, or the nearest one that nobody has taken.
+    """The wanted place, or the nearest free one.
 
     Args:
         plan: the building.
@@ -102,7 +102,7 @@ def somewhere(
 def beside(
     plan: FloorPlan, rng: np.random.Generator, other: Pose2, radius: float, taken: NDArray[np.float64]
 ) -> Pose2:
-    """A free place 0.6 to 2 m from another robot and in its sight, with any heading.
+    """A free place 0.6 to 2 m from another robot and visible from it, with any heading.
 
     Raises:
         InvalidValue: there is none.
@@ -137,7 +137,7 @@ def check_path(plan: FloorPlan, path: Points, radius: float) -> None:
 
 
 def past(plan: FloorPlan, rng: np.random.Generator, robot: Pose2, radius: float) -> list[tuple[float, float]]:
-    """A straight path that crosses what a robot sees, 1 to 2.5 m ahead; beside or behind it if need be.
+    """A straight path across a robot's view, 1 to 2.5 m ahead; beside or behind it if there is no room.
 
     Args:
         plan: the building.
@@ -146,7 +146,7 @@ def past(plan: FloorPlan, rng: np.random.Generator, robot: Pose2, radius: float)
         radius: of who shall walk, m.
 
     Raises:
-        InvalidValue: nobody fits anywhere near the robot.
+        InvalidValue: there is no room near the robot.
     """
     near, far = (1.0, 2.5), (0.8, 4.0)
     for shortest, directions, (nearest, farthest) in (
@@ -163,7 +163,7 @@ def past(plan: FloorPlan, rng: np.random.Generator, robot: Pose2, radius: float)
                     path = _longest(plan, middle, angle, radius)
                     if path and math.dist(path[0], path[-1]) >= shortest and _misses(path, robot):
                         return path if rng.random() < 0.5 else path[::-1]
-    raise InvalidValue(f"nobody can walk near ({robot.x:.2f}, {robot.y:.2f}): there is no room")
+    raise InvalidValue(f"no path near ({robot.x:.2f}, {robot.y:.2f}): there is no room")
 
 
 def sampled(path: Points) -> Array:

@@ -55,12 +55,12 @@ class Rangers:
 
 def cast(physics: Physics, rangers: Sequence[Rangers], poses: Sequence[Pose2]) -> None:
     """Let all robots' rangers feel their surroundings, in one batch of rays."""
-    rays = [one.rays(pose) for one, pose in zip(rangers, poses, strict=True)]
+    rays = [robot_rangers.rays(pose) for robot_rangers, pose in zip(rangers, poses, strict=True)]
     starts = np.concatenate([start for start, _ in rays])
     if not len(starts):
         return
     hits = physics.rayTestBatch(starts.tolist(), np.concatenate([end for _, end in rays]).tolist())
     shares = np.array([hit[2] for hit in hits])
     ends = np.cumsum([len(start) for start, _ in rays])
-    for one, some in zip(rangers, np.split(shares, ends[:-1]), strict=True):
-        one.take(some)
+    for robot_rangers, some in zip(rangers, np.split(shares, ends[:-1]), strict=True):
+        robot_rangers.take(some)

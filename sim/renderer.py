@@ -1,4 +1,4 @@
-"""Draws textured panels as an ideal pinhole camera sees them.
+"""Renders textured panels for an ideal pinhole camera.
 
 Every surface is flat, so each is one homography away from the image and its inverse depth is linear in
 the pixel. That makes an exact renderer of a few numpy and OpenCV calls, which filters textures properly:
@@ -35,7 +35,7 @@ CAMERA_FROM_ROBOT = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0
 
 
 class Renderer:
-    """Draws for one camera. Not for two threads at once: it keeps its working memory."""
+    """Renders for one camera. Not thread-safe: it keeps its working memory."""
 
     def __init__(self, camera: Camera, background: int) -> None:
         """Prepare the pixel grid.
@@ -69,7 +69,7 @@ class Renderer:
     def render(
         self, panels: PanelSet | Scene, rotation: NDArray[np.float64], position: NDArray[np.float64]
     ) -> Image:
-        """Draw.
+        """Render.
 
         Args:
             panels: everything that can be seen, in world.
@@ -84,7 +84,7 @@ class Renderer:
         self._depth.fill(0.0)
         candidates = self._in_view(scene, rotation, position)
         for start in range(0, len(candidates.index), CHUNK):
-            # What is known to be hidden now is hidden for good: depths only come nearer.
+            # A panel hidden now stays hidden: depths only decrease.
             chosen = [
                 k
                 for k in range(start, min(start + CHUNK, len(candidates.index)))
@@ -99,7 +99,7 @@ class Renderer:
         """Panels that face the camera and may meet the image, nearest first."""
         camera_from_world = CAMERA_FROM_ROBOT @ rotation.T
         optical_centre = position + rotation @ self._robot_from_camera
-        # First by the balls around them: most panels of a building are behind or beside the camera.
+        # First by bounding spheres: most panels of a building are outside the view.
         middles = (scene.middle - optical_centre) @ camera_from_world.T
         distances, ahead = middles @ self._borders.T, middles[:, 2]
         inside = (distances > -scene.radius[:, None]).all(axis=1)
@@ -131,8 +131,8 @@ class Renderer:
         left, top = np.where(cut, 0.0, np.maximum(left, 0.0)), np.where(cut, 0.0, np.maximum(top, 0.0))
         right = np.where(cut, width - 1.0, np.minimum(right, width - 1.0))
         low = np.where(cut, height - 1.0, np.minimum(low, height - 1.0))
-        seen = (left <= right) & (top <= low) & (z > NEAR).any(axis=1) & (nearest > 1 / FAR)
-        visible = np.flatnonzero(seen)
+        in_view = (left <= right) & (top <= low) & (z > NEAR).any(axis=1) & (nearest > 1 / FAR)
+        visible = np.flatnonzero(in_view)
         order = visible[np.argsort(-nearest[visible], kind="stable")]
         bounds = np.stack([top, low + 1, left, right + 1], axis=1)[order].astype(int).tolist()
         windows = [(slice(b[0], b[1]), slice(b[2], b[3])) for b in bounds]

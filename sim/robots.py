@@ -68,7 +68,7 @@ class RobotSetup:
         return None if self.start is None else Pose2(*self.start)
 
     def describe(self) -> RobotDescription:
-        """What the robot's agent is told."""
+        """The description that the robot's agent gets."""
         ideal = RobotDescription(self.camera.intrinsics)
         return replace(
             ideal,

@@ -1,4 +1,4 @@
-"""All panels of a moment in columns, with what the renderer needs to know of each before it looks."""
+"""All panels of a moment in columns, with what the renderer needs of each."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ class Scene:
     def __init__(self, sets: Sequence[PanelSet]) -> None:
         """Put sets side by side; their numbers are their places in the sequence."""
         self._sets = list(sets)
-        ends = np.cumsum([len(one.textures) for one in sets], dtype=int).tolist()
-        self._spans = [slice(end - len(one.textures), end) for end, one in zip(ends, self._sets, strict=True)]
+        ends = np.cumsum([len(panel_set.textures) for panel_set in sets], dtype=int).tolist()
+        self._spans = [
+            slice(end - len(panel_set.textures), end) for end, panel_set in zip(ends, self._sets, strict=True)
+        ]
         joined = PanelSet.joined(self._sets) if self._sets else PanelSet.of([])
         self.corner = joined.corner
         self.along = joined.along
@@ -40,7 +42,7 @@ class Scene:
         self.textures = joined.textures
 
     def place(self, number: int, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> None:
-        """Stand a set elsewhere than where it was made.
+        """Move a panel set.
 
         Args:
             number: of the set.

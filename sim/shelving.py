@@ -69,9 +69,9 @@ class Rack:
         x, right, bottom, room = shelf
         for _ in range(COLUMNS):
             design, gap, empty = int(load.integers(DESIGNS)), int(load.integers(2, 14)), load.random() < 0.06
-            other, swapped = int(own.integers(DESIGNS + 1)), self.changed and own.random() < CHANGED
+            replacement, swapped = int(own.integers(DESIGNS + 1)), self.changed and own.random() < CHANGED
             if swapped:
-                design, empty = other % DESIGNS, other == DESIGNS
+                design, empty = replacement % DESIGNS, replacement == DESIGNS
             picture = carton_face(self.common, design)
             high, wide = picture.shape
             count = int(load.integers(1, max(1, room // high) + 1))

@@ -1,4 +1,4 @@
-"""What tells people where they are: signs and doors with numbers."""
+"""Signs, and doors with numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def sign(rng: np.random.Generator, width_px: int, height_px: int, text: str) -> 
         rng: where chance comes from.
         width_px: across.
         height_px: down.
-        text: what it says; empty for letters and numbers by chance.
+        text: on it; empty for letters and numbers by chance.
     """
     text = text or "".join([*rng.choice(CAPITALS, 1), *rng.choice(DIGITS, int(rng.integers(2, 4)))])
     dark = rng.random() < 0.5

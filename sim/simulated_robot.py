@@ -1,4 +1,4 @@
-"""One simulated robot: its body, its camera, its rangers, and what is broken of them."""
+"""One simulated robot: its body, its camera, its rangers, and their faults."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class SimulatedRobot:
 
     Attributes:
         setup: what was ordered.
-        description: what its agent is told.
+        description: the description that its agent gets.
         body: in the physics.
-        rangers: what they met when `look` was called last.
+        rangers: distances at the last call of `look`.
         faults: what is broken.
-        pose: world_from_robot, true, when `look` was called last.
+        pose: world_from_robot, true, at the last call of `look`.
         image: that it took last; None if the last observation had none.
         render_seconds: wall time that its pictures took.
     """
@@ -56,20 +56,20 @@ class SimulatedRobot:
         self._imager = Imager(setup.camera, stage.world.background, (base, 0x701E, number))
         self._placement: RigidPose = self.body.position_and_rotation()
         self._turn_rate = 0.0
-        self._looked_tick = 0
+        self._measured_tick = 0
         self._frame_tick = -1
         self._frame: Image | None = None
         self._dropped = (-1, False)
 
     def look(self, tick: int) -> RigidPose:
-        """Read the true pose out of the physics; call after whatever may have moved the robot."""
+        """Read the true pose out of the physics; call after anything that may have moved the robot."""
         self._placement = placement = self.body.position_and_rotation()
         position, rotation = placement
         pose = Pose2(float(position[0]), float(position[1]), math.atan2(rotation[1, 0], rotation[0, 0]))
-        if tick > self._looked_tick:
+        if tick > self._measured_tick:
             turned = wrap_angle(pose.heading - self.pose.heading)
-            self._turn_rate = turned / ((tick - self._looked_tick) * self.description.tick)
-        self.pose, self._looked_tick = pose, tick
+            self._turn_rate = turned / ((tick - self._measured_tick) * self.description.tick)
+        self.pose, self._measured_tick = pose, tick
         return placement
 
     def put(self, pose: Pose2) -> None:
@@ -93,7 +93,7 @@ class SimulatedRobot:
 
     def _picture(self, stage: Stage, tick: int) -> Image | None:
         if self._dropped[0] != tick:
-            # Once a tick, whoever asks how often, and whatever else is broken.
+            # Once a tick, however often it is asked, and whatever else has failed.
             self._dropped = (tick, self._imager.drops())
         if self._dropped[1] or self.faults.active("camera", "drop", tick):
             return None

@@ -55,8 +55,8 @@ class Simulation:
             world: solid blocks and textured panels.
             robots: 1 to 16; a name alone means the standard robot.
             seed: of start places, wheels, slip, noise, and of what happens.
-            poses: start places, `world_from_robot`, whatever the robots' setups say; by default those of the
-                setups, the others spread over the rooms.
+            poses: start places, `world_from_robot`, instead of those of the robots' setups; by default
+                those of the setups, the others spread over the rooms.
 
         Raises:
             InvalidValue: too many robots, names that are not unique, or places where no robot can stand.
@@ -107,7 +107,7 @@ class Simulation:
         return {**self._wall, "render": sum(robot.render_seconds for robot in self._robots.values())}
 
     def describe(self, name: str) -> RobotDescription:
-        """What the robot's agent may know of its body. All robots of a simulation have one clock."""
+        """The description that the robot's agent gets. All robots of a simulation have one clock."""
         return replace(self._robot(name).description, clock=self._clock)
 
     def step(self, commands: Mapping[str, Command]) -> dict[str, Observation]:

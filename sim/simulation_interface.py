@@ -20,7 +20,7 @@ class World(Protocol):
 
     @property
     def plan(self) -> FloorPlan:
-        """What stands where."""
+        """The floor plan."""
         ...
 
 

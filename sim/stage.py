@@ -44,12 +44,12 @@ class Stage:
         lamps: brightness, 1 as painted.
     """
 
-    def __init__(self, world: World, looks: Sequence[PanelSet], tick: float) -> None:
+    def __init__(self, world: World, panels: Sequence[PanelSet], tick: float) -> None:
         """Build the world.
 
         Args:
             world: solid blocks and textured panels.
-            looks: of the robots, each in its own frame.
+            panels: panels of the robots, each in its own frame.
             tick: simulated time of a tick, s.
         """
         self.world = world
@@ -63,7 +63,7 @@ class Stage:
         self.floor = int(p.createMultiBody(0, p.createCollisionShape(p.GEOM_PLANE)))
         p.changeDynamics(self.floor, -1, lateralFriction=1.0)
         self._solids = [self._solid(block) for block in world.blocks]
-        self._looks = tuple(looks)
+        self._panels = tuple(panels)
         self._still = PanelSet.of(world.panels)
         self._cast: list[_Cast] = []
         self._light = (1.0, 1.0, 0, 0)
@@ -74,7 +74,7 @@ class Stage:
     @property
     def actors(self) -> tuple[Actor, ...]:
         """Who is there now."""
-        return tuple(one.actor for one in self._cast)
+        return tuple(member.actor for member in self._cast)
 
     def place_robots(self, poses: Sequence[RigidPose]) -> None:
         """Show the robots where they are now."""
@@ -93,15 +93,15 @@ class Stage:
         old, new, begin, end = self._light
         share = 1.0 if tick >= end else (tick - begin) / (end - begin)
         self.lamps = new if share >= 1.0 else old + share * (new - old)
-        gone = [one for one in self._cast if tick > one.actor.until]
-        for one in gone:
-            self.physics.removeBody(one.number)
-        if gone:
-            self._cast = [one for one in self._cast if one not in gone]
+        leaving = [member for member in self._cast if tick > member.actor.until]
+        for member in leaving:
+            self.physics.removeBody(member.number)
+        if leaving:
+            self._cast = [member for member in self._cast if member not in leaving]
             self.scene = self._assemble()
-        for number, one in enumerate(self._cast):
-            one.actor.walk(seconds, robots)
-            self._stand(number)
+        for number, member in enumerate(self._cast):
+            member.actor.walk(seconds, robots)
+            self._place(number)
 
     def change_light(self, factor: float, tick: int, ticks: int) -> None:
         """Let all lamps go to a brightness, from a tick on, over some ticks."""
@@ -110,11 +110,11 @@ class Stage:
             self.lamps = factor
 
     def enter(self, actor: Actor, seed: Sequence[int]) -> None:
-        """Somebody comes in.
+        """Add an actor.
 
         Args:
             actor: who.
-            seed: of the looks.
+            seed: of the appearance.
         """
         p, figure = self.physics, actor.figure
         half = [figure.length / 2, figure.width / 2, figure.height / 2]
@@ -123,7 +123,7 @@ class Stage:
         self.scene = self._assemble()
 
     def rearrange(self, world: World) -> None:
-        """Exchange the world for one of the same blocks and panels, some of which stand elsewhere."""
+        """Exchange the world for one of the same blocks and panels, some of which have moved."""
         for number, (old, new) in enumerate(zip(self.world.blocks, world.blocks, strict=True)):
             if old != new:
                 self.physics.removeBody(self._solids[number])
@@ -143,25 +143,25 @@ class Stage:
         return int(p.createMultiBody(0, shape, -1, place, p.getQuaternionFromEuler(turn)))
 
     def _assemble(self) -> Scene:
-        scene = self.scene = Scene([*self._looks, self._still, *(one.looks for one in self._cast)])
+        scene = self.scene = Scene([*self._panels, self._still, *(member.looks for member in self._cast)])
         self.place_robots(self._poses)
         for number in range(len(self._cast)):
-            self._stand(number)
+            self._place(number)
         return scene
 
-    def _stand(self, number: int) -> None:
-        """Put an actor's solid and its looks where it is."""
-        p, one = self.physics, self._cast[number]
-        pose = one.actor.pose
+    def _place(self, number: int) -> None:
+        """Move an actor's solid and panels to its pose."""
+        p, member = self.physics, self._cast[number]
+        pose = member.actor.pose
         turn = p.getQuaternionFromEuler([0, 0, pose.heading])
-        height = one.actor.figure.height
-        p.resetBasePositionAndOrientation(one.number, [pose.x, pose.y, height / 2], turn)
+        height = member.actor.figure.height
+        p.resetBasePositionAndOrientation(member.number, [pose.x, pose.y, height / 2], turn)
         rotation, position = upright(pose)
-        self.scene.place(len(self._looks) + 1 + number, rotation, position)
+        self.scene.place(len(self._panels) + 1 + number, rotation, position)
 
 
 def upright(pose: Pose2) -> tuple[Array, Array]:
-    """(3, 3) rotation and (3,) m position in space of what stands upright on the floor."""
+    """(3, 3) rotation and (3,) m position in space of an upright object on the floor."""
     rotation = np.eye(3)
     rotation[:2, :2] = pose.rotation
     return rotation, np.array([pose.x, pose.y, 0.0])

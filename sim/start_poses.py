@@ -31,7 +31,7 @@ def spread(
         rooms: names of those in which robots start.
         robots: how many.
         clearance: of a robot's middle from walls and furniture, m.
-        look_along: whether robots look along the longer side of their room, else anywhere.
+        look_along: whether robots face along the longer side of their room, else anywhere.
         seed: other seeds, other poses.
 
     Raises:
@@ -52,20 +52,20 @@ def spread(
     return tuple(poses)
 
 
-def _apart(rng: np.random.Generator, points: Array, taken: Sequence[Pose2], far: bool) -> Pose2 | None:
+def _apart(rng: np.random.Generator, points: Array, taken: Sequence[Pose2], spread_out: bool) -> Pose2 | None:
     """A random pose on one of the points, apart from those taken; the farthest of a few if so wished."""
     if len(points) == 0:
         return None
     tries = [random_pose(rng, points) for _ in range(TRIES)]
     gaps = [min((p.distance(q) for q in taken), default=math.inf) for p in tries]
     comfortable = [p for p, gap in zip(tries, gaps, strict=True) if gap > COMFORT]
-    if comfortable and not far:
+    if comfortable and not spread_out:
         return comfortable[0]
     best = int(np.argmax(gaps))
     if gaps[best] >= APART:
         return tries[best]
-    here = np.array([[p.x, p.y] for p in taken])
-    distances = np.linalg.norm(points[:, None] - here, axis=-1).min(axis=1)
+    positions = np.array([[p.x, p.y] for p in taken])
+    distances = np.linalg.norm(points[:, None] - positions, axis=-1).min(axis=1)
     if distances.max() < APART:
         return None
     x, y = points[int(np.argmax(distances))]

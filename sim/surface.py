@@ -58,7 +58,7 @@ def concrete(rng: np.random.Generator, width_px: int, height_px: int, paint: flo
 
 
 def cladding(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
-    """Trapezoidal sheet metal: upright ribs, all alike, on a low concrete plinth, with scratches."""
+    """Trapezoidal sheet metal: upright, equal ribs, on a low concrete plinth, with scratches."""
     rib = np.arange(width_px) / (0.2 * TEXELS_PER_METRE) % 1.0
     shade = np.select([rib < 0.4, rib < 0.5, rib < 0.9], [1.0, 0.8, 0.93], 1.08)
     surface = paint * shade[None, :] + 4 * _seamless(clouds(rng, width_px, height_px, 1.3), across=True)
@@ -100,7 +100,7 @@ def wood(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
 
 
 def desk(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
-    """Drawers with handles and locks beside a panel with a few notes on it."""
+    """Drawers with handles and locks next to a panel with a few notes on it."""
     canvas = wood(rng, width_px, height_px)
     base = int(canvas.mean())
     cv2.rectangle(canvas, (0, 0), (width_px - 1, max(4, height_px // 24)), int(0.7 * base), -1)
@@ -250,7 +250,7 @@ def _streak(rng: np.random.Generator, canvas: Image, start: tuple[int, int]) -> 
 
 
 def _socket(canvas: Image, x: int, y: int) -> None:
-    """A wall socket, all alike, 8 cm wide."""
+    """A wall socket, always the same, 8 cm wide."""
     side = int(0.08 * TEXELS_PER_METRE)
     if y < 0:
         return

@@ -19,8 +19,8 @@ Painter = Callable[[np.random.Generator, int, int], Image]
 class Texture:
     """A grey image on a surface, at every sharpness at which a camera may see it.
 
-    Painted from its own seed when it is first needed, so that a large world costs nothing where nobody
-    looks and the picture does not depend on the order in which things are seen.
+    Painted from its own seed when it is first needed, so that unseen parts of a large world cost nothing
+    and the picture does not depend on the order in which things are seen.
 
     Attributes:
         width_px: across.

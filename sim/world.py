@@ -86,11 +86,11 @@ class PanelSet:
         )
 
     def placed(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> PanelSet:
-        """Panels of a body, in the frame in which the body stands.
+        """Panels of an object, in the frame of its pose.
 
         Args:
-            rotation: (3, 3) turns vectors of the body into that frame.
-            position: (3,) m, of the body in that frame.
+            rotation: (3, 3) turns vectors of the object into that frame.
+            position: (3,) m, of the object in that frame.
         """
         return PanelSet(
             self.corner @ rotation.T + position,
@@ -160,7 +160,7 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """All that stands still.
+    """All static things.
 
     Attributes:
         name: of the world.
@@ -168,8 +168,8 @@ class World:
         blocks: what one can run into.
         panels: what one can see.
         background: grey where no panel is (the ceiling).
-        pieces: one for each of `plan.furniture`, in the same order; empty where nobody knows what belongs to
-            what, and then nothing can be moved.
+        pieces: one for each of `plan.furniture`, in the same order; empty if unknown, and then nothing can be
+            moved.
         start_rooms: names of the rooms in which robots start; by default those called "room ...".
         look_along: whether robots start looking along the longer side of their room.
     """
@@ -215,7 +215,7 @@ class World:
             clearance: from the middle of such a robot, m.
 
         Raises:
-            InvalidValue: no such share, or nothing that could be put elsewhere.
+            InvalidValue: no such share, or nothing that can be moved.
         """
         if not 0.0 < share <= 1.0:
             raise InvalidValue(f"a share of the furniture is more than 0 and at most 1, not {share}")
@@ -224,7 +224,7 @@ class World:
         wanted = max(1, round(share * len(movable)))
         plan, moves = rearrange(self.plan, movable, wanted, rng, keep_clear, clearance)
         if not moves:
-            raise InvalidValue(f"world {self.name} has no furniture that can stand elsewhere in its room")
+            raise InvalidValue(f"world {self.name} has no furniture that can be moved within its room")
         blocks, panels = list(self.blocks), list(self.panels)
         for move in moves:
             piece, old = self.pieces[move.index], self.plan.furniture[move.index]

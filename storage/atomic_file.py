@@ -13,7 +13,7 @@ from mapweave.hybridmap.errors import InvalidFile
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:
-    """Write a file beside its place, then move it there.
+    """Write a temporary file in the same folder, then rename it.
 
     Raises:
         InvalidFile: the disk does not take it; what was there is as before.
@@ -36,7 +36,7 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
         beside.unlink(missing_ok=True)
         raise _unwritable(path, error.strerror or str(error)) from None
     except BaseException:
-        # Somebody interrupts: nothing is left lying about.
+        # Interrupted: remove the temporary file.
         beside.unlink(missing_ok=True)
         raise
 

@@ -1,4 +1,4 @@
-"""SQLite files that survive the loss of power, belong to one process, and say clearly what is wrong."""
+"""SQLite files that survive the loss of power, belong to one process, and report errors clearly."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mapweave.hybridmap.errors import InvalidFile
 class Database:
     """One SQLite file in WAL mode, each commit on the disk before it returns (synchronous=FULL).
 
-    The file is locked for as long as it is open: two processes that append to one log would number their
-    changes alike.
+    The file is locked while it is open: two processes that append to one log would use the same sequence
+    numbers.
     """
 
     def __init__(
         self,
         path: Path,
-        what: str,
+        kind: str,
         application_id: int,
         version: int,
         schema: str,
@@ -31,27 +31,27 @@ class Database:
 
         Args:
             path: of the file; its folder must be there.
-            what: what it is for people, for example "agent journal".
+            kind: what it is for people, for example "agent journal".
             application_id: marks files of this kind.
             version: of the schema.
             schema: SQL that makes the tables of a new file.
             repair: called before the check of the file's pages; may take out rows that are damaged.
-            advice: what to do about a damaged file, for people; stands behind the reason.
+            advice: what to do about a damaged file, for people; appended to the reason.
 
         Raises:
             InvalidFile: damaged, of another kind or version, in use, or not readable.
         """
         self.path = path
         self._file = path.absolute()
-        self.what = what
+        self.what = kind
         self._repair = repair
         self._advice = f"; {advice}" if advice else ""
         with self.guard():
-            # Threads take turns: whoever shares a Database holds a lock of its own.
+            # Threads take turns: a shared Database is used under the caller's lock.
             self.connection = sqlite3.connect(
                 path, timeout=5.0, isolation_level=None, check_same_thread=False
             )
-        # Text with a flipped bit may be no UTF-8; what it stands for is checked by whoever reads it.
+        # Text with a flipped bit may be no UTF-8; its meaning is checked by the reader.
         self.connection.text_factory = lambda data: data.decode("utf-8", "replace")
         try:
             with self.guard():
@@ -64,10 +64,10 @@ class Database:
     def _inode_now(self) -> tuple[int, int] | None:
         """By which the file of this name is known; None if there is none."""
         try:
-            found = self._file.stat()
+            status = self._file.stat()
         except OSError:
             return None
-        return found.st_dev, found.st_ino
+        return status.st_dev, status.st_ino
 
     @contextmanager
     def guard(self) -> Iterator[None]:
@@ -118,9 +118,11 @@ class Database:
         empty = run("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
         if not empty and kind != application_id:
             raise InvalidFile(f"{self.path}: is not a Mapweave {self.what}")
-        found = run("PRAGMA user_version").fetchone()[0]
-        if not empty and found != version:
-            raise InvalidFile(f"{self.path}: {self.what} of format {found}, this program uses {version}")
+        stored_version = run("PRAGMA user_version").fetchone()[0]
+        if not empty and stored_version != version:
+            raise InvalidFile(
+                f"{self.path}: {self.what} of format {stored_version}, this program uses {version}"
+            )
         run("PRAGMA journal_mode=WAL")
         if empty:
             run("BEGIN IMMEDIATE")
@@ -131,7 +133,7 @@ class Database:
             run("COMMIT")
         if self._repair is not None and not empty:
             self._repair(self.connection)
-        # With its name in front a message may have two lines, the second of which says what is wrong.
+        # A message that begins with the file's name may have two lines; the second gives the reason.
         damage = str(run("PRAGMA quick_check(1)").fetchone()[0])
         if damage != "ok":
             raise self._damaged(damage.splitlines()[-1])

@@ -23,13 +23,13 @@ MAX_SCANS = 20
 PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 
 
-def read_grey(path: Path, camera: Camera | None = None, told: str = "the camera") -> NDArray[np.uint8]:
+def read_grey(path: Path, camera: Camera | None = None, source: str = "the camera") -> NDArray[np.uint8]:
     """Read an image.
 
     Args:
         path: of a PNG, JPEG, PGM or BMP file.
         camera: that took it, if known.
-        told: who says so, for the error.
+        source: the source of the size, for the error.
 
     Returns:
         (H, W) grey.
@@ -49,7 +49,7 @@ def read_grey(path: Path, camera: Camera | None = None, told: str = "the camera"
         raise DeviceError(f"{path}: not an image that can be read ({error})") from None
     if camera is not None and image.shape != (camera.height, camera.width):
         height, width = image.shape
-        raise DeviceError(f"{path}: {width}x{height} px, but {told} says {camera.width}x{camera.height}")
+        raise DeviceError(f"{path}: {width}x{height} px, but {source} gives {camera.width}x{camera.height}")
     return image
 
 
@@ -60,7 +60,7 @@ def decode_grey(data: bytes) -> NDArray[np.uint8]:
         data: a whole PNG, JPEG, PGM or BMP file.
 
     Returns:
-        (H, W) grey, upright if the file says how the camera was held.
+        (H, W) grey, upright if the file has the camera's orientation.
 
     Raises:
         InvalidValue: it is none of these, damaged, or too large or too costly to decode.
@@ -101,8 +101,8 @@ def image_size(data: bytes) -> tuple[int, int]:
     if data.startswith(b"BM") and len(data) >= 26:
         width, height = struct.unpack("<ii", data[18:26])
         return abs(width), abs(height)
-    if found := PNM.match(data[:4096]):
-        return int(found[1]), int(found[2])
+    if header := PNM.match(data[:4096]):
+        return int(header[1]), int(header[2])
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
     raise InvalidValue("send a JPEG or PNG image")

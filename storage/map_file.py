@@ -9,7 +9,7 @@
 Fields that an older program does not know it leaves alone; a file of an older program lacks them. The version
 is raised only when an older program would misread a file.
 
-Poses and landmarks have the wire's precision. A file is written beside its place and then moved there, so
+Poses and landmarks have the wire's precision. A file is written under another name and then renamed, so
 that a reader, or a loss of power, finds either the old file or the new one.
 """
 
@@ -54,13 +54,13 @@ Kind = Literal["agent", "merged"]
 
 @dataclass(frozen=True, eq=False)
 class RefusedPair:
-    """Two nodes that looked alike and were not linked.
+    """Two similar nodes that were not linked.
 
     Attributes:
         a: one node.
         b: another one.
         reason: in words.
-        edge: the link that was found, or what the robot itself said, as an edge; None if not even that.
+        edge: the refused link, or the robot's own edge; None if there is neither.
     """
 
     a: NodeId
@@ -79,9 +79,9 @@ class MapFile:
         changes: the map is their replay; a merged map's links are edges among them.
         poses: of a merged map's nodes: number of the component, pose in that component's frame.
         refused: of a merged map: pairs that were not linked. Edges of robots that are refused are only here.
-        rulings: of people on what shall not be linked, in order.
-        superseded: of a merged map: nodes that newer ones stand for.
-        faded: of a merged map: (N,) which of a node's N landmarks are thought to be gone.
+        rulings: manual constraints, in order.
+        superseded: of a merged map: superseded nodes.
+        faded: of a merged map: (N,) which of a node's N landmarks are faded.
         history: of a merged map: what has become of its maps by itself, in order.
     """
 
@@ -114,7 +114,7 @@ def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
         kind: refuse files of another kind.
 
     Raises:
-        InvalidFile: it cannot be read, is truncated, altered or of another kind; one line says which.
+        InvalidFile: it cannot be read, is truncated, altered or of another kind; one line gives the reason.
     """
     try:
         data = read_whole(path)
@@ -139,7 +139,7 @@ def pack_map_file(content: MapFile) -> bytes:
     data = HEADER.pack(MAGIC, VERSION, len(packed)) + packed
     data += hashlib.sha256(data).digest()
     try:
-        # The title, the counts and the ids are checked by the one who will read them.
+        # The title, the counts and the ids are checked by the reader.
         _unpack(packed)
     except InvalidMessage as error:
         raise InvalidValue(str(error)) from None
@@ -171,7 +171,7 @@ def unpack_map_file(data: bytes) -> MapFile:
 
 def _pack(content: MapFile) -> bytes:
     poses = [[list(node), component, pack_pose(pose)] for node, (component, pose) in content.poses.items()]
-    changes = [encode_body(body) for body in content.changes]
+    changes = [encode_body(change) for change in content.changes]
     fields = {"kind": content.kind, "title": content.title, "changes": changes, "poses": poses}
     refused = [
         [list(r.a), list(r.b), r.reason, b"" if r.edge is None else encode_body(EdgePut(r.edge))]
@@ -181,30 +181,30 @@ def _pack(content: MapFile) -> bytes:
         {
             **fields,
             "refused": refused,
-            "rulings": [pack_manual_constraint(ruling) for ruling in content.rulings],
+            "rulings": [pack_manual_constraint(constraint) for constraint in content.rulings],
             "superseded": [
                 [list(node), list(fate.by), fate.found, fate.distance, fate.turn]
                 for node, fate in content.superseded.items()
             ],
             "faded": [
-                [list(node), np.packbits(gone, bitorder="little").tobytes()]
-                for node, gone in content.faded.items()
+                [list(node), np.packbits(faded, bitorder="little").tobytes()]
+                for node, faded in content.faded.items()
             ],
-            "history": [pack_happening(one) for one in content.history],
+            "history": [pack_happening(event) for event in content.history],
         }
     )
 
 
 def _unpack(content: bytes) -> MapFile:
-    # A map file has as many values as it has room for: whoever reads one has chosen it.
+    # A map file may have any number of values: the user has chosen to read it.
     reader = Reader(content, "map file", MAX_CONTENT_BYTES, MAX_CONTENT_BYTES)
     name = reader.text("kind", 16)
     kinds: dict[str, Kind] = {kind: kind for kind in get_args(Kind)}
     if name not in kinds:
         raise reader.error(f"kind {name!r} is unknown")
     changes = tuple(
-        decode_body(reader.as_binary(body, "change", MAX_BODY_BYTES))
-        for body in reader.array("changes", MAX_ELEMENTS)
+        decode_body(reader.as_binary(change, "change", MAX_BODY_BYTES))
+        for change in reader.array("changes", MAX_ELEMENTS)
     )
     poses: dict[NodeId, tuple[int, PoseGaussian]] = {}
     for value in reader.array("poses", MAX_ELEMENTS):
@@ -226,7 +226,7 @@ def _unpack(content: bytes) -> MapFile:
         _read_superseded(reader, value)
         for value in (reader.array("superseded", MAX_ELEMENTS) if reader.has("superseded") else [])
     )
-    sizes = {body.node.id: len(body.node.landmarks) for body in changes if isinstance(body, NodePut)}
+    sizes = {change.node.id: len(change.node.landmarks) for change in changes if isinstance(change, NodePut)}
     faded = dict(
         _read_faded(reader, value, sizes)
         for value in (reader.array("faded", MAX_ELEMENTS) if reader.has("faded") else [])
@@ -245,10 +245,10 @@ def _read_refused(reader: Reader, value: Any) -> RefusedPair:
         reader.as_text(parts[2], "reason", MAX_REASON),
         reader.as_binary(parts[3], "edge", MAX_BODY_BYTES),
     )
-    body = decode_body(encoded) if encoded else None
-    if body is not None and not isinstance(body, EdgePut):
+    change = decode_body(encoded) if encoded else None
+    if change is not None and not isinstance(change, EdgePut):
         raise reader.error("what was refused must be an edge")
-    return RefusedPair(a, b, reason, None if body is None else body.edge)
+    return RefusedPair(a, b, reason, None if change is None else change.edge)
 
 
 def _read_superseded(reader: Reader, value: Any) -> tuple[NodeId, Superseded]:
@@ -256,9 +256,9 @@ def _read_superseded(reader: Reader, value: Any) -> tuple[NodeId, Superseded]:
     if len(parts) < 5:
         raise reader.error("a superseded node must be [node, by, landmarks, distance, turn]")
     node, by = (reader.as_node_id(part, "node") for part in parts[:2])
-    found = reader.as_integer(parts[2], "landmarks", 0, MAX_NUMBER)
+    landmarks = reader.as_integer(parts[2], "landmarks", 0, MAX_NUMBER)
     distance, turn = (reader.as_number(part, "distance or turn", 0.0, 1e6) for part in parts[3:5])
-    return node, Superseded(by, found, distance, turn)
+    return node, Superseded(by, landmarks, distance, turn)
 
 
 def _read_faded(reader: Reader, value: Any, sizes: Mapping[NodeId, int]) -> tuple[NodeId, NDArray[np.bool_]]:

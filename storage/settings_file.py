@@ -1,4 +1,4 @@
-"""Tables of TOML or MessagePack into frozen dataclasses; a wrong name or value says so at once."""
+"""Tables of TOML or MessagePack into frozen dataclasses; a wrong name or value is an error."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise SettingsError(f"{path}: is not text in UTF-8, as TOML must be") from None
     except (ValueError, RecursionError) as error:
-        # Besides what is no TOML: numbers of thousands of digits, tables nested a thousand deep.
+        # In addition to invalid TOML: numbers of thousands of digits, tables nested a thousand deep.
         raise SettingsError(f"{path}: {error}") from None
 
 
@@ -59,10 +59,10 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
             hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(names)}"
             raise SettingsError(f"{where}: no setting {name!r}; {hint}")
         given[name] = _convert(hints[name], value, f"{where}: {name}")
-    for one in dataclasses.fields(cls):  # type: ignore[arg-type]
-        optional = one.default is not dataclasses.MISSING or one.default_factory is not dataclasses.MISSING
-        if one.name not in given and not optional:
-            raise SettingsError(f"{where}: {one.name} is missing")
+    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
+        optional = item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING
+        if item.name not in given and not optional:
+            raise SettingsError(f"{where}: {item.name} is missing")
     try:
         return cls(**given)
     except (ValueError, SettingsError) as error:
@@ -96,7 +96,7 @@ def _convert(kind: Any, value: Any, where: str) -> Any:
             kinds = (kinds[0],) * len(value)
         if len(value) != len(kinds):
             raise SettingsError(f"{where}: must be a list of {len(kinds)}")
-        return tuple(_convert(one, v, where) for one, v in zip(kinds, value, strict=True))
+        return tuple(_convert(item_kind, v, where) for item_kind, v in zip(kinds, value, strict=True))
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         # A comparison with "not a number" is false; an integer of TOML may be larger than any float.
         if not -sys.float_info.max <= value <= sys.float_info.max:

@@ -1,8 +1,8 @@
 """A building that many synthetic robots map at the same time, for the merge at scale.
 
-Rooms with landmarks of their own stand in a square. Each robot walks from room to room and looks around in
-each; several robots come through every room, and one robot may come back. Landmarks are drawn as in
-`synthetic.world`, so search, verification and merging do on them what they do on real ones.
+Rooms with landmarks of their own lie in a square. Each robot drives from room to room and turns around in
+each; several robots come through every room, and a robot may return. Landmarks are drawn as in
+`synthetic.world`, so search, verification and merging work on them as on real ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WIDTH, DEPTH = 5.0, 4.0
 """Of a room, m."""
 PITCH = 6.0
 """From room to room, m."""
-LOOKS = 8
+VIEWS = 8
 """In each room, all around."""
 LANDMARKS = 250
 """On the walls of a room."""
@@ -38,9 +38,9 @@ TURN_SIGMAS = np.array([0.01, 0.01, 0.005])
 WALK_SIGMAS = np.array([0.05, 0.05, 0.02])
 """The same of the way to the next room."""
 LINK_SIGMAS = np.array([0.03, 0.03, 0.01])
-"""Of links that are drawn instead of looked for."""
+"""Of links that are drawn instead of searched for."""
 ALIKE = math.radians(20.0)
-"""Two looks in one room show the same if they differ by less than this."""
+"""Two views in one room show the same landmarks if they differ by less than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,20 +67,20 @@ class Building:
             seed: of the walks and the rooms.
         """
         rng = np.random.default_rng([seed, robots, nodes])
-        side = max(math.ceil(math.sqrt(robots * nodes / LOOKS / VISITS)), 2)
+        side = max(math.ceil(math.sqrt(robots * nodes / VIEWS / VISITS)), 2)
         rooms = np.zeros((robots, nodes), np.int64)
         truth = np.zeros((robots, nodes, 3))
         ways = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
         for robot in range(robots):
-            here = rng.integers(0, side, 2)
-            for start in range(0, nodes, LOOKS):
-                count = min(LOOKS, nodes - start)
-                rooms[robot, start : start + count] = here[0] * side + here[1]
-                stop = here * PITCH + [WIDTH / 2, DEPTH / 2] + rng.normal(0.0, 0.25, (count, 2))
-                turn = 2.0 * math.pi / LOOKS * np.arange(count) + rng.normal(0.0, 0.05, count)
+            room = rng.integers(0, side, 2)
+            for start in range(0, nodes, VIEWS):
+                count = min(VIEWS, nodes - start)
+                rooms[robot, start : start + count] = room[0] * side + room[1]
+                stop = room * PITCH + [WIDTH / 2, DEPTH / 2] + rng.normal(0.0, 0.25, (count, 2))
+                turn = 2.0 * math.pi / VIEWS * np.arange(count) + rng.normal(0.0, 0.05, count)
                 truth[robot, start : start + count] = np.column_stack([stop, turn])
-                open_ = [here + way for way in ways if ((here + way >= 0) & (here + way < side)).all()]
-                here = open_[int(rng.integers(len(open_)))]
+                open_ = [room + way for way in ways if ((room + way >= 0) & (room + way < side)).all()]
+                room = open_[int(rng.integers(len(open_)))]
         return Building(seed, rooms, truth)
 
     @property
@@ -93,10 +93,10 @@ class Building:
         return Pose2.from_vector(self.truth[int(node.agent[1:]), node.number // 2])
 
     def log(self, robot: int) -> Iterator[tuple[MapId, ChangeBody]]:
-        """What a robot tells: each node, then the edge that leads to it."""
+        """A robot's log: each node, then the edge that leads to it."""
         rng = np.random.default_rng([self.seed, 1, robot])
         map_id = MapId(f"r{robot}", 1)
-        here = PoseGaussian(Pose2(), np.zeros((3, 3)))
+        pose = PoseGaussian(Pose2(), np.zeros((3, 3)))
         for k in range(self.rooms.shape[1]):
             node_id = NodeId(map_id.agent, map_id.epoch, 2 * k)
             true = Pose2.from_vector(self.truth[robot, k])
@@ -107,10 +107,10 @@ class Building:
                 sigmas = TURN_SIGMAS if same else WALK_SIGMAS
                 noise = Pose2.from_vector(rng.normal(0.0, sigmas))
                 step = PoseGaussian(before.inverse() @ true @ noise, np.diag(sigmas**2))
-                here = here @ step
+                pose = pose @ step
             world = _room(self.seed, int(self.rooms[robot, k]))
             corner = self._corner(robot, k)
-            yield map_id, NodePut(take_node(world, node_id, corner.inverse() @ true, here, rng, SENSING))
+            yield map_id, NodePut(take_node(world, node_id, corner.inverse() @ true, pose, rng, SENSING))
             if step is not None:
                 edge_id = EdgeId(map_id.agent, map_id.epoch, 2 * k - 1)
                 earlier = NodeId(map_id.agent, map_id.epoch, 2 * k - 2)
@@ -123,14 +123,14 @@ class Building:
         cell = np.round((np.array([x, y]) - [WIDTH / 2, DEPTH / 2]) / PITCH)
         return Pose2(float(cell[0] * PITCH), float(cell[1] * PITCH), 0.0)
 
-    def pairs(self, told: NDArray[np.bool_]) -> list[tuple[NodeId, NodeId]]:
+    def pairs(self, active: NDArray[np.bool_]) -> list[tuple[NodeId, NodeId]]:
         """Pairs of nodes that show the same, smaller id first.
 
         Args:
-            told: (robots, nodes) which nodes there are.
+            active: (robots, nodes) which nodes there are.
         """
-        found: list[tuple[NodeId, NodeId]] = []
-        robots, numbers = np.nonzero(told)
+        result: list[tuple[NodeId, NodeId]] = []
+        robots, numbers = np.nonzero(active)
         order = np.argsort(self.rooms[robots, numbers], kind="stable")
         seats = self.rooms[robots, numbers][order]
         for group in np.split(order, np.flatnonzero(np.diff(seats)) + 1):
@@ -138,20 +138,20 @@ class Building:
             off = np.abs((headings[:, None] - headings + math.pi) % math.tau - math.pi)
             for i, j in np.argwhere(np.triu(off < ALIKE, 1)):
                 a, b = (NodeId(f"r{robots[g]}", 1, 2 * int(numbers[g])) for g in (group[i], group[j]))
-                found.append((min(a, b), max(a, b)))
-        return sorted(found)
+                result.append((min(a, b), max(a, b)))
+        return sorted(result)
 
-    def knowledge(self, told: NDArray[np.bool_]) -> tuple[dict[Pair, float], dict[Pair, Link]]:
+    def knowledge(self, active: NDArray[np.bool_]) -> tuple[dict[Pair, float], dict[Pair, Link]]:
         """Overlaps and links that are drawn, as if all pairs of these nodes had been compared.
 
         Args:
-            told: (robots, nodes) which nodes there are.
+            active: (robots, nodes) which nodes there are.
         """
         rng = np.random.default_rng([self.seed, 2])
         overlaps: dict[Pair, float] = {}
         links: dict[Pair, Link] = {}
         covariance = np.diag(LINK_SIGMAS**2)
-        for a, b in self.pairs(told):
+        for a, b in self.pairs(active):
             overlaps[a, b] = float(rng.uniform(8.0, 30.0))
             noise = Pose2.from_vector(rng.normal(0.0, LINK_SIGMAS))
             measured = self.world_from(a).inverse() @ self.world_from(b) @ noise

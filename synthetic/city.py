@@ -37,11 +37,13 @@ def draw_grid(nodes: int, heading_sigma: float, rng: np.random.Generator) -> G2o
     sigmas = np.array([PLACE_SIGMA, PLACE_SIGMA, heading_sigma])
     true = _drive(nodes, rng)
     edges = [_edge(k, k + 1, true, sigmas, rng) for k in range(nodes - 1)]
-    seen: dict[tuple[int, int], list[int]] = {}
+    at_corner: dict[tuple[int, int], list[int]] = {}
     for k, pose in enumerate(true):
-        here = seen.setdefault((round(pose.x), round(pose.y)), [])
-        edges += [_edge(i, k, true, sigmas, rng) for i in here if k - i > APART and rng.random() < RECOGNISED]
-        here.append(k)
+        corner = at_corner.setdefault((round(pose.x), round(pose.y)), [])
+        edges += [
+            _edge(i, k, true, sigmas, rng) for i in corner if k - i > APART and rng.random() < RECOGNISED
+        ]
+        corner.append(k)
     poses = {0: Pose2()}
     for edge in edges[: nodes - 1]:
         poses[edge.j] = poses[edge.i] @ edge.i_from_j
@@ -50,14 +52,14 @@ def draw_grid(nodes: int, heading_sigma: float, rng: np.random.Generator) -> G2o
 
 def _drive(nodes: int, rng: np.random.Generator) -> list[Pose2]:
     """A block a step, straight on or round a corner, inside the city."""
-    here = Pose2(BLOCKS // 2, BLOCKS // 2, 0.0)
-    drive = [here]
+    pose = Pose2(BLOCKS // 2, BLOCKS // 2, 0.0)
+    drive = [pose]
     while len(drive) < nodes:
         turn = rng.choice([0.0, 0.5 * math.pi, -0.5 * math.pi], p=[0.6, 0.2, 0.2])
-        ahead = here @ Pose2(0.0, 0.0, turn) @ Pose2(1.0, 0.0, 0.0)
+        ahead = pose @ Pose2(0.0, 0.0, turn) @ Pose2(1.0, 0.0, 0.0)
         if -0.5 < ahead.x < BLOCKS + 0.5 and -0.5 < ahead.y < BLOCKS + 0.5:
-            here = ahead
-            drive.append(here)
+            pose = ahead
+            drive.append(pose)
     return drive
 
 

@@ -1,8 +1,8 @@
 """Drives: one robot through the same hall every day, as maps and links without images.
 
-What is tried here begins where verification ends, so that a year of drives takes minutes. On each drive, a
-new epoch, the robot wanders. Its nodes are linked with nodes of its own drive and with those of earlier ones
-for which no newer one stands yet. Some links are false: places that look alike (see `merge_fleets`).
+The input is what verification would return, so that a year of drives takes minutes. On each drive, a
+new epoch, the robot wanders. Its nodes are linked with nodes of its own drive and with earlier active nodes.
+Some links are false: places that look alike (see `merge_fleets`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Drive:
         links: of its nodes, with each other and with earlier ones.
         true: pairs of those that are true.
         truth: `world_from_robot` of its nodes.
-        past: earlier nodes for which newer ones stand once it is over.
+        past: earlier nodes that are superseded once it is over.
     """
 
     map_id: MapId
@@ -68,64 +68,68 @@ def drives(rng: np.random.Generator, settings: DriveSettings | None = None) -> I
         settings: sizes.
     """
     s = settings or DriveSettings()
-    living: dict[NodeId, Pose2] = {}
+    active: dict[NodeId, Pose2] = {}
     past: set[NodeId] = set()
     for epoch in count(1):
         walk = walk_of(s.floor, rng)
         truth = {NodeId(ROBOT, epoch, k): pose_vector for k, pose_vector in enumerate(walk)}
-        where, pairs = living | truth, _same_places(truth, living, s, rng)
+        where, pairs = active | truth, _same_places(truth, active, s, rng)
         links = [link_between(a, b, where[a].inverse() @ where[b], rng) for a, b in pairs]
         true = frozenset(pairs)
         wanted = round(len(links) * s.false_share / (1.0 - s.false_share))
-        links += _false_links(truth, living, true, wanted, s, rng)
+        links += _false_links(truth, active, true, wanted, s, rng)
         shuffled = tuple(links[k] for k in rng.permutation(len(links)))
-        covered = {a for a, b in pairs if a in living}
+        covered = {a for a, b in pairs if a in active}
         past |= covered
         map_id = MapId(ROBOT, epoch)
         yield Drive(map_id, map_of(map_id, walk, rng), shuffled, true, truth, frozenset(past))
-        living = {node: pose for node, pose in where.items() if node not in covered}
+        active = {node: pose for node, pose in where.items() if node not in covered}
 
 
 def _same_places(
-    truth: dict[NodeId, Pose2], living: dict[NodeId, Pose2], s: DriveSettings, rng: np.random.Generator
+    truth: dict[NodeId, Pose2], active: dict[NodeId, Pose2], s: DriveSettings, rng: np.random.Generator
 ) -> list[tuple[NodeId, NodeId]]:
     """Pairs of nodes that show the same place: of a node the nearest few of each drive."""
-    others = living | truth
-    there, names = np.array([pose.vector for pose in others.values()]), list(others)
-    found: set[tuple[NodeId, NodeId]] = set()
+    candidates = active | truth
+    positions, names = np.array([pose.vector for pose in candidates.values()]), list(candidates)
+    pairs: set[tuple[NodeId, NodeId]] = set()
     for node, pose in truth.items():
-        far = np.hypot(there[:, 0] - pose.x, there[:, 1] - pose.y)
-        turn = np.abs((there[:, 2] - pose.heading + math.pi) % math.tau - math.pi)
+        distance = np.hypot(positions[:, 0] - pose.x, positions[:, 1] - pose.y)
+        turn = np.abs((positions[:, 2] - pose.heading + math.pi) % math.tau - math.pi)
         drawn: Counter[MapId] = Counter()
-        near = np.flatnonzero((far < s.floor.same) & (turn < math.radians(30.0)))
-        for k in near[np.argsort(far[near])].tolist():
-            other = names[k]
-            loop = other.map == node.map
-            if drawn[other.map] < s.most and not (loop and abs(other.number - node.number) < s.floor.apart):
-                drawn[other.map] += 1
-                found.add((min(node, other), max(node, other)))
-    return sorted(found)
+        close = np.flatnonzero((distance < s.floor.same) & (turn < math.radians(30.0)))
+        for k in close[np.argsort(distance[close])].tolist():
+            candidate = names[k]
+            loop = candidate.map == node.map
+            if drawn[candidate.map] < s.most and not (
+                loop and abs(candidate.number - node.number) < s.floor.apart
+            ):
+                drawn[candidate.map] += 1
+                pairs.add((min(node, candidate), max(node, candidate)))
+    return sorted(pairs)
 
 
 def _false_links(
     truth: dict[NodeId, Pose2],
-    living: dict[NodeId, Pose2],
+    active: dict[NodeId, Pose2],
     taken: Set[tuple[NodeId, NodeId]],
     wanted: int,
     s: DriveSettings,
     rng: np.random.Generator,
 ) -> list[Link]:
-    """Of places that look alike: nodes of this drive seem to stand about some of earlier drives."""
-    known, names, links = set(taken), sorted(living), list[Link]()
+    """Perceptual aliasing: nodes of this drive seem to be near some of earlier drives."""
+    linked, names, links = set(taken), sorted(active), list[Link]()
     while len(links) < wanted and names:
         a, b = names[int(rng.integers(len(names)))], sorted(truth)[int(rng.integers(len(truth)))]
-        if living[a].distance(truth[b]) < 2.0 * s.floor.same:
+        if active[a].distance(truth[b]) < 2.0 * s.floor.same:
             continue
         seeming = Pose2.from_vector(rng.uniform([-0.7, -0.7, -0.5], [0.7, 0.7, 0.5]))
-        moved = living[a] @ seeming @ truth[b].inverse()
+        moved = active[a] @ seeming @ truth[b].inverse()
         for k in range(int(rng.integers(1, s.floor.most_alike + 1))):
-            one, two = (NodeId(node.agent, node.epoch, node.number + k) for node in (a, b))
-            if one in living and two in truth and (one, two) not in known and len(links) < wanted:
-                known.add((one, two))
-                links.append(link_between(one, two, living[one].inverse() @ moved @ truth[two], rng))
+            first, second = (NodeId(node.agent, node.epoch, node.number + k) for node in (a, b))
+            if first in active and second in truth and (first, second) not in linked and len(links) < wanted:
+                linked.add((first, second))
+                links.append(
+                    link_between(first, second, active[first].inverse() @ moved @ truth[second], rng)
+                )
     return links

@@ -1,8 +1,8 @@
 """Synthetic fleets: maps that drift, links that are true, and links that are false.
 
-Only poses are drawn, no landmarks: what is tried here begins where verification ends. False links come as
-they do in buildings: a place that looks like another gives one to four of them, which agree with each other
-and with as many landmarks as true ones have.
+Only poses are drawn, no landmarks: the input is what verification would return. False links occur as in
+buildings: a place that looks like another gives one to four of them, which agree with each other and with as
+many landmarks as true ones have.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class FleetSettings:
         robots: how many.
         nodes: of each robot.
         side: of the square floor, m.
-        true_links: wanted; fewer if there are not as many pairs in sight of each other.
-        same: nodes at most so far apart, m, that look the same way within 30 degrees, show the same place.
+        true_links: wanted; fewer if there are not as many pairs with a common view.
+        same: nodes at most so far apart, m, with headings within 30 degrees, show the same place.
         apart: nodes of one map that are fewer steps apart are no loop.
-        most_alike: links at most that one place gives which looks like another.
+        most_alike: most links that one aliased place gives.
     """
 
     robots: int = 4
@@ -101,32 +101,32 @@ def draw_fleet(
 
 def map_of(map_id: MapId, walk: list[Pose2], rng: np.random.Generator) -> HybridMap:
     """A robot's map of a walk, in its own frame, by edges that are off by about `STEP_SIGMAS`."""
-    one, covariance = HybridMap(), np.diag(STEP_SIGMAS**2)
-    here = PoseGaussian(Pose2(), np.zeros((3, 3)))
+    hybrid_map, covariance = HybridMap(), np.diag(STEP_SIGMAS**2)
+    current = PoseGaussian(Pose2(), np.zeros((3, 3)))
     for k, pose in enumerate(walk):
         node_id = NodeId(map_id.agent, map_id.epoch, k)
         step = None
         if k:
             noise = Pose2.from_vector(rng.normal(0, STEP_SIGMAS))
             step = PoseGaussian(walk[k - 1].inverse() @ pose @ noise, covariance)
-            here = here @ step
-        one.apply(NodePut(Node(node_id, k * 1_000_000_000, here, CAMERA, BARE)))
+            current = current @ step
+        hybrid_map.apply(NodePut(Node(node_id, k * 1_000_000_000, current, CAMERA, BARE)))
         if step is not None:
             before = NodeId(map_id.agent, map_id.epoch, k - 1)
             edge_id = EdgeId(map_id.agent, map_id.epoch, len(walk) + k)
-            one.apply(EdgePut(Edge(edge_id, before, node_id, step, EdgeKind.MAPPED)))
-    return one
+            hybrid_map.apply(EdgePut(Edge(edge_id, before, node_id, step, EdgeKind.MAPPED)))
+    return hybrid_map
 
 
 def walk_of(s: FleetSettings, rng: np.random.Generator) -> list[Pose2]:
     """Steps of 0.7 m with turns, and turns about at the walls."""
-    here = Pose2.from_vector(rng.uniform([1.0, 1.0, -math.pi], [s.side - 1.0, s.side - 1.0, math.pi]))
-    walk = [here]
+    pose = Pose2.from_vector(rng.uniform([1.0, 1.0, -math.pi], [s.side - 1.0, s.side - 1.0, math.pi]))
+    walk = [pose]
     while len(walk) < s.nodes:
-        step = here @ Pose2(0.7, 0.0, rng.normal(0.0, 0.3))
+        step = pose @ Pose2(0.7, 0.0, rng.normal(0.0, 0.3))
         inside = 0.0 < step.x < s.side and 0.0 < step.y < s.side
-        here = step if inside else here @ Pose2(0.0, 0.0, rng.uniform(0.5, 1.0))
-        walk.append(here)
+        pose = step if inside else pose @ Pose2(0.0, 0.0, rng.uniform(0.5, 1.0))
+        walk.append(pose)
     return walk
 
 
@@ -136,9 +136,9 @@ def _pairs(truth: dict[NodeId, Pose2], s: FleetSettings) -> tuple[list[NodeId], 
     place = np.array([truth[node].vector for node in nodes])
     robot = np.array([int(node.agent[1:]) for node in nodes])
     number = np.array([node.number for node in nodes])
-    far = np.hypot(*(place[:, None, :2] - place[None, :, :2]).transpose(2, 0, 1))
-    other = (robot[:, None] != robot) | (np.abs(number[:, None] - number) >= s.apart)
-    return nodes, np.triu(other, 1), far
+    distance = np.hypot(*(place[:, None, :2] - place[None, :, :2]).transpose(2, 0, 1))
+    distinct = (robot[:, None] != robot) | (np.abs(number[:, None] - number) >= s.apart)
+    return nodes, np.triu(distinct, 1), distance
 
 
 def link_between(a: NodeId, b: NodeId, a_from_b: Pose2, rng: np.random.Generator) -> Link:
@@ -149,11 +149,11 @@ def link_between(a: NodeId, b: NodeId, a_from_b: Pose2, rng: np.random.Generator
 
 
 def _true_links(truth: dict[NodeId, Pose2], s: FleetSettings, rng: np.random.Generator) -> list[Link]:
-    nodes, other, far = _pairs(truth, s)
+    nodes, distinct, distance = _pairs(truth, s)
     heading = np.array([truth[node].heading for node in nodes])
     turn = np.abs((heading[:, None] - heading + math.pi) % math.tau - math.pi)
-    found = np.argwhere(other & (far < s.same) & (turn < math.radians(30.0)))
-    chosen = rng.permutation(found)[: s.true_links]
+    pairs = np.argwhere(distinct & (distance < s.same) & (turn < math.radians(30.0)))
+    chosen = rng.permutation(pairs)[: s.true_links]
     ends = [(nodes[i], nodes[j]) for i, j in chosen]
     return [link_between(a, b, truth[a].inverse() @ truth[b], rng) for a, b in ends]
 
@@ -165,9 +165,9 @@ def _false_links(
     s: FleetSettings,
     rng: np.random.Generator,
 ) -> list[Link]:
-    """Of places that look alike: some nodes about the one seem to stand about the other."""
-    nodes, other, far = _pairs(truth, s)
-    candidates = np.argwhere(other & (far > 2.0 * s.same))
+    """Perceptual aliasing: some nodes near one place seem to be near another."""
+    nodes, distinct, distance = _pairs(truth, s)
+    candidates = np.argwhere(distinct & (distance > 2.0 * s.same))
     taken = set(taken)
     links: list[Link] = []
     while len(links) < wanted:
@@ -175,9 +175,9 @@ def _false_links(
         seeming = Pose2.from_vector(rng.uniform([-0.7, -0.7, -0.5], [0.7, 0.7, 0.5]))
         moved = truth[a] @ seeming @ truth[b].inverse()
         for k in range(int(rng.integers(1, s.most_alike + 1))):
-            one, two = (NodeId(node.agent, node.epoch, node.number + k) for node in (a, b))
-            fresh = one in truth and two in truth and (one, two) not in taken
-            if fresh and one < two and len(links) < wanted:
-                taken.add((one, two))
-                links.append(link_between(one, two, truth[one].inverse() @ moved @ truth[two], rng))
+            first, second = (NodeId(node.agent, node.epoch, node.number + k) for node in (a, b))
+            fresh = first in truth and second in truth and (first, second) not in taken
+            if fresh and first < second and len(links) < wanted:
+                taken.add((first, second))
+                links.append(link_between(first, second, truth[first].inverse() @ moved @ truth[second], rng))
     return links

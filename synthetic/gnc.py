@@ -32,7 +32,7 @@ def inliers(fragments: Sequence[Fragment], links: Sequence[Link], gate: float) -
     """The links that are right, component by component.
 
     Args:
-        fragments: pieces of map; their own measurements are believed.
+        fragments: pieces of map; their own measurements are always inliers.
         links: between their nodes.
         gate: see `wrong_measurements`.
     """
@@ -43,10 +43,10 @@ def inliers(fragments: Sequence[Fragment], links: Sequence[Link], gate: float) -
     for names in nx.connected_components(pieces):
         inside = [fragment for fragment in fragments if fragment.name in names]
         own = [Measurement(m.a, m.b, m.a_from_b) for fragment in inside for m in fragment.measurements]
-        here = [link.measurement for link in links if by_node[link.a].name in names]
+        measurements = [link.measurement for link in links if by_node[link.a].name in names]
         anchor = min(names)
         start = by_node[anchor].graph.pose(anchor)
-        wrong |= {(m.a, m.b) for m in wrong_measurements(anchor, start, [*own, *here], gate)}
+        wrong |= {(m.a, m.b) for m in wrong_measurements(anchor, start, [*own, *measurements], gate)}
     return [link for link in links if link.pair not in wrong]
 
 
@@ -58,7 +58,7 @@ def wrong_measurements(
     Args:
         anchor: the node that is held.
         anchor_pose: where.
-        measurements: those that are not robust are believed.
+        measurements: those that are not robust are always inliers.
         gate: chi-square with 3 degrees of freedom above which a measurement is wrong.
 
     Returns:
@@ -75,12 +75,12 @@ def wrong_measurements(
     # GNC sets the weights itself: its factors must have plain noise.
     factors = Factors.of(ordered, [row[m.a] for m in ordered], [row[m.b] for m in ordered])
     add_measurements(graph, factors)
-    believed = [0] + [k for k, m in enumerate(ordered, 1) if not m.robust]
-    if len(believed) == 1 + len(ordered):
+    inliers = [0] + [k for k, m in enumerate(ordered, 1) if not m.robust]
+    if len(inliers) == 1 + len(ordered):
         return []
     parameters = gtsam.GncLMParams()
     parameters.setLossType(gtsam.GncLossType.TLS)
-    parameters.setKnownInliers(believed)
+    parameters.setKnownInliers(inliers)
     optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
     # A factor's cost is half its squared residual.
     optimizer.setInlierCostThresholds(0.5 * gate)

@@ -20,7 +20,7 @@ FEW = 6
 """So many landmarks in view at the start, or fewer, are few."""
 
 _PIXEL = 0.7
-_NEAR, _TURNED = 0.10, math.radians(3.0)
+_DISTANCE, _TURNED = 0.10, math.radians(3.0)
 """m and rad: a start has converged when the pose stays nearer to the truth than this."""
 _LEAST, _MOST = 4, 30
 _WRONG = np.array([1.0, 1.0, 1.0])
@@ -35,7 +35,7 @@ class Place:
     Attributes:
         true: (N, 3) m, where its landmarks are, in the node's robot frame.
         points: (N, 3) m, where the map has them.
-        covariances: (N, 3, 3) m^2, how uncertain the map says they are.
+        covariances: (N, 3, 3) m^2, by the map.
     """
 
     true: Array
@@ -83,7 +83,7 @@ def draw_place(rng: np.random.Generator) -> Place:
     depths = rng.uniform(1.5, 5.0, count)
     pixels = np.column_stack([rng.uniform(20, 300, count), rng.uniform(20, 220, count)])
     mapped_pixels = pixels + _PIXEL * rng.normal(size=pixels.shape)
-    # A map's errors are of inverse depth, as parallax makes them; it tells them as sigmas of the depth.
+    # A map's errors are of inverse depth, as from parallax; it has them as sigmas of the depth.
     share = rng.uniform(0.01, 0.08, count)
     mapped_depths = depths / (1 + share * rng.normal(size=count))
     sigmas = share * mapped_depths**2 / depths
@@ -115,15 +115,15 @@ def drive(rng: np.random.Generator, place: Place, steps: int = 100) -> Start:
         right, left = ways * (1 + WHEEL_NOISE * rng.normal(size=2))
         true = true @ Odometry(0.5 * (right + left), (right - left) / AXLE).motion()
         exact = CAMERA.project(true.inverse().apply(place.true))
-        seen = exact + _PIXEL * rng.normal(size=exact.shape)
-        seen[~CAMERA.contains(exact)] = np.nan
+        pixels = exact + _PIXEL * rng.normal(size=exact.shape)
+        pixels[~CAMERA.contains(exact)] = np.nan
         filter_.predict(odometry)
-        filter_.update(ids, seen)
+        filter_.update(ids, pixels)
         off = filter_.pose.mean.inverse() @ true
-        near = math.hypot(off.x, off.y) < _NEAR and abs(off.heading) < _TURNED
+        near = math.hypot(off.x, off.y) < _DISTANCE and abs(off.heading) < _TURNED
         converged &= near or k < _STEPS_TO_CONVERGE
-    known = filter_.landmarks_in_node()
-    after = Place(place.true[known.ids], known.points, known.covariances)
+    landmarks = filter_.landmarks_in_node()
+    after = Place(place.true[landmarks.ids], landmarks.points, landmarks.covariances)
     nees = filter_.pose.mahalanobis2(true)
     return Start(visible, converged, filter_.healthy, near, nees, place, after)
 

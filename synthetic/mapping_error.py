@@ -11,7 +11,7 @@ from synthetic.mapping_run import AXLE, WHEEL_NOISE, MappingRun
 
 
 def follow(run: MappingRun, settings: FilterSettings | None = None) -> MappingFilter:
-    """Filter a run, with the standard settings if not told otherwise."""
+    """Filter a run, by default with the standard settings."""
     settings = settings or FilterSettings(pixel_sigma=run.pixel_sigma)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, settings)
     ids = np.arange(len(run.points))
@@ -31,20 +31,20 @@ def error(run: MappingRun, ids: NDArray[np.int64], pose_vector: Array, points: A
 
 def filter_error(run: MappingRun, filter_: MappingFilter, judged: NDArray[np.bool_]) -> float:
     """The same of a filter, over those of its landmarks that are judged, (N,)."""
-    known = filter_.landmarks()
-    mask = judged[known.ids] & np.isfinite(known.depths)
+    landmarks = filter_.landmarks()
+    mask = judged[landmarks.ids] & np.isfinite(landmarks.depths)
     mean = filter_.pose.mean
-    return error(run, known.ids[mask], mean.vector, mean.apply(known.points_in_robot[mask]))
+    return error(run, landmarks.ids[mask], mean.vector, mean.apply(landmarks.points_in_robot[mask]))
 
 
 def left_out(filter_: MappingFilter, judged: NDArray[np.bool_]) -> int:
     """How many of the landmarks judged have no place in the filter's error."""
-    known = filter_.landmarks()
-    return int(judged.sum() - (judged[known.ids] & np.isfinite(known.depths)).sum())
+    landmarks = filter_.landmarks()
+    return int(judged.sum() - (judged[landmarks.ids] & np.isfinite(landmarks.depths)).sum())
 
 
 def landmark_nees(run: MappingRun, filter_: MappingFilter) -> float:
-    """Mean squared Mahalanobis distance of the landmarks in the camera as it stands."""
+    """Mean squared Mahalanobis distance of the landmarks in the last camera frame."""
     points = run.poses[-1].inverse().apply(run.points[filter_.ids])
     depth = points[:, 0] - run.camera.mount_forward
     true = np.column_stack([-points[:, 1], run.camera.mount_height - points[:, 2], np.ones(len(depth))])

@@ -35,8 +35,8 @@ def batch_optimum(run: MappingRun, prior_depth: float, prior_spread: float) -> t
         between = _camera_pose(run, Pose2()).inverse() * _camera_pose(run, odometry.motion())
         graph.add(gtsam.BetweenFactorPose3(_x(k), _x(k + 1), between, _wheel_model(run, odometry)))
     for k, i in np.argwhere(np.isfinite(run.pixels[:, :, 0])):
-        seen = run.pixels[k, i]
-        graph.add(gtsam.GenericProjectionFactorCal3_S2(seen, pixel, _x(k), _l(i), lens))
+        measured = run.pixels[k, i]
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(measured, pixel, _x(k), _l(i), lens))
     settings = gtsam.LevenbergMarquardtParams()
     settings.setRelativeErrorTol(1e-9)
     best = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
@@ -71,8 +71,8 @@ def _wheel_model(run: MappingRun, odometry: Odometry) -> gtsam.noiseModel.Gaussi
     middle = _camera_pose(run, odometry.motion())
     columns = []
     for sigma, side in zip(sigmas, (1.0, -1.0), strict=True):
-        other = Odometry(odometry.forward + 0.5 * sigma, odometry.turn + side * sigma / AXLE)
-        columns.append(gtsam.Pose3.Logmap(middle.inverse() * _camera_pose(run, other.motion())))
+        perturbed = Odometry(odometry.forward + 0.5 * sigma, odometry.turn + side * sigma / AXLE)
+        columns.append(gtsam.Pose3.Logmap(middle.inverse() * _camera_pose(run, perturbed.motion())))
     root = np.column_stack(columns)
     return gtsam.noiseModel.Gaussian.Covariance(root @ root.T + _RIGID**2 * np.eye(6))
 

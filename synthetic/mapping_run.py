@@ -29,7 +29,7 @@ class MappingRun:
         camera: of the robot.
         points: (N, 3) m, landmarks in the first robot frame.
         poses: T + 1 true poses in the first robot frame.
-        odometry: T steps as the wheels tell them.
+        odometry: T steps as the wheels measure them.
         pixels: (T + 1, N, 2) px; NaN where a landmark is out of the image.
         pixel_sigma: px.
     """
@@ -45,16 +45,16 @@ class MappingRun:
 def speeds(shape: str, steps: int) -> tuple[Array, Array]:
     """Forward speed m/s and turn rate rad/s of each tick, (T,) each; all shapes keep a common view."""
     t = TICK * np.arange(steps)
-    there_and_back = np.sin(2 * np.pi * t / 16.7)
+    oscillation = np.sin(2 * np.pi * t / 16.7)
     if shape == "line":
         # The paper's Figures 7 and 8: straight back and forth, with a correction now and then.
-        return 0.15 * np.sign(there_and_back + 1e-9), 0.03 * np.sin(2 * np.pi * t / 5)
+        return 0.15 * np.sign(oscillation + 1e-9), 0.03 * np.sin(2 * np.pi * t / 5)
     if shape == "arc":
-        return 0.2 * there_and_back, 0.12 * np.sin(2 * np.pi * t / 8)
+        return 0.2 * oscillation, 0.12 * np.sin(2 * np.pi * t / 8)
     if shape == "weave":
-        return 0.15 * np.sign(there_and_back + 1e-9), 0.3 * np.cos(2 * np.pi * t / 4)
+        return 0.15 * np.sign(oscillation + 1e-9), 0.3 * np.cos(2 * np.pi * t / 4)
     still = (t % 4.0) < 1.0
-    return np.where(still, 0.0, 0.2 * there_and_back), np.where(still, 0.0, 0.06 * np.sin(2 * np.pi * t / 6))
+    return np.where(still, 0.0, 0.2 * oscillation), np.where(still, 0.0, 0.06 * np.sin(2 * np.pi * t / 6))
 
 
 def draw_run(

@@ -35,14 +35,14 @@ Rival = Callable[[Maps, Sequence[Link]], MergedMap]
 
 
 def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
-    """All links are believed."""
+    """All links are accepted."""
     fragments = fragments_of(maps)
     by_node = fragment_by_node(fragments)
-    believed = [link for link in links if link.a in by_node and link.b in by_node]
-    graphs = ComponentSolver(fragments).solve(believed)
+    used = [link for link in links if link.a in by_node and link.b in by_node]
+    graphs = ComponentSolver(fragments).solve(used)
     return MergedMap(
         maps,
-        tuple(sorted(believed, key=lambda link: link.pair)),
+        tuple(sorted(used, key=lambda link: link.pair)),
         (),
         tuple(frozenset(graph.nodes) for graph in graphs),
         Poses(graphs),
@@ -125,5 +125,5 @@ def joined_falsely(merged: MergedMap, fleet: SyntheticFleet) -> bool:
     tied: nx.Graph = nx.Graph()
     tied.add_nodes_from(fleet.maps)
     tied.add_edges_from((link.a.map, link.b.map) for link in merged.links if link.pair in fleet.true)
-    part_of = {one: k for k, part in enumerate(nx.connected_components(tied)) for one in part}
+    part_of = {member: k for k, part in enumerate(nx.connected_components(tied)) for member in part}
     return any(len({part_of[node.map] for node in component}) > 1 for component in merged.components)

@@ -17,7 +17,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.fleet import BARE, CAMERA
 
 WEIGHT = 20.0
-"""Landmarks behind each link: files tell of none, so all have the same."""
+"""Landmarks behind each link: files have none, so all get the same."""
 
 
 def split(graph: G2oGraph, robots: int) -> tuple[dict[MapId, HybridMap], list[Link], dict[int, NodeId]]:
@@ -45,8 +45,8 @@ def split(graph: G2oGraph, robots: int) -> tuple[dict[MapId, HybridMap], list[Li
             maps[a.map].apply(EdgePut(Edge(edge_id, a, b, between, EdgeKind.MAPPED)))
             continue
         link = Link(a, b, between, evidence={"inliers": WEIGHT, "share": 1.0}).canonical()
-        known = links.get(link.pair)
-        if known is None or between.covariance.trace() < known.a_from_b.covariance.trace():
+        existing = links.get(link.pair)
+        if existing is None or between.covariance.trace() < existing.a_from_b.covariance.trace():
             links[link.pair] = link
     return maps, list(links.values()), nodes
 

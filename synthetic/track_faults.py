@@ -1,4 +1,4 @@
-"""What goes wrong with tracks: they jump, slide away, cling to somebody who walks, change places."""
+"""What goes wrong with tracks: they jump, slide away, stick to a walking person, change places."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def spoil(run: MappingRun, share: float, rng: np.random.Generator) -> tuple[Mapp
         for track in walkers:
             for k in range(at, last + 1):
                 # There and back within a metre, as a person in a room does.
-                gone = abs((speed * TICK * (k - at) + 1.0) % 2.0 - 1.0)
-                point = run.points[track] + np.array([*(gone * way), 0.0])
-                seen = run.camera.project(run.poses[k].inverse().apply(point))
+                offset = abs((speed * TICK * (k - at) + 1.0) % 2.0 - 1.0)
+                point = run.points[track] + np.array([*(offset * way), 0.0])
+                pixel = run.camera.project(run.poses[k].inverse().apply(point))
                 noise = run.pixel_sigma * rng.normal(size=2)
-                pixels[k, track] = seen + noise if run.camera.contains(seen) else np.nan
+                pixels[k, track] = pixel + noise if run.camera.contains(pixel) else np.nan
     for first, second in zip(swappers[::2], swappers[1::2], strict=False):
         at = int(rng.integers(1, last))
         pixels[at:, [first, second]] = pixels[at:, [second, first]]

@@ -28,7 +28,7 @@ class Sensing:
     Attributes:
         pixel_sigma: px.
         depth_share: standard deviation of a landmark's depth, as a share of the depth.
-        code_sigma: noise of each coordinate of a decoded descriptor; two sightings of one landmark are
+        code_sigma: noise of each coordinate of a decoded descriptor; two observations of one landmark are
             then about 8 code_sigma apart, unrelated ones 0.9.
         most: features an image.
         clutter: features an image that belong to nothing.
@@ -68,7 +68,7 @@ class World:
         )
 
     def moved(self, world_from_old: Pose2) -> World:
-        """The same landmarks with the same looks somewhere else: a room that is just like this one."""
+        """The same landmarks with the same descriptors elsewhere: a room that looks the same."""
         return replace(
             self, points=world_from_old.apply(self.points), normals=self.normals @ world_from_old.rotation.T
         )

@@ -20,9 +20,9 @@ from mapweave.mapserver.merging.merger import Merger
 from synthetic.world import World, room, take_node, take_view
 
 SIGMA_XY, SIGMA_HEADING = 0.015, 0.008
-"""What a robot says of each step, and what a sound one is off by, m and rad."""
+"""Noise that a robot reports for each step, and the true noise of a correct one, m and rad."""
 RIGHT_M = 0.35
-"""A told position nearer to the truth than this is right."""
+"""An answered position nearer to the truth than this is right."""
 MARGIN = 0.6
 """m, robots keep away from walls."""
 
@@ -84,16 +84,16 @@ def draw_house(rng: np.random.Generator, *, twins: bool = False, gap: float = 0.
 
 
 def draw_tour(
-    house: House, visits: Sequence[int], stops: int, looks: int, rng: np.random.Generator
+    house: House, visits: Sequence[int], stops: int, views: int, rng: np.random.Generator
 ) -> list[Pose2]:
-    """Poses of a robot that goes from room to room and looks around at each stop."""
+    """Poses of a robot that drives from room to room and turns around at each stop."""
     tour: list[Pose2] = []
     for number in visits:
         for _ in range(stops):
             choice = [house.inside(number, rng) for _ in range(4)]
             # Robots go to what is near: long ways are rare.
             stop = min(choice, key=tour[-1].distance) if tour else choice[0]
-            tour += [Pose2(stop.x, stop.y, stop.heading + k * math.tau / looks) for k in range(looks)]
+            tour += [Pose2(stop.x, stop.y, stop.heading + k * math.tau / views) for k in range(views)]
     return tour
 
 
@@ -146,14 +146,14 @@ class Fleet:
     truth: dict[NodeId, Pose2]
 
     def changes(self, left_out: frozenset[MapId] = frozenset()) -> list[Change]:
-        """All maps in turns, as robots that map at the same time tell of them."""
+        """The changes of all maps in turns, as from robots that map at the same time."""
         queues = []
         for map_id, (nodes, edges) in self.maps.items():
             if map_id not in left_out:
-                bodies: list[ChangeBody] = [NodePut(nodes[0])]
+                content: list[ChangeBody] = [NodePut(nodes[0])]
                 for node, edge in zip(nodes[1:], edges, strict=True):
-                    bodies += [NodePut(node), EdgePut(edge)]
-                queues.append([Change(map_id, n, 0, body) for n, body in enumerate(bodies, start=1)])
+                    content += [NodePut(node), EdgePut(edge)]
+                queues.append([Change(map_id, n, 0, change) for n, change in enumerate(content, start=1)])
         out = []
         for k in range(max(map(len, queues))):
             out += [queue[k] for queue in queues if k < len(queue)]
@@ -190,7 +190,7 @@ SCENES = {
     for scene in (
         Scene("room", False, ((0,), (0,), (0,)), (0,), (0,), rooms=1),
         Scene("house", False, ((0, 1), (1, 0), (0, 1)), (0, 1), (0, 1)),
-        # The sound robots know the first of the two alike rooms, the fourth one the second.
+        # The correct robots know the first of the two similar rooms, the fourth one the second.
         Scene("twins", True, ((0, 1), (1, 0), (0, 1)), (0, 2), (1, 2), rooms=3),
         Scene("twins both", True, ((0, 1, 2), (2, 1, 0), (0, 2, 1)), (0, 2), (1, 2), rooms=3),
         Scene("twins alone", True, ((1,), (1,), (1,)), (2,), (1, 2), rooms=3),
@@ -198,7 +198,7 @@ SCENES = {
 }
 
 
-def draw_fleet(seed: int, scene: Scene, fault: Fault, stops: int = 3, looks: int = 5) -> Fleet:
+def draw_fleet(seed: int, scene: Scene, fault: Fault, stops: int = 3, views: int = 5) -> Fleet:
     """Three sound robots, and one with a fault."""
     rng = np.random.default_rng([seed, 0x0DD])
     house = draw_house(rng, twins=scene.twins, count=scene.rooms)
@@ -207,7 +207,7 @@ def draw_fleet(seed: int, scene: Scene, fault: Fault, stops: int = 3, looks: int
         odd = k == len(scene.sound)
         own = np.random.default_rng([seed, k])
         count = round(stops * 2 / len(visits)) if not scene.twins else stops
-        tour = draw_tour(house, visits, count, looks, own)
+        tour = draw_tour(house, visits, count, views, own)
         map_id = ODD if odd else MapId(f"r{k}", 1)
         nodes, edges, true = draw_map(house, map_id, tour, fault if odd else Fault.NONE, own)
         maps[map_id] = nodes, edges
@@ -228,16 +228,16 @@ def merged_fleet(fleet: Fleet, left_out: frozenset[MapId] = frozenset()) -> Merg
 
 
 def lost_views(fleet: Fleet, scene: Scene, count: int, seed: int) -> list[tuple[View, Pose2]]:
-    """What lost robots see, near where somebody has been, and where they are."""
+    """Views of lost robots, near mapped places, and their true poses."""
     rng = np.random.default_rng([seed, 0x105])
     out = []
     box = {number: fleet.house.boxes[number] for number in scene.asked}
-    near = [
+    nearby = [
         pose for pose in fleet.truth.values()
         if any(x < pose.x < x + w and y < pose.y < y + d for x, y, w, d in box.values())
     ]  # fmt: skip
     for _ in range(count):
-        pose = near[rng.integers(len(near))]
+        pose = nearby[rng.integers(len(nearby))]
         while True:
             at = pose @ Pose2.from_vector(rng.normal(0.0, [0.2, 0.2, 0.15]))
             try:
@@ -260,10 +260,10 @@ class Told(StrEnum):
 
 def judged(answers: Answers, view: View, at: Pose2, truth: dict[NodeId, Pose2]) -> Told:
     """Compare an answer with the truth."""
-    told = answers.relocalizer.answer(view)
-    if told.certainty is not Certainty.FOUND:
-        return Told.AMBIGUOUS if told.certainty is Certainty.AMBIGUOUS else Told.UNKNOWN
-    best = told.candidates[0]
+    answer = answers.relocalizer.answer(view)
+    if answer.certainty is not Certainty.FOUND:
+        return Told.AMBIGUOUS if answer.certainty is Certainty.AMBIGUOUS else Told.UNKNOWN
+    best = answer.candidates[0]
     off = (truth[best.node] @ best.node_from_robot.mean).distance(at)
     return Told.RIGHT if off < RIGHT_M else Told.WRONG
 
@@ -275,7 +275,7 @@ def outcome(
     merger = merged_fleet(fleet, left_out)
     merged = merger.merged()
     answers = Answers.of(merger, merged, merger.node)
-    told = Counter(judged(answers, view, at, fleet.truth) for view, at in views)
+    verdicts = Counter(judged(answers, view, at, fleet.truth) for view, at in views)
     parts = sum(any(node.map != ODD for node in part) for part in merged.components)
-    wrong = [one.reason for one in merged.wrong.values()]
-    return {str(one): told[one] for one in Told} | {"parts": parts, "found": wrong}
+    wrong = [verdict.reason for verdict in merged.wrong.values()]
+    return {str(verdict): verdicts[verdict] for verdict in Told} | {"parts": parts, "found": wrong}

@@ -1,1 +1,1 @@
-"""What robot and server see alike: features of an image, and the lens in front of it."""
+"""Vision shared by robot and server: SIFT features, and the lens."""

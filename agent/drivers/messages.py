@@ -1,9 +1,9 @@
-"""What travels between an agent and a body that lives elsewhere: MessagePack, validated field by field.
+"""Messages between an agent and a robot base in another process: MessagePack, validated field by field.
 
     describe    question: empty; answer: RobotDescription
     step        question: StepRequest; answer: Observation
 
-A body refuses with a reason. Two reasons are part of the protocol: ENDED and AGAIN.
+A base refuses with a reason. Two reasons are part of the protocol: ENDED and AGAIN.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ENDED = "the simulation has ended"
 """Refusal: there will be no more observations, and that is no failure."""
 
 AGAIN = "ask again later"
-"""A refusal with this in it is answered by asking the same again (the bus itself says so when it is full)."""
+"""A refusal that contains this is answered by asking the same again (the bus says so when it is full)."""
 
 MAX_IMAGE_BYTES = 16 * 2**20
 MAX_SIDE_PX = 16384
@@ -48,7 +48,7 @@ COMPRESSED = ("jpeg", "png")
 
 @dataclass(frozen=True, slots=True)
 class StepRequest:
-    """Apply a command for one tick, then tell what is sensed.
+    """Apply a command for one tick, then return an observation.
 
     Attributes:
         sequence: 1 begins a conversation; each further step is one more. The same number again asks for the
@@ -120,7 +120,7 @@ def decode_observation(data: bytes) -> Observation:
 
 
 def check_image(observation: Observation, description: RobotDescription) -> None:
-    """Hold an observation's image against the camera that the body has described.
+    """Check an observation's image against the camera in the description.
 
     Raises:
         InvalidMessage: it has another size.
@@ -206,7 +206,7 @@ def _read_image(reader: Reader) -> NDArray[np.uint8]:
 
 def _decompress(reader: Reader, encoding: str, data: bytes, shape: Sequence[int]) -> NDArray[np.uint8]:
     try:
-        # The message says the size; an image that says another one is not decoded.
+        # An image whose size differs from the one in the message is not decoded.
         image = decode_grey(data) if sorted(image_size(data)) == sorted(shape) else None
     except InvalidValue as error:
         raise reader.error(f"no {encoding} image ({error})") from None

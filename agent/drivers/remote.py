@@ -1,4 +1,4 @@
-"""A robot whose body is behind the bus: the simulator, or a computer on a real base."""
+"""A robot whose base is behind the bus: the simulator, or a computer on a real robot."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ ASK_TIMEOUT = 3.0
 """After what silence a question is asked again, s. A lost question costs no more than this."""
 
 PATIENCE = 90.0
-"""How long a body may be silent, s. A simulated one is as long as it waits for other robots' agents."""
+"""Longest silence of a base, s. A simulated base is silent while it waits for the agents of other robots."""
 
 PAUSE = 0.05
-"""Between two questions when nobody is there, s."""
+"""Between two questions while there is no answer, s."""
 
 _T = TypeVar("_T")
 
@@ -51,7 +51,7 @@ def clip(command: Command, description: RobotDescription) -> Command:
 
 
 class RemoteRobot:
-    """The Robot protocol over questions to a body.
+    """The Robot protocol over questions to a base.
 
     Each `sense` carries the last command there and the observation back: one question a tick.
     """
@@ -63,7 +63,7 @@ class RemoteRobot:
             bus: the connection.
             fleet: which fleet.
             name: the robot's.
-            patience: how long to ask a body that does not answer, s; longer than a bridge's patience with
+            patience: how long to repeat a question without an answer, s; longer than a bridge waits for
                 its other robots.
         """
         keys = Keys(fleet)
@@ -75,19 +75,19 @@ class RemoteRobot:
         self._command = Command()
         self._description: RobotDescription | None = None
         self._closed = threading.Event()
-        # A body waits for its driver no longer than it lives.
+        # A base waits for its driver only while it runs.
         self._alive: Closing = bus.announce(keys.robot_driver(name, secrets.randbits(52)))
 
     def describe(self) -> RobotDescription:
-        """What the body says of itself; asked once.
+        """Description of the robot; asked once.
 
         Raises:
-            DeviceError: nobody answers, or not properly.
+            DeviceError: no answer, or a malformed one.
         """
         if self._description is None:
             self._description = self._ask(self._describe_key, b"", decode_description)
             if self._description is None:
-                why = "stopped before its body has answered" if self._closed.is_set() else ENDED
+                why = "stopped before its base has answered" if self._closed.is_set() else ENDED
                 raise DeviceError(f"{self._describe_key}: {why}")
         return self._description
 
@@ -95,7 +95,7 @@ class RemoteRobot:
         """Let the last command act for one tick; None when the simulation has ended.
 
         Raises:
-            DeviceError: nobody answers, or not properly.
+            DeviceError: no answer, or a malformed one.
         """
         if self._closed.is_set():
             return None
@@ -116,17 +116,17 @@ class RemoteRobot:
         """Keep the command for the next tick.
 
         Returns:
-            The command within the body's limits.
+            The command within the base's limits.
 
         Raises:
-            DeviceError: the body was never asked for its limits and does not answer.
+            DeviceError: the limits are unknown and the base does not answer.
             InvalidValue: the command is not finite.
         """
         self._command = clip(command, self.describe())
         return self._command
 
     def close(self) -> None:
-        """Ask no more. A body stands still by itself when its agent asks no more or is no longer alive."""
+        """Stop asking. A base stops by itself when its agent no longer asks or has died."""
         self._closed.set()
         self._alive.close()
 
@@ -136,14 +136,14 @@ class RemoteRobot:
         An answer that is not valid is asked for once more: it may have been damaged on its way.
         """
         end = time.monotonic() + self._patience
-        reason = "nobody answers"
+        reason = "no answer"
         asked_again = False
         while True:
             # A short patience still gives every question time for its answer.
             replies = self._bus.ask(key, payload, min(ASK_TIMEOUT, max(end - time.monotonic(), PAUSE)))
             answers = [reply.payload for reply in replies if not reply.error]
             if len(answers) > 1:
-                raise DeviceError(f"{key}: {len(answers)} bodies answer; stop all but one")
+                raise DeviceError(f"{key}: {len(answers)} bases answer; stop all but one")
             if answers:
                 try:
                     return decode(answers[0])
@@ -160,7 +160,7 @@ class RemoteRobot:
                     raise DeviceError(f"{key}: refused: {reason}")
             if time.monotonic() >= end:
                 raise DeviceError(
-                    f"{key}: {reason} for {self._patience:g} s; start the robot's body (for a simulated one: "
+                    f"{key}: {reason} for {self._patience:g} s; start the robot's base (for a simulated one: "
                     "mapweave sim serve) with the same fleet and endpoint"
                 )
             if self._closed.wait(PAUSE):

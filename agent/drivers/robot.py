@@ -8,7 +8,7 @@ from mapweave.agent.observation import Command, Observation, RobotDescription
 
 
 class Robot(Protocol):
-    """A body: senses, and obeys."""
+    """A robot base: returns observations, executes commands."""
 
     def describe(self) -> RobotDescription:
         """Camera, footprint, limits."""

@@ -1,7 +1,7 @@
 """What was driven is written into the map: an edge between two nodes, known better with every drive.
 
-It stands beside what else the map says of its two nodes, and never in its place: that was measured by other
-means, and only where both are there can the one refute the other (docs/decisions/driven-edges.md).
+It is kept beside the other edges between the two nodes and replaces none of them: they were measured by
+other means, and can be checked against each other (docs/decisions/driven-edges.md).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 THERE, BACK, INLIERS = "there", "back", "inliers"
-"""Evidence: drives from a to b, drives from b to a, and most landmarks in sight at a hand-over in between."""
+"""Evidence: drives from a to b, drives from b to a, and most visible landmarks at a hand-over in between."""
 
 AGREE = 16.27
 """Chi-square with 3 degrees of freedom, 99.9 %: drives that differ by more are not of the same two places."""
@@ -28,7 +28,7 @@ def driven_edge(own_map: HybridMap, traverse: Traverse, new_id: Callable[[], Edg
     Args:
         own_map: of the robot that drove. The nodes may be another's.
         traverse: as measured.
-        new_id: draws an id of that map; asked only for an edge that is new.
+        new_id: returns an unused id of that map; called only for a new edge.
 
     Returns:
         The edge, from the smaller id to the greater: with the id of the earlier one, if these nodes were
@@ -41,38 +41,41 @@ def driven_edge(own_map: HybridMap, traverse: Traverse, new_id: Callable[[], Edg
     earlier = _driven(own_map, traverse)
     if earlier is None:
         return Edge(new_id(), a, b, a_from_b, EdgeKind.DRIVEN, evidence=evidence)
-    known = {name: earlier.evidence.get(name, 0.0) for name in evidence}
-    drives = known[THERE] + known[BACK]
+    earlier_evidence = {name: earlier.evidence.get(name, 0.0) for name in evidence}
+    drives = earlier_evidence[THERE] + earlier_evidence[BACK]
     if agree(earlier.a_from_b, a_from_b):
         a_from_b = averaged(earlier.a_from_b, drives, a_from_b)
-        evidence = {name: value + known[name] for name, value in evidence.items()}
-        evidence[INLIERS] = max(known[INLIERS], float(traverse.landmarks))
+        evidence = {name: value + earlier_evidence[name] for name, value in evidence.items()}
+        evidence[INLIERS] = max(earlier_evidence[INLIERS], float(traverse.landmarks))
     elif drives > 1.0:
         # The majority counts (Boyer and Moore 1991): a drive that contradicts takes one that agreed away.
-        a_from_b, evidence = earlier.a_from_b, known
-        evidence[THERE if known[THERE] >= known[BACK] else BACK] -= 1.0
+        a_from_b, evidence = earlier.a_from_b, earlier_evidence
+        evidence[THERE if earlier_evidence[THERE] >= earlier_evidence[BACK] else BACK] -= 1.0
     return Edge(earlier.id, a, b, a_from_b, EdgeKind.DRIVEN, evidence=evidence)
 
 
 def averaged(earlier: PoseGaussian, drives: float, newest: PoseGaussian) -> PoseGaussian:
     """The average of a pose known from several drives and one known from one more.
 
-    All drives see by the same landmarks, and err alike by these. So they are averaged by covariance
-    intersection (Julier and Uhlmann 1997) with equal weights, which holds however they are correlated: many
-    drives are not surer than the surest of them.
+    All drives see the same landmarks, so their errors are correlated. They are averaged by covariance
+    intersection (Julier and Uhlmann 1997) with equal weights, which is consistent for any correlation: many
+    drives are not more certain than the most certain of them.
     """
     share = 1.0 / (drives + 1.0)
-    known, new = np.linalg.inv(earlier.covariance), np.linalg.inv(newest.covariance)
-    covariance = np.linalg.inv((1.0 - share) * known + share * new)
+    earlier_information, newest_information = (
+        np.linalg.inv(earlier.covariance),
+        np.linalg.inv(newest.covariance),
+    )
+    covariance = np.linalg.inv((1.0 - share) * earlier_information + share * newest_information)
     off = (earlier.mean.inverse() @ newest.mean).vector
-    step = Pose2.from_vector(share * covariance @ new @ off)
+    step = Pose2.from_vector(share * covariance @ newest_information @ off)
     return PoseGaussian(earlier.mean @ step, 0.5 * (covariance + covariance.T))
 
 
-def agree(one: PoseGaussian, other: PoseGaussian) -> bool:
+def agree(a: PoseGaussian, b: PoseGaussian) -> bool:
     """Whether two measurements may be of the same pose."""
-    both = PoseGaussian(one.mean, one.covariance + other.covariance)
-    return both.mahalanobis2(other.mean) < AGREE
+    difference = PoseGaussian(a.mean, a.covariance + b.covariance)
+    return difference.mahalanobis2(b.mean) < AGREE
 
 
 def _driven(own_map: HybridMap, traverse: Traverse) -> Edge | None:

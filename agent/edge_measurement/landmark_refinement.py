@@ -20,11 +20,11 @@ followed may be something else."""
 
 @dataclass(frozen=True)
 class LandmarkRefinementSettings:
-    """When a node is put anew.
+    """When a node is written again.
 
     Attributes:
         share: a landmark is known better if its depth's sigma has fallen below this share of what it was.
-        least: a node is told anew if so many of its landmarks are known better: it costs some 3 kB.
+        least: a node is written again if so many of its landmarks are known better: it costs some 3 kB.
         floor: what a depth is never better than: m, and share of the depth; as when it was mapped.
     """
 
@@ -34,9 +34,9 @@ class LandmarkRefinementSettings:
 
 
 class LandmarkRefinement:
-    """Watches a drive, and says how the landmarks of the robot's own nodes are known after it.
+    """Watches a drive and refines the landmarks of the robot's own nodes.
 
-    Each node is put anew once a drive at most: when the robot leaves it, or has arrived.
+    Each node is written again once a drive at most: when the robot leaves it, or has arrived.
     """
 
     def __init__(self, own_map: HybridMap, settings: LandmarkRefinementSettings | None = None) -> None:
@@ -44,7 +44,7 @@ class LandmarkRefinement:
         self._map = own_map
         self._settings = settings or LandmarkRefinementSettings()
         self._localizer: NodeLocalizer | None = None
-        self._told: set[NodeId] = set()
+        self._refined_nodes: set[NodeId] = set()
 
     def see(self, fix: Fix | None) -> Node | None:
         """Take in where the robot is now; returns a node of the map with better landmarks.
@@ -58,20 +58,24 @@ class LandmarkRefinement:
 
     def _refined(self, localizer: NodeLocalizer) -> Node | None:
         node = self._map.nodes.get(localizer.node.id)
-        if node is None or node.id in self._told or len(node.landmarks) != len(localizer.node.landmarks):
+        if (
+            node is None
+            or node.id in self._refined_nodes
+            or len(node.landmarks) != len(localizer.node.landmarks)
+        ):
             return None
         landmarks = refined(node.landmarks, *localizer.depths(), self._settings)
         if landmarks is None:
             return None
-        self._told.add(node.id)
-        # Rounded now, the robot works with the same numbers as everybody who gets the node.
+        self._refined_nodes.add(node.id)
+        # Rounded now, the robot works with the same numbers as all receivers of the node.
         return replace(node, landmarks=snap(landmarks, node.camera))
 
 
 def refined(
     mapped: Landmarks, depths: Array, sigmas: Array, s: LandmarkRefinementSettings
 ) -> Landmarks | None:
-    """Take over the depths that are known better; None if these are too few to tell.
+    """Take over the depths that are known better; None if they are too few.
 
     Args:
         mapped: N landmarks as the map has them.
@@ -79,12 +83,12 @@ def refined(
         sigmas: (N,) m, of independent errors.
         s: what counts as better.
     """
-    sober = np.hypot(sigmas, s.floor[0] + s.floor[1] * depths)
+    sigmas_with_floor = np.hypot(sigmas, s.floor[0] + s.floor[1] * depths)
     with np.errstate(invalid="ignore"):
-        better = sober < s.share * mapped.depth_sigmas
+        better = sigmas_with_floor < s.share * mapped.depth_sigmas
         better &= np.abs(depths - mapped.depths) < DOUBT * mapped.depth_sigmas
     if np.count_nonzero(better) < s.least:
         return None
-    new = [np.where(better, one, old).astype(np.float32) for one, old in
-           ((depths, mapped.depths), (sober, mapped.depth_sigmas))]  # fmt: skip
+    new = [np.where(better, measured, old).astype(np.float32) for measured, old in
+           ((depths, mapped.depths), (sigmas_with_floor, mapped.depth_sigmas))]  # fmt: skip
     return replace(mapped, depths=new[0], depth_sigmas=new[1])

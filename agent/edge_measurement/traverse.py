@@ -1,7 +1,7 @@
 """What a drive measures between the nodes that it passes: a traverse, as surveyors call it.
 
-At a hand-over the robot knows itself by the landmarks of one node, and a moment later by those of the next:
-the two poses of one robot are a measurement of where the nodes stand to each other.
+At a hand-over the robot is localized by the landmarks of one node, and a moment later by those of the next:
+two poses of the same robot measure the relative pose of the two nodes.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
 SETTLED = 3
-"""Images through which a node's landmarks must have been followed: fewer than lie between two looks for the
-next node."""
+"""Images through which a node's landmarks must have been followed: fewer than lie between two detections of
+the next node."""
 TRAVERSE_GAP = 0.5
 """What may lie between the landmarks of two nodes, as `Fix.blind` counts it, m."""
 REACH = 0.45
 """This near to a node the robot has passed it, m. It is twice the distance within which the follower takes
 a node for passed."""
 DETOUR = 1.3
-"""Nor is one on a way longer than the straight line by more than this factor, and `reach` at either end:
-something stands in between."""
+"""A way longer than the straight line by more than this factor, and `reach` at either end, is not measured:
+it leads around something."""
 
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
@@ -37,9 +37,9 @@ class TraverseSettings:
     """When a drive from node to node is a measurement.
 
     Attributes:
-        floor: error of a settled pose that its covariance does not tell of, m and rad: tracks err alike
-            for a while, and the landmarks of a node were mapped by the same wheels.
-        widest: a traverse known no better than this is not worth telling, m.
+        floor: error of a settled pose beyond its covariance, m and rad: tracks have a common error for a
+            while, and the landmarks of a node were mapped by the same wheels.
+        widest: largest standard deviation of a traverse that is reported, m.
     """
 
     floor: tuple[float, float] = (0.005, 0.005)
@@ -48,13 +48,13 @@ class TraverseSettings:
 
 @dataclass(frozen=True, eq=False)
 class Traverse:
-    """The robot has stood at one node, and then at another.
+    """The robot was at one node, and then at another.
 
     Attributes:
         start: the first node.
         end: the second.
         start_from_end: as measured on the way.
-        landmarks: fewest in sight where one node was handed over to the next.
+        landmarks: fewest visible at a hand-over from one node to the next.
     """
 
     start: NodeId
@@ -64,10 +64,10 @@ class Traverse:
 
 
 class TraverseRecorder:
-    """Watches where a robot is on its way, and says when it has got from one node to another.
+    """Watches the robot's fixes and reports when it has driven from one node to another.
 
-    Between may lie nodes that it knew itself by and did not come near to. It measures nothing across a gap
-    that it drove blind for long, nor from where it had to be found anew.
+    In between it may localize by nodes that it does not come near to. It measures nothing across a long gap
+    without landmarks, nor from where the robot was lost.
     """
 
     def __init__(self, description: RobotDescription, settings: TraverseSettings | None = None) -> None:
@@ -82,7 +82,7 @@ class TraverseRecorder:
         self._node: NodeId | None = None
         self._node_from_robot = HERE
         self._gap = 0.0
-        self._in_sight = 0
+        self._visible = 0
         self._passed: NodeId | None = None
         self._passed_from_node = HERE
         self._fewest, self._way = 0, 0.0
@@ -91,7 +91,7 @@ class TraverseRecorder:
         """Take in one tick of a drive.
 
         Args:
-            fix: where the robot is after this observation; None while it does not know, or is found anew.
+            fix: where the robot is after this observation; None while it is lost, or localizes globally.
             observation: with the wheels' last step.
 
         Returns:
@@ -108,35 +108,35 @@ class TraverseRecorder:
                 self._forget()
             return None
         assert fix.localizer is not None, "landmarks are in sight"
-        self._stand(fix.node, self._sober(fix.node_from_robot), len(fix.localizer.visible))
+        self._set_reference_node(fix.node, self._with_floor(fix.node_from_robot), len(fix.localizer.visible))
         mean = self._node_from_robot.mean
         return self._arrive() if mean.distance(Pose2()) <= REACH else None
 
     def _settled(self, fix: Fix) -> bool:
-        """Whether landmarks that the node has with their depths have been in sight for a while."""
+        """Whether landmarks of the node with known depths have been visible for a while."""
         localizer = fix.localizer if fix.in_sight else None
-        known = localizer is not None and localizer is self._watched
-        self._images = self._images + 1 if known else 0
+        same_localizer = localizer is not None and localizer is self._watched
+        self._images = self._images + 1 if same_localizer else 0
         self._watched = localizer
-        return known and self._images >= SETTLED
+        return same_localizer and self._images >= SETTLED
 
-    def _stand(self, node: NodeId, node_from_robot: PoseGaussian, in_sight: int) -> None:
+    def _set_reference_node(self, node: NodeId, node_from_robot: PoseGaussian, visible: int) -> None:
         """Know the robot by a node; where that is another one, this is a hand-over."""
         if self._node is None:
-            self._fewest = in_sight
+            self._fewest = visible
         elif node != self._node:
             before_from_node = self._node_from_robot @ node_from_robot.inverse()
             self._passed_from_node = self._passed_from_node @ before_from_node
-            self._fewest = min(self._fewest, self._in_sight, in_sight)
+            self._fewest = min(self._fewest, self._visible, visible)
         self._node, self._node_from_robot = node, node_from_robot
-        self._gap, self._in_sight = 0.0, in_sight
+        self._gap, self._visible = 0.0, visible
 
     def _arrive(self) -> Traverse | None:
-        """The robot stands at the node that it knows itself by."""
+        """The robot is at the node by which it is localized."""
         assert self._node is not None
         start, between, fewest, way = self._passed, self._passed_from_node, self._fewest, self._way
         self._passed, self._passed_from_node = self._node, HERE
-        self._fewest, self._way = self._in_sight, 0.0
+        self._fewest, self._way = self._visible, 0.0
         if start is None or start == self._node:
             return None
         s = self._settings
@@ -144,7 +144,7 @@ class TraverseRecorder:
         straight = DETOUR * between.mean.distance(Pose2()) + 2.0 * REACH
         return Traverse(start, self._node, between, fewest) if widest < s.widest and way < straight else None
 
-    def _sober(self, pose: PoseGaussian) -> PoseGaussian:
+    def _with_floor(self, pose: PoseGaussian) -> PoseGaussian:
         """A pose of the filter with the uncertainty that the filter cannot know."""
         xy, heading = self._settings.floor
         more: Array = np.diag([xy**2, xy**2, heading**2])

@@ -1,4 +1,4 @@
-"""How far the mapping filter believes its wheels: less for a while, once an image has refuted them."""
+"""Odometry noise of the mapping filter: larger for a while after an image has refuted the wheels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mapweave.hybridmap.pose import Array
 
 
 class AdaptiveOdometryNoise:
-    """The wheels' noise, as it is said or as images have shown it to be."""
+    """The wheels' noise: nominal, or as large as images have shown it to be."""
 
     def __init__(self, noise: WheelNoise, settings: FilterSettings) -> None:
         """Begin with trust."""
@@ -38,12 +38,12 @@ class AdaptiveOdometryNoise:
         return self._settings.side_slip * way
 
     def refuted(self, odometry: Odometry, surprise: float) -> Array:
-        """The root for a step that its image refutes by so many sigmas; the next are doubted as well."""
+        """The root for a step that its image refutes by so many sigmas; the next ones get more noise, too."""
         self.doubt()
         return self._noise.refuted_root(odometry, surprise, self._settings.slip[0])
 
     def slipped(self) -> Array:
-        """The root for a step of which the wheels may say anything."""
+        """The root for a step in which the wheels carry no information."""
         return np.diag(self._settings.slip)
 
     def doubt(self) -> None:

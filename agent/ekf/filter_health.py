@@ -11,7 +11,7 @@ from mapweave.hybridmap.pose import Array, Pose2
 
 
 class FilterHealth:
-    """Keeps what the last image told, how long that is ago, and how far the robot has moved for parallax."""
+    """Keeps the health by the last image, its age, and how far the robot has moved for parallax."""
 
     def __init__(self, settings: FilterSettings, focal: float) -> None:
         """Begin at the anchor, healthy.
@@ -32,17 +32,17 @@ class FilterHealth:
         self._base, self._baseline = _position(pose_vector), 0.0
 
     def moved(self, pose_vector: Array) -> None:
-        """The robot has moved to a pose (3,), and no image has told of it yet."""
+        """Take in a predicted pose (3,), before its image."""
         self._steps_unseen += 1
         self._baseline = max(self._baseline, math.dist(_position(pose_vector), self._base))
 
     def saw(self, health: Health, reason: str) -> None:
-        """An image has come and told this."""
+        """Take in the health by an image."""
         self._steps_unseen = 0
         self._last = health, reason
 
     def reanchored(self, old_from_new: Pose2) -> None:
-        """Poses are told from a new anchor on."""
+        """Restart at a new anchor."""
         base = old_from_new.inverse() @ Pose2(*self._base)
         self._base = base.x, base.y
 

@@ -1,10 +1,9 @@
-"""Which measurements to believe: chi-square gates and one-point RANSAC.
+"""Which measurements to accept: chi-square gates and one-point RANSAC.
 
-All tests are made on innovations and their joint covariance S, so that they know what the filter knows: a
-shared error (the robot turned more than its wheels say) moves all landmarks together and is no outlier.
-Everything is computed for all landmarks at once and without chance: of the one-point hypotheses
-(Civera et al., "1-point RANSAC for EKF filtering", 2010) there are only as many as landmarks, so all are
-tried.
+All tests are made on innovations and their joint covariance S, so that correlations count: a shared error
+(the robot turned more than its wheels measured) moves all landmarks together and is no outlier. Everything is
+computed for all landmarks at once and without random samples: there are only as many one-point hypotheses
+(Civera et al., "1-point RANSAC for EKF filtering", 2010) as landmarks, so all are tried.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ class Judgement(NamedTuple):
 
     Attributes:
         innovations: (m, 2) slopes, measured minus expected.
-        believed: (m,) which of them to correct by.
+        believed: (m,) which of them are accepted.
         whitening: (2k, 2k) what whitens the innovations of these k (mapweave.agent.ekf.innovations.whiten).
-        health: what they tell of the filter.
+        health: of the filter, by this image.
         reason: what is wrong, in words; empty if nothing is.
     """
 
@@ -41,12 +40,12 @@ class Judgement(NamedTuple):
 
     @property
     def agreeing(self) -> int:
-        """How many are believed."""
+        """How many are accepted."""
         return len(self.whitening) // 2
 
     @staticmethod
     def of_none(innovations: Array, health: Health, reason: str) -> Judgement:
-        """None of them is believed."""
+        """None of them is accepted."""
         return Judgement(innovations, np.zeros(len(innovations), np.bool_), np.zeros((0, 0)), health, reason)
 
 
@@ -105,8 +104,8 @@ def one_point_consensus(innovations: Array, covariance: Array, gate: float) -> M
 def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
     """Which innovations to accept.
 
-    If each agrees with all the others, all of them. Else the one-point consensus, from which the worst is
-    taken until each that is left agrees with all the others left.
+    If each agrees with all the others, all are accepted. Else those of the one-point consensus, from which
+    the worst is removed until each agrees with all the rest.
 
     Args:
         innovations: (N, 2) measured minus expected, N > 0.
@@ -115,8 +114,8 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
 
     Returns:
         (N,) accepted; what whitens the accepted ones (mapweave.agent.ekf.innovations.whiten), (2K, 2K); and
-        the median of their distances from what all others say, MEDIAN if the noise is as it is said and
-        without any.
+        the median of their distances from the prediction by all others, MEDIAN if the noise is nominal and
+        if there are none.
     """
     whitening = whiten(covariance)
     distances = leave_one_out(innovations, whitening)

@@ -1,8 +1,8 @@
-"""Images beside what the mapping filter expects of them: innovations and their joint covariance.
+"""Innovations of the mapping filter and their joint covariance.
 
 The image measures entries of the state itself, the slopes (a, b) of landmarks. With S = L L^T the covariance
-of all innovations of an image, W = L^-1 whitens them and serves everything: W^T W is the information that the
-leave-one-out tests need, |W r|^2 the NIS, W B what the image says of the wheels, and W P_M the update's root.
+of all innovations of an image, W = L^-1 whitens them and serves everything: W^T W is the information for the
+leave-one-out tests, |W r|^2 the NIS, W B the sensitivity to the wheels' errors, and W P_M the update's root.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ LEAF = 32
 
 
 class Examined(NamedTuple):
-    """An image beside what was expected of it.
+    """An image compared with its prediction.
 
     Attributes:
         innovations: (m, 2) slopes, measured minus expected.
         whitening: (2m, 2m) W of all of them.
-        worst: largest of their distances from what all others say (`leave_one_out`).
+        worst: largest of their distances from the prediction by all others (`leave_one_out`).
         median: of these distances.
     """
 
@@ -102,7 +102,7 @@ def leave_one_out(innovations: Array, whitening: Array) -> Array:
 def examine(
     rays: Array, covariance: Array, slots: NDArray[np.intp], slopes: Array, variances: Array
 ) -> Examined:
-    """Hold an image beside what was expected of it.
+    """Compare an image with its prediction.
 
     Args:
         rays: (n, 3) expected.
@@ -120,12 +120,12 @@ def examine(
 def turn_by_image(
     rays: Array, slots: NDArray[np.intp], slopes: Array, wheel_root: Array, most: float
 ) -> float:
-    """By how much further than its wheels say the robot has turned, rad, as the landmarks seen vote.
+    """By how much the robot has turned further than its wheels measured, rad, by the landmarks in the image.
 
-    The image shows a turn as da = (1 + a^2) du2, alike for all landmarks, near and far. Their vote is the
+    The image shows a turn as da = (1 + a^2) du2, the same for near and far landmarks. The estimate is the
     mean of the middle half, so that a quarter may be wrong on either side, and its error follows from the
     half's width: a Gaussian's is 1.35 sigma wide, and its mean has 1.2 times the variance of the whole mean.
-    It and the wheels are weighed by their variances.
+    It and the wheels are weighted by their variances.
 
     Args:
         rays: (n, 3) expected.
@@ -147,7 +147,7 @@ def turn_by_image(
 def wheel_errors(
     by_input: Array, wheel_root: Array, slots: NDArray[np.intp], whitening: Array, residual: Array
 ) -> tuple[float, float, float]:
-    """What the residuals of some landmarks say of the wheels' errors.
+    """The wheels' errors, estimated from the residuals of some landmarks.
 
     With J = W B_M R, the errors in sigmas of the wheels have the score s = J^T W r, which is also their
     posterior mean, and J^T J is its covariance if the wheels are right: what the image could know of them.
@@ -160,9 +160,9 @@ def wheel_errors(
         residual: (m, 2) r, measured minus expected.
 
     Returns:
-        The posterior mean R s of the errors of u1, m, and u2, rad; and how far the score is from what right
-        wheels allow, in its own sigmas. Unlike the mean this does not shrink with the wheels' noise: wheels
-        that claim for certain to stand, as with a lost encoder, are refuted as well.
+        The posterior mean R s of the errors of u1, m, and u2, rad; and the distance of the score from what
+        correct wheels allow, in its own sigmas. Unlike the mean, this does not shrink with the wheels' noise:
+        it also refutes wheels that report a standstill without noise, as with a lost encoder.
     """
     lever = whitening @ (by_input[measured_entries(slots), :2] @ wheel_root)
     score = lever.T @ (whitening @ residual.ravel())

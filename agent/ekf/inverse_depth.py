@@ -1,9 +1,9 @@
 """Landmarks anchored at a node's camera, seen from another pose: the localization filter's measurement.
 
-A landmark is (a, b, w), slopes and inverse depth as in mapweave.agent.ekf.motion, here of a camera that
-stands at the node for good. Only (a, w) are estimated, two numbers a landmark as in the paper; where the
-paper keeps the height, b is kept, which is what the node's image really fixed: the height of a landmark of
-uncertain depth is uncertain, its slope is known to a pixel (docs/decisions/ekf-localization.md).
+A landmark is (a, b, w), slopes and inverse depth as in mapweave.agent.ekf.motion, here of a camera fixed at
+the node. Only (a, w) are estimated, two numbers a landmark as in the paper. The paper fixes the height; here
+b is fixed, which the node's image measures: the height of a landmark of uncertain depth is uncertain, its
+slope is known to a pixel (docs/decisions/ekf-localization.md).
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ def project_anchored(pose_vector: Array, rays: Array, mount_forward: float) -> A
     ahead, right = 1.0 - w * x, a + w * y
     scale = c * ahead - s * right
     safe = np.where(np.abs(scale) > 1e-9, scale, 1e-9)
-    seen = np.stack([(s * ahead + c * right) / safe, b / safe, w / safe], axis=1)
+    projected = np.stack([(s * ahead + c * right) / safe, b / safe, w / safe], axis=1)
     # Each is a quotient n / D: its derivative is (dn - (n / D) dD) / D.
     scale_by_pose = np.stack([-c * w, -s * w, -(s * ahead + c * right)], axis=1)
-    by_pose = -seen[:, :, None] * scale_by_pose[:, None, :]
+    by_pose = -projected[:, :, None] * scale_by_pose[:, None, :]
     by_pose[:, 0, 0] -= s * w
     by_pose[:, 0, 1] += c * w
     by_pose[:, 0, 2] += scale + mount_forward * w
     by_ray = np.zeros((len(rays), 3, 3))
-    by_ray[:, :, 0] = s * seen
-    by_ray[:, :, 2] = (c * x + s * y) * seen
+    by_ray[:, :, 0] = s * projected
+    by_ray[:, :, 2] = (c * x + s * y) * projected
     by_ray[:, 0, 0] += c
     by_ray[:, 0, 2] += c * y - s * x
     by_ray[:, 1, 1] = 1.0
     by_ray[:, 2, 2] += 1.0
-    return AnchoredProjection(seen, by_pose / safe[:, None, None], by_ray / safe[:, None, None], scale)
+    return AnchoredProjection(projected, by_pose / safe[:, None, None], by_ray / safe[:, None, None], scale)
 
 
 def rays_of_points(points: Array, mount_forward: float, mount_height: float) -> tuple[Array, Array]:
@@ -90,8 +90,8 @@ def points_of_rays(rays: Array, mount_forward: float, mount_height: float) -> tu
 
     Rays with w <= 0 have no point: NaN.
     """
-    known = rays[:, 2] > 0
-    depth = np.where(known, 1.0 / np.where(known, rays[:, 2], 1.0), np.nan)
+    finite = rays[:, 2] > 0
+    depth = np.where(finite, 1.0 / np.where(finite, rays[:, 2], 1.0), np.nan)
     points = np.stack([depth + mount_forward, -rays[:, 0] * depth, mount_height - rays[:, 1] * depth], axis=1)
     by_ray = np.zeros((len(rays), 3, 3))
     by_ray[:, 1, 0] = by_ray[:, 2, 1] = -depth

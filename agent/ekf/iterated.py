@@ -16,7 +16,7 @@ from mapweave.hybridmap.pose import Array
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What an image says of some landmarks.
+    """An image's measurements of some landmarks.
 
     Attributes:
         slots: (N,) their places in the state.
@@ -41,9 +41,9 @@ class Fit:
 
     Attributes:
         state: after the update.
-        accepted: (N,) measurements that were believed.
+        accepted: (N,) measurements that were accepted.
         innovations: (N, 2) slopes, measured minus expected, at the first linearisation.
-        mean_nis: normalised innovation squared over its degrees of freedom; NaN if nothing was believed.
+        mean_nis: normalised innovation squared over its degrees of freedom; NaN if none was accepted.
     """
 
     state: LocalizationState
@@ -53,42 +53,42 @@ class Fit:
 
 
 def iterated_update(
-    state: LocalizationState, start: Array, seen: Measurement, mount_forward: float
+    state: LocalizationState, start: Array, measured: Measurement, mount_forward: float
 ) -> Fit | None:
     """Correct the state by an image (iterated extended Kalman filter: Gauss-Newton on the MAP cost).
 
     Args:
         state: before the update: prior mean and covariance.
         start: (3,) pose at which to linearise first, the prior's or a better one.
-        seen: the image.
+        measured: the image.
         mount_forward: of the optical centre ahead of the axle, m.
 
     Returns:
         The correction, or None if an iterate had a landmark behind the camera: the prior is too uncertain.
     """
-    n, slots = len(seen.slots), seen.slots
+    n, slots = len(measured.slots), measured.slots
     index = (3 + 3 * slots[:, None] + np.arange(3)).ravel()
     pose_vector, rays = start, state.rays
     first: Array | None = None
     accepted: NDArray[np.bool_] = np.ones(n, np.bool_)
-    for _ in range(seen.most):
-        sight = project_anchored(pose_vector, rays[slots], mount_forward)
-        first_sight = project_anchored(pose_vector, state.first[slots], mount_forward)
-        if (np.minimum(sight.scale, first_sight.scale) <= NEAREST_SCALE).any():
+    for _ in range(measured.most):
+        projected = project_anchored(pose_vector, rays[slots], mount_forward)
+        first_projected = project_anchored(pose_vector, state.first[slots], mount_forward)
+        if (np.minimum(projected.scale, first_projected.scale) <= NEAREST_SCALE).any():
             return None
-        by_pose = first_sight.by_pose[:, :2].reshape(2 * n, 3)
-        by_ray = first_sight.by_ray[:, :2]
+        by_pose = first_projected.by_pose[:, :2].reshape(2 * n, 3)
+        by_ray = first_projected.by_ray[:, :2]
         rows = by_pose @ state.covariance[:3]
         rows += (by_ray @ state.covariance[index].reshape(n, 3, -1)).reshape(2 * n, -1)
         columns = rows.T
         spread = by_pose @ columns[:3] + (by_ray @ columns[index].reshape(n, 3, -1)).reshape(2 * n, 2 * n)
-        spread[np.arange(2 * n), np.arange(2 * n)] += np.tile(seen.variances, n)
+        spread[np.arange(2 * n), np.arange(2 * n)] += np.tile(measured.variances, n)
         # The prior mean as seen from this linearisation point.
         back = _linear(by_pose, by_ray, state.pose_vector - pose_vector, (state.rays - rays)[slots])
-        innovations = seen.slopes - sight.rays[:, :2] - back
+        innovations = measured.slopes - projected.rays[:, :2] - back
         if first is None:
             first = innovations
-            accepted, whitening, _ = believe(innovations, spread, seen.gate)
+            accepted, whitening, _ = believe(innovations, spread, measured.gate)
             if not accepted.any():
                 return Fit(state, accepted, first, float("nan"))
         else:
@@ -99,10 +99,10 @@ def iterated_update(
         step = root @ white
         new_pose, new_rays = state.stepped(step)
         change = _linear(by_pose, by_ray, new_pose - pose_vector, (new_rays - rays)[slots])
-        promised = sight.rays[:, :2] + change
+        promised = projected.rays[:, :2] + change
         pose_vector, rays = new_pose, new_rays
         kept = project_anchored(pose_vector, rays[slots], mount_forward).rays[:, :2]
-        if np.abs(kept - promised)[accepted].max() < seen.linear:
+        if np.abs(kept - promised)[accepted].max() < measured.linear:
             break
     corrected = state.corrected(step, root)
     nis = float(white @ white) / len(white)

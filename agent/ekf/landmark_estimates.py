@@ -1,4 +1,4 @@
-"""What the filters tell of their landmarks: values, in metres and in the robot's frame."""
+"""Landmarks as the filters return them: values, in metres and in the robot's frame."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class LandmarkEstimates(NamedTuple):
     def of_rays(ids: Ids, rays: Array, covariances: Array, camera: Camera) -> LandmarkEstimates:
         """Of rays (N, 3) [a, b, w 1/m] in the camera and their covariances (N, 3, 3)."""
         w = rays[:, 2]
-        known = w > 0.0
-        depths = np.where(known, 1.0 / np.where(known, w, 1.0), np.inf)
-        sigmas = np.where(known, np.sqrt(covariances[:, 2, 2]) * depths**2, np.inf)
+        finite = w > 0.0
+        depths = np.where(finite, 1.0 / np.where(finite, w, 1.0), np.inf)
+        sigmas = np.where(finite, np.sqrt(covariances[:, 2, 2]) * depths**2, np.inf)
         points, by_ray = points_of_rays(rays, camera.mount_forward, camera.mount_height)
         in_robot = by_ray @ covariances @ np.swapaxes(by_ray, 1, 2)
-        in_robot[~known] = np.inf
+        in_robot[~finite] = np.inf
         return LandmarkEstimates(ids, points, in_robot, depths, sigmas)
 
 

@@ -90,8 +90,8 @@ class LocalizationFilter:
             ids: (n,) landmark ids as they will come in update.
             points_in_node: (n, 3) m, in the node's robot frame; those that cannot be anchored are left out.
             covariances: (n, 3, 3) m^2, in the node's robot frame.
-            scale_share: by which the points and the prior's position may be off together, besides that, as a
-                share of them: the wheels tell.
+            scale_share: common relative error of the points and the prior's position, on top of that; the
+                wheels measure it.
             settings: see there.
 
         Raises:
@@ -111,7 +111,7 @@ class LocalizationFilter:
         self._state = self._state.of_unknown_scale(scale_share)
 
     def predict(self, odometry: Odometry) -> None:
-        """Move by one step of the wheels. The landmarks stand still in the node's frame."""
+        """Move by one step of the wheels. The landmarks do not move in the node's frame."""
         pose_vector, by_pose, by_input = move_pose(self._state.pose_vector, odometry)
         aside = self.settings.side_slip * (abs(odometry.forward) + self._wheels.axle * abs(odometry.turn))
         noise = np.column_stack([by_input[:, :2] @ self._wheels.root(odometry), aside * by_input[:, 2]])
@@ -165,7 +165,7 @@ class LocalizationFilter:
         return self._judge(UpdateReport(ids, accepted, innovations_px, fit.mean_nis, health, reason))
 
     def add(self, ids: Ids, points_in_robot: Array, covariances_in_robot: Array) -> NDArray[np.bool_]:
-        """Add landmarks that are new to the map, as they are known from where the robot stands now.
+        """Add landmarks that are new to the map, as they are known from the robot's present pose.
 
         Args:
             ids: (N,) new ids.
@@ -194,7 +194,7 @@ class LocalizationFilter:
         """Hand over to another node's frame; landmarks that cannot be anchored there are let go.
 
         Args:
-            new_node_from_node: where the old node stands in the new, independent of what the filter knows.
+            new_node_from_node: pose of the old node in the new one, independent of the filter's state.
         """
         self._state, ahead = self._state.rebased(new_node_from_node, self._camera.mount_forward)
         self._keep(ahead & self._anchorable(self._state.rays))
@@ -224,9 +224,9 @@ class LocalizationFilter:
 
     def predict_pixels(self, ids: Ids | None = None) -> Array:
         """(N, 2) px where landmarks are expected now; NaN if behind the camera or not held."""
-        sight = project_anchored(self._state.pose_vector, self._state.rays, self._camera.mount_forward)
-        ahead = (sight.scale > NEAREST_SCALE)[:, None]
-        pixels = np.where(ahead, self._centre + self._focal * sight.rays[:, :2], np.nan)
+        projected = project_anchored(self._state.pose_vector, self._state.rays, self._camera.mount_forward)
+        ahead = (projected.scale > NEAREST_SCALE)[:, None]
+        pixels = np.where(ahead, self._centre + self._focal * projected.rays[:, :2], np.nan)
         if ids is None:
             return pixels
         slots, rows = self._slots(ids)

@@ -23,8 +23,8 @@ class LocalizationState:
         pose_vector: (3,) [x m, y m, heading rad], node_from_robot.
         rays: (n, 3) [a, b, w 1/m] at the node. The paper's two numbers a landmark, here a and w, are
             estimated; b is known as the map gives it, and only its uncertainty is considered.
-        first: (n, 3) the rays as they were first known. All Jacobians are taken there: at estimates that
-            change from image to image they would let the filter learn what no image tells (first-estimates
+        first: (n, 3) the rays when they were added. All Jacobians are taken there: at estimates that
+            change from image to image the filter would gain information that no image has (first-estimates
             Jacobians, Huang, Mourikis and Roumeliotis 2010).
         covariance: (3 + 3n, 3 + 3n) of [pose, (a, b, w) of each landmark], additive errors.
     """
@@ -59,8 +59,8 @@ class LocalizationState:
     def depths(self) -> tuple[Array, Array]:
         """Depths of the landmarks at the node, and standard deviations by which they may be kept one by one.
 
-        What images teach of the depths is common to many of them. Kept without their correlations they would
-        be believed to err independently, and the next drive would learn too much from them. Independent
+        The errors of depths learned from the same images are correlated. Taken as independent, they would
+        make the next drive learn too much from them. Independent
         errors that are together no smaller than the joint ones have the standard deviations
         sigma_i sqrt(sum_j |rho_ij|): their covariance less the joint one is diagonally dominant.
 
@@ -98,7 +98,7 @@ class LocalizationState:
         Args:
             rays: (N, 3) [a, b, w 1/m] at the node.
             covariances: (N, 3, 3) of their own errors, independent of the state.
-            by_pose: (N, 3, 3) how the pose's error enters them besides.
+            by_pose: (N, 3, 3) how the pose's error enters them in addition.
         """
         size, n = len(self.covariance), len(rays)
         lever = by_pose.reshape(3 * n, 3)
@@ -134,10 +134,10 @@ class LocalizationState:
     def rebased(
         self, new_from_node: PoseGaussian, mount_forward: float
     ) -> tuple[LocalizationState, NDArray[np.bool_]]:
-        """The state in another node's frame, whose error enters all of it alike.
+        """The state in another node's frame, whose error is common to all of it.
 
         Args:
-            new_from_node: where this node stands in the other, independent of the state.
+            new_from_node: pose of this node in the other, independent of the state.
             mount_forward: of the optical centre ahead of the axle, m.
 
         Returns:
@@ -148,24 +148,24 @@ class LocalizationState:
         at = node_from_new.mean.vector
         turn = turning(node_from_new.mean)
         edge = turn @ node_from_new.covariance @ turn.T
-        seen = project_anchored(at, self.rays, mount_forward)
+        projected = project_anchored(at, self.rays, mount_forward)
         by_edge = np.empty((3 + 3 * n, 3))
         away = turn[:2, :2].T @ (self.pose_vector[:2] - at[:2])
         by_edge[:3] = -turn.T
         by_edge[:2, 2] = away[1], -away[0]
-        by_edge[3:] = seen.by_pose.reshape(3 * n, 3)
+        by_edge[3:] = projected.by_pose.reshape(3 * n, 3)
         p = self.covariance
         moved = np.empty_like(p)
         moved[:3, :3] = turn.T @ p[:3, :3] @ turn
-        moved[3:, :3] = (seen.by_ray @ (turn.T @ p[:3, 3:]).T.reshape(n, 3, 3)).reshape(3 * n, 3)
+        moved[3:, :3] = (projected.by_ray @ (turn.T @ p[:3, 3:]).T.reshape(n, 3, 3)).reshape(3 * n, 3)
         moved[:3, 3:] = moved[3:, :3].T
-        half = (seen.by_ray @ p[3:, 3:].reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
-        moved[3:, 3:] = (seen.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+        half = (projected.by_ray @ p[3:, 3:].reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
+        moved[3:, 3:] = (projected.by_ray @ half.T.reshape(n, 3, 3 * n)).reshape(3 * n, 3 * n)
         moved += by_edge @ edge @ by_edge.T
         mean = new_from_node.mean @ Pose2.from_vector(self.pose_vector)
         # What was linearised in the old frame and what will be in the new agree only at one estimate.
-        state = LocalizationState(mean.vector, seen.rays, seen.rays, 0.5 * (moved + moved.T))
-        return state, seen.scale > NEAREST_SCALE
+        state = LocalizationState(mean.vector, projected.rays, projected.rays, 0.5 * (moved + moved.T))
+        return state, projected.scale > NEAREST_SCALE
 
 
 def turning(pose: Pose2) -> Array:

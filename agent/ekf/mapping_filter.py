@@ -1,4 +1,4 @@
-"""The mapping filter: pose since an anchor and landmarks nobody knows yet, 3 + 3n (paper section 4).
+"""The mapping filter: pose since an anchor and unknown landmarks, 3 + 3n (paper section 4).
 
 Landmarks live in the moving camera's own frame as the paper has it, but as (a, b, w), slopes and inverse
 depth: the image measures a and b directly, and a landmark of unknown depth is a landmark with a large
@@ -43,7 +43,7 @@ class MappingFilter:
 
     Attributes:
         ids: (n,) landmark ids in the state's order, as the front end numbers them.
-        lost: landmarks that the filter has let go by itself since it began: behind the camera, or aside.
+        lost: landmarks that the filter has removed since it began: behind the camera, or far aside.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class MappingFilter:
         self._watch = FilterHealth(self.settings, camera.fx)
 
     def predict(self, odometry: Odometry) -> None:
-        """Move by one step of the wheels; landmarks that come behind the camera or far aside are let go."""
+        """Move by one step of the wheels; landmarks that come behind the camera or far aside are removed."""
         state, mount, s = self.state, self._camera.mount_forward, self.settings
         pose_vector, _, _ = move_pose(state.pose_vector, odometry)
         rays, scale = transform_rays(state.rays, odometry, mount)
@@ -133,29 +133,31 @@ class MappingFilter:
         """
         s = self.settings
         self._noise.begin_image()
-        seen = ImageMeasurement.of(self.ids, ids, pixels, self._pinhole)
-        if not len(seen.slots):
+        measurement = ImageMeasurement.of(self.ids, ids, pixels, self._pinhole)
+        if not len(measurement.slots):
             self._watch.saw(Health.BLIND, "no landmark of the filter is in view")
             return UpdateReport.blind(ids, "no landmark of the filter is in view")
         by_wheels = self._step
-        self._step, found = seen.compared(by_wheels, self._settled, self._noise.variances, s)
-        if not found.worst <= self._gate:
-            nod = pitch_offset(found.innovations, self._spread(seen.slots), seen.slopes)
+        self._step, innovations = measurement.compared(by_wheels, self._settled, self._noise.variances, s)
+        if not innovations.worst <= self._gate:
+            nod = pitch_offset(innovations.innovations, self._spread(measurement.slots), measurement.slopes)
             if nod is not None:
-                seen = seen._replace(slopes=seen.slopes - nod)
-                self._step, found = seen.compared(by_wheels, self._settled, self._noise.variances, s)
-        judged = self._judge(seen, found)
+                measurement = measurement._replace(slopes=measurement.slopes - nod)
+                self._step, innovations = measurement.compared(
+                    by_wheels, self._settled, self._noise.variances, s
+                )
+        judged = self._judge(measurement, innovations)
         nis, health, reason = math.nan, judged.health, judged.reason
         if judged.agreeing:
-            nis, slip = self._correct(seen, judged)
+            nis, slip = self._correct(measurement, judged)
             if slip and health is Health.GOOD:
                 health, reason = Health.SLIP, slip
         else:
-            # What is not believed must not choose where the step is linearised either.
+            # Rejected measurements must not choose the linearisation point either.
             self._step = by_wheels
             self._settle(self.state)
         self._watch.saw(health, reason)
-        return seen.report(judged.believed, judged.innovations, nis, health, reason)
+        return measurement.report(judged.believed, judged.innovations, nis, health, reason)
 
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
@@ -225,9 +227,9 @@ class MappingFilter:
         """(2m, 2m) joint covariance of the innovations of some landmarks."""
         return innovation_covariance(self.state.covariance, slots, self._noise.variances)
 
-    def _judge(self, seen: ImageMeasurement, examined: Examined) -> Judgement:
-        """Which of the landmarks seen to correct by, and what that tells of the wheels and the pixels."""
-        s, slots = self.settings, seen.slots
+    def _judge(self, measurement: ImageMeasurement, examined: Examined) -> Judgement:
+        """Which measured landmarks to accept, and what they say about the wheels and the pixels."""
+        s, slots = self.settings, measurement.slots
         innovations, whitening, worst, median = examined
         believed = np.ones(len(slots), np.bool_)
         if not worst <= self._gate:
@@ -237,12 +239,12 @@ class MappingFilter:
             if self._step is not None:
                 # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
                 step, self._step = self._step, self._step.again(wheel_root=self._wheels.slipped())
-                then_believed, then_whitening, _ = believe(innovations, self._spread(slots), self._gate)
-                then_agreeing = len(then_whitening) // 2
-                if then_agreeing >= max(s.least_agreeing, least):
+                still_believed, still_whitening, _ = believe(innovations, self._spread(slots), self._gate)
+                still_agreeing = len(still_whitening) // 2
+                if still_agreeing >= max(s.least_agreeing, least):
                     self._wheels.doubt()
-                    reason = f"the wheels are refuted by {then_agreeing} of {len(slots)} landmarks"
-                    return Judgement(innovations, then_believed, then_whitening, Health.SLIP, reason)
+                    reason = f"the wheels are refuted by {still_agreeing} of {len(slots)} landmarks"
+                    return Judgement(innovations, still_believed, still_whitening, Health.SLIP, reason)
                 self._step = step
             # A few that agree among many that do not may as well be the wrong ones.
             reason = f"{agreeing} of {len(slots)} landmarks agree"
@@ -254,18 +256,19 @@ class MappingFilter:
             return Judgement(innovations, believed, whitening, Health.FEW, reason)
         return Judgement(innovations, believed, whitening)
 
-    def _correct(self, seen: ImageMeasurement, judged: Judgement) -> tuple[float, str]:
-        """Correct by what is believed.
+    def _correct(self, measurement: ImageMeasurement, judged: Judgement) -> tuple[float, str]:
+        """Update with the accepted measurements.
 
-        The image tells better than the wheels by how much the robot has turned, so the step is linearised
-        at what it then seems to have been. Without this each step leaves a second-order error of one
-        sign, an expansion of the image that passes for a way forward (docs/decisions/ekf-parametrisation.md).
-        Wheels that an image refutes are believed less; if they claim to stand, not at all and for a while.
+        The image measures the robot's turn better than the wheels do, so the step is linearised at the turn
+        that the image suggests. Without this each step leaves a second-order error of one sign, an
+        expansion of the image that looks like a drive forward (docs/decisions/ekf-parametrisation.md).
+        Wheels that an image refutes get more noise; wheels that report a standstill carry no information for
+        a while.
 
         Returns:
             Their NIS over its degrees of freedom; and what is wrong with the wheels, empty if nothing is.
         """
-        slip, slots, slopes = "", seen.slots, seen.slopes
+        slip, slots, slopes = "", measurement.slots, measurement.slopes
         residual, whitening = judged.innovations, judged.whitening
         if judged.agreeing < len(slots):
             slots, slopes = slots[judged.believed], slopes[judged.believed]

@@ -19,7 +19,7 @@ class MappingState:
 
     Attributes:
         pose_vector: (3,) [x m, y m, heading rad], anchor_from_robot.
-        rays: (n, 3) [a, b, w 1/m] in the camera as it stands now.
+        rays: (n, 3) [a, b, w 1/m] in the present camera frame.
         covariance: (3 + 3n, 3 + 3n) of [pose, rays], additive errors.
     """
 
@@ -99,7 +99,7 @@ class Step:
 
     Attributes:
         before: state before the step.
-        measured: what the wheels say.
+        measured: by the wheels.
         wheel_root: (2, 2) root of the covariance S of (u1, u2).
         side_slip: sigma of u3, m.
         pose_variances: (3,) process noise of the pose, the diagonal of Q.
@@ -126,7 +126,7 @@ class Step:
         return self._advanced()[0]
 
     def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> Step:
-        """The same step linearised elsewhere, or with the wheels believed less."""
+        """The same step linearised elsewhere, or with more odometry noise."""
         step = Step(
             self.before, self.measured, self.wheel_root if wheel_root is None else wheel_root,
             self.side_slip, self.pose_variances, self.mount_forward, at or self.at,
@@ -139,18 +139,18 @@ class Step:
     def glanced(
         self, slots: NDArray[np.intp], slopes: Array, variances: Array, most: float
     ) -> tuple[Step, Examined]:
-        """Linearise where the step seems to have gone at a first glance at its image, and look from there.
+        """Linearise at the turn that the image suggests, and compare the image with that prediction.
 
-        The turn is as the landmarks vote, of whom a quarter may be wrong; the way is left as the wheels say.
+        The turn comes from the landmarks, of which a quarter may be wrong; the way comes from the wheels.
 
         Args:
             slots: (m,) landmarks seen, m > 0.
             slopes: (m, 2) where.
             variances: (2,) of a slope.
-            most: sigmas of the wheels by which the guess may be off what they say.
+            most: largest deviation of the turn from the wheels, in their sigmas.
 
         Returns:
-            The step, its covariance computed; and the image beside it.
+            The step, its covariance computed; and the image compared with it.
         """
         more = turn_by_image(self.rays, slots, slopes, self.wheel_root, most)
         step = self.again(at=Odometry(self.measured.forward, self.measured.turn + more))
@@ -179,7 +179,7 @@ class Step:
     def _advanced(self) -> tuple[MappingState, Array]:
         """The state after the step, and the Jacobian of its mean by (u1, u2, u3), (3 + 3n, 3).
 
-        The mean is exact where the step is linearised, and of first order from there to what the wheels say.
+        The mean is exact where the step is linearised, and of first order elsewhere.
         """
         if self._after is not None:
             return self._after

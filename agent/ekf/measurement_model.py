@@ -83,7 +83,7 @@ class ImageMeasurement(NamedTuple):
     def compared(
         self, step: Step | None, settled: MappingState, variances: Array, settings: FilterSettings
     ) -> tuple[Step | None, Examined]:
-        """Hold an image beside what was expected of it.
+        """Compare an image with its prediction.
 
         Args:
             step: that brought the robot to where the image was taken, if there was one.
@@ -102,7 +102,7 @@ class ImageMeasurement(NamedTuple):
     def report(
         self, believed: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
     ) -> UpdateReport:
-        """Of an update by what is seen: believed (m,), innovations (m, 2) slopes measured minus expected."""
+        """Report of an update: believed (m,), innovations (m, 2) slopes measured minus expected."""
         accepted, innovations_px = np.zeros(len(self.ids), np.bool_), np.full((len(self.ids), 2), np.nan)
         accepted[self.rows], innovations_px[self.rows] = believed, innovations * self.focal
         return UpdateReport(self.ids, accepted, innovations_px, mean_nis, health, reason)

@@ -49,12 +49,12 @@ class WheelNoise:
         )
 
     def refuted_root(self, odometry: Odometry, factor: float, lost: float) -> Array:
-        """The same of wheels that cannot be right: less is believed of a way, nothing of a wheel that stood.
+        """The noise of wheels that cannot be right: more for a way, unbounded for a wheel that reports none.
 
         Args:
             odometry: the step.
             factor: by which the wheels err more than they should.
-            lost: standard deviation of a wheel's way if its encoder says that there was none, m.
+            lost: standard deviation of a wheel's way if its encoder reports none, m.
         """
         sigmas = [
             factor * self.share * abs(way) if abs(way) > STANDS else lost for way in self.ways(odometry)
@@ -93,7 +93,7 @@ def move_pose(pose_vector: Array, odometry: Odometry, aside: float = 0.0) -> tup
 def transform_rays(
     rays: Array, odometry: Odometry, mount_forward: float, aside: float = 0.0
 ) -> tuple[Array, Array]:
-    """See landmarks from where the camera stands after one step of the wheels.
+    """Transform landmarks into the camera frame after one step of the wheels.
 
     Args:
         rays: (N, 3) [a, b, w 1/m] in the camera before the step.

@@ -1,8 +1,8 @@
 """A camera that nods: over a kerb, on a rough floor, or braking hard, all that it sees moves up or down.
 
-The filter knows of motion in the plane alone. A nod of half a degree moves every landmark by several pixels,
-all the same way, and landmarks that are well known then refute each other's gates, or the wheels. What nods
-have in common is told apart from all that: no motion in the plane moves everything up.
+The filter models motion in the plane only. A pitch of half a degree moves every landmark by several pixels in
+the same direction, and precise landmarks then fail each other's gates, or refute the wheels. Pitch differs
+from wrong landmarks and wheels in one way: no motion in the plane moves everything up.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Array 
         slopes: (N, 2) as they are measured.
 
     Returns:
-        (N, 2) to be taken off the slopes, from the derivative of a pinhole camera's slopes (a, b) by its
-        pitch, (a b, 1 + b^2), times the median of what the landmarks say that the pitch is; None if the
-        filter may be wrong by as much in the plane.
+        (N, 2) to subtract from the slopes: the derivative of a pinhole camera's slopes (a, b) with respect to
+        pitch, (a b, 1 + b^2), times the median of the landmarks' pitch estimates; None if the filter may be
+        wrong by as much in the plane.
     """
     if len(innovations) < LEAST:
         return None

@@ -1,4 +1,4 @@
-"""How uncertain the slopes of an image are: as it is said, or more where images have told so for a while."""
+"""How uncertain the slopes of an image are: nominal, or more after images have shown so for a while."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from mapweave.hybridmap.pose import Array
 
 MOST_EXCESS = 16.0
-"""Pixels are never taken for worse than this times what is said, in variance."""
+"""Largest ratio of the variance to the nominal variance."""
 
 
 class PixelNoise:
@@ -18,7 +18,7 @@ class PixelNoise:
     """
 
     def __init__(self, pixel_sigma: float, focal: Array, adaptation: float) -> None:
-        """Begin with what is said.
+        """Begin with the nominal variances.
 
         Args:
             pixel_sigma: standard deviation of a tracked pixel, px.
@@ -26,7 +26,7 @@ class PixelNoise:
             adaptation: share of an image's excess that is taken over at once, 0 ... 1.
         """
         self.variances: Array = np.square(pixel_sigma / focal)
-        self._said = self.variances
+        self._nominal = self.variances
         self._adaptation = adaptation
         self._excess = self._next = 1.0
 
@@ -34,12 +34,12 @@ class PixelNoise:
         """What was learned from the images before holds now."""
         if self._next != self._excess:
             self._excess = self._next
-            self.variances = self._said * self._excess
+            self.variances = self._nominal * self._excess
 
     def learn(self, excess: float) -> None:
         """Learn that the squared residuals of an image are `excess` times what its noise allows.
 
-        In logarithms, so that images that are twice as good and twice as bad as said cancel.
+        In logarithms, so that images twice as good and twice as bad as nominal cancel.
         """
         learned = self._excess * min(excess, MOST_EXCESS) ** self._adaptation
         self._next = min(max(learned, 1.0), MOST_EXCESS)

@@ -1,4 +1,4 @@
-"""How the two filters believe, gate and judge themselves."""
+"""Settings of the two filters: noise, gates and health."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ STEPS = 4
 """Gauss-Newton steps after the linear solution that they start from."""
 
 NEAREST = 1e-3
-"""A sighting from which the landmark would be nearer than this share of its depth is not used."""
+"""An observation from which the landmark would be nearer than this share of its depth is not used."""
 
 
 class Triangulation(NamedTuple):
@@ -101,7 +101,7 @@ class _Solver:
         self.covariances: Array = np.zeros((0, 3, 3))
 
     def expect(self, rays: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Slopes (N, T, 2) expected, and 1 / depth (N, T), 0 for sightings that are not used."""
+        """Slopes (N, T, 2) expected, and 1 / depth (N, T), 0 for observations that are not used."""
         rotated = np.stack([np.ones(len(rays)), rays[:, 0], rays[:, 2]], axis=1)
         depth = rotated @ self.depth_by
         used = seen & (depth > NEAREST)
@@ -149,10 +149,10 @@ def _answer(
     rays: Array, covariances: Array, chi2: Array, seen: NDArray[np.int64], camera: Camera
 ) -> Triangulation:
     w = rays[:, 2]
-    known = w > 0
-    depths = np.where(known, 1.0 / np.where(known, w, 1.0), np.where(np.isnan(w), np.nan, np.inf))
+    finite = w > 0
+    depths = np.where(finite, 1.0 / np.where(finite, w, 1.0), np.where(np.isnan(w), np.nan, np.inf))
     sigmas = np.sqrt(covariances[:, 2, 2]) * depths**2
     points = camera.back_project(
-        rays[:, :2] * (camera.fx, camera.fy) + (camera.cx, camera.cy), np.where(known, depths, np.nan)
+        rays[:, :2] * (camera.fx, camera.fy) + (camera.cx, camera.cy), np.where(finite, depths, np.nan)
     )
     return Triangulation(rays, covariances, points, depths, sigmas, chi2, seen)

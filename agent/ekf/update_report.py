@@ -1,4 +1,4 @@
-"""What a filter says of itself after an update."""
+"""Report of a filter after an update."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from mapweave.hybridmap.pose import Array
 
 
 class Health(StrEnum):
-    """What holds an estimate up, or what it lacks. The covariance tells how much is lost by it."""
+    """What supports an estimate, or what it lacks. The covariance says how much it loses by that."""
 
     GOOD = "good"
     SLIP = "wheels refuted"
-    """Landmarks agree that the robot did not go where its wheels say: slip, a lost encoder."""
+    """Landmarks agree that the robot did not move as its wheels measured: slip, a lost encoder."""
     NO_PARALLAX = "no parallax"
-    """The robot stands or turns on the spot: depths stay as unknown as they are."""
+    """The robot stands still or turns on the spot: depths stay as unknown as they are."""
     FEW = "few landmarks"
-    """Too few are in view to tell a wrong one from a right one; what is seen is used."""
+    """Too few are in view to tell wrong from right ones; all are used."""
     DISAGREEMENT = "landmarks disagree"
     """Too few of those in view agree with each other and the wheels."""
     BLIND = "no landmark in view"
-    """Dark, a covered lens, or the robot looks elsewhere."""
+    """Dark, a covered lens, or the robot faces elsewhere."""
     NO_IMAGE = "no image"
     """The camera dropped frames: only the wheels move the estimate on."""
 
@@ -40,7 +40,7 @@ class UpdateReport:
 
     Attributes:
         ids: (N,) landmarks that were given, as they were given.
-        accepted: (N,) which of them were believed; never those that the filter does not hold.
+        accepted: (N,) which of them were accepted; never those that the filter does not hold.
         innovations_px: (N, 2) px, measured minus expected before the update; NaN where there is none.
         mean_nis: normalised innovation squared over its degrees of freedom, of the accepted landmarks taken
             jointly; about 1 if the filter is consistent, NaN if nothing was accepted.

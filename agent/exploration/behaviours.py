@@ -41,7 +41,7 @@ class ExplorationBehaviours:
     """
 
     def __init__(self, description: RobotDescription, mapper: Mapper, settings: ExplorerSettings) -> None:
-        """Take the body, and the mapper that the pipeline keeps up to date."""
+        """Take the robot's description, and the mapper that the pipeline keeps up to date."""
         self.phase = Phase.LOOKING
         self.detail = ""
         self._description = description
@@ -64,7 +64,7 @@ class ExplorationBehaviours:
             yield Command()
 
     def map_view(self) -> Iterator[Command]:
-        """Drive back and forth with the view's features in sight until their depths have converged."""
+        """Drive back and forth with the view's features visible until their depths have converged."""
         if self._mapper.anchor_features < LEAST_FEATURES:
             self.detail = f"only {self._mapper.anchor_features} features in view: turning on"
             return
@@ -168,8 +168,8 @@ class ExplorationBehaviours:
             since_best += self._description.tick
             if since_best > PATIENCE or (self.room(0.0) <= 0.0 and since_best > 1.0):
                 return False
-            gone = self._mapper.anchor_from_robot
-            way = math.hypot(gone.x, gone.y)
+            anchor_from_start = self._mapper.anchor_from_robot
+            way = math.hypot(anchor_from_start.x, anchor_from_start.y)
             if way > TRAVEL_STEP or (way > 0.3 and self._mapper.anchored < 2 * LEFT):
                 yield Command()
                 self.finish()

@@ -1,4 +1,4 @@
-"""Mapping while somebody else moves the robot: when to make a node."""
+"""Mapping while a person moves the robot: when to make a node."""
 
 from __future__ import annotations
 

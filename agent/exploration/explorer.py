@@ -18,10 +18,10 @@ from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Array
 
-KNOWN_REACH = 0.7
+COVERED_REACH = 0.7
 """Nodes within this of a place show it, m."""
-KNOWN = 0.75
-"""A place around which nodes look into this share of all directions is not mapped again."""
+COVERED_SHARE = 0.75
+"""A place around which nodes cover this share of all directions is not mapped again."""
 
 
 class Explorer:
@@ -31,7 +31,7 @@ class Explorer:
     can be read from top to bottom.
 
     Attributes:
-        places: where it has looked all around, (x, y) m in map.
+        places: where it has made a full turn, (x, y) m in map.
     """
 
     def __init__(
@@ -43,14 +43,14 @@ class Explorer:
         settings: ExplorerSettings | None = None,
         seed: int = 0,
     ) -> None:
-        """Take the body, and the mapper and floor that the pipeline keeps up to date."""
+        """Take the robot's description, and the mapper and grid that the pipeline keeps up to date."""
         self.places: list[Array] = []
         self._description = description
         self._mapper = mapper
         self._floor = floor
         self._settings = settings or ExplorerSettings()
         self._moves = ExplorationBehaviours(description, mapper, self._settings)
-        self._hearsay = FleetCoverage(map_id, REACH + SPACING)
+        self._fleet_coverage = FleetCoverage(map_id, REACH + SPACING)
         self._rng = np.random.default_rng(seed)
         self._side = self._either_side()
         self._avoid: list[Array] = []
@@ -64,7 +64,7 @@ class Explorer:
         self._moves.see(observation)
         self._questions = []
         for answer in answers:
-            self._hearsay.take(answer)
+            self._fleet_coverage.take(answer)
         return next(self._behaviour), self._questions
 
     @property
@@ -91,7 +91,7 @@ class Explorer:
         yield from self._moves.begin()
         self._ask()
         while True:
-            if seen_around(self._views, self._moves.position, KNOWN_REACH) >= KNOWN:
+            if seen_around(self._views, self._moves.position, COVERED_REACH) >= COVERED_SHARE:
                 yield from self._scan()
             else:
                 yield from self._look_around()
@@ -133,18 +133,18 @@ class Explorer:
         """Corners of the way to the next place; empty if there is none."""
         s = self._settings
         been = np.array(self.places + self._avoid)
-        theirs = self._hearsay.places(self._views, KNOWN_REACH, KNOWN)
-        return next_viewpoint(self._floor, self._moves.position, been, theirs, s)
+        fleet_places = self._fleet_coverage.places(self._views, COVERED_REACH, COVERED_SHARE)
+        return next_viewpoint(self._floor, self._moves.position, been, fleet_places, s)
 
     @property
     def _views(self) -> Array:
         """(N, 4) of own and of others' nodes; see `views_of`."""
-        return np.concatenate([views_of(self._mapper.map), self._hearsay.views])
+        return np.concatenate([views_of(self._mapper.map), self._fleet_coverage.views])
 
     def _ask(self) -> None:
         """Ask what others have mapped around here. Nothing waits for the answer."""
         if self._settings.ask:
-            self._questions.append(self._hearsay.question(self._moves.position))
+            self._questions.append(self._fleet_coverage.question(self._moves.position))
 
     def _either_side(self) -> float:
         return 1.0 if self._rng.random() < 0.5 else -1.0

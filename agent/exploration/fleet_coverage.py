@@ -1,4 +1,4 @@
-"""What other robots have mapped around here, as the fleet's map tells it."""
+"""What other robots have mapped nearby, by the fleet's map."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ class FleetCoverage:
         return WhatIsKnown(NUMBER, self._map, float(position[0]), float(position[1]), self._reach)
 
     def take(self, answer: Answer) -> None:
-        """Take what came back. Nothing new is no reason to forget what was said before."""
+        """Take an answer. A missing answer leaves the earlier coverage as it is."""
         if isinstance(answer.content, KnownAnswer):
             self.views = answer.content.views
 
-    def places(self, views: Array, reach: float, known: float) -> Array:
-        """Where others have looked around, so that this robot need not: (M, 2) m, in map.
+    def places(self, views: Array, reach: float, covered_share: float) -> Array:
+        """Places that others have covered, so that this robot need not: (M, 2) m, in map.
 
         Args:
-            views: (N, 4) of everybody: it does not matter who looked.
+            views: (N, 4) of all robots, this one included.
             reach: views within this of a place show it, m.
-            known: share of all directions into which they must look.
+            covered_share: share of all directions that they must cover.
         """
         positions: Array = self.views[:, :2]
-        around = [seen_around(views, position, reach) >= known for position in positions]
+        around = [seen_around(views, position, reach) >= covered_share for position in positions]
         return np.asarray(positions[np.array(around, dtype=bool)])

@@ -1,4 +1,4 @@
-"""Who may know a view: the robot's own map, and the fleet's. Each says where the robot may be."""
+"""Sources of place candidates for a view: the robot's own map, and the fleet's."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from mapweave.registration.recognition import Recognition
 from mapweave.vision.sift import Features
 
 RIVAL = 0.5
-"""Another node of the own map with this share of the best one's inliers has a say too,"""
+"""Another node of the own map with this share of the best one's inliers is a rival,"""
 APART = 0.5
 """if it puts the robot further away than this, m: then the view is ambiguous."""
 
 SILENCE = 20.0
-"""After a question that nobody answered the fleet is not asked for so long, s."""
+"""After an unanswered question the fleet is not asked for so long, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Candidate:
     """A place where the robot may be.
 
     Attributes:
-        node: of whichever robot's map.
+        node: of any robot's map.
         node_from_robot: pose.
         recognized: how the own map knows it; None if the fleet does.
         distance_known: False if how far the node is away is not known (a photograph of unknown scale).
@@ -57,12 +57,12 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """What one source says to a view.
+    """One source's candidates for a view.
 
     Attributes:
         places: best first.
-        ambiguous: why the best is not to be told from another, in words; empty if it is.
-        reason: in words, whatever the outcome.
+        ambiguous: why the best cannot be told from another, in words; empty if it can.
+        reason: of the outcome, in words.
     """
 
     places: tuple[Candidate, ...]
@@ -74,7 +74,7 @@ class OwnMap:
     """The robot's own map as a source."""
 
     def __init__(self, hybrid_map: HybridMap, rng: np.random.Generator) -> None:
-        """Take the map, which may grow, and what verification draws its samples from."""
+        """Take the map, which may grow, and the source of verification's random samples."""
         self.map = hybrid_map
         self._rng = rng
 
@@ -86,18 +86,20 @@ class OwnMap:
         alike = lookalikes(recalled, RIVAL, APART)
         ambiguous = "" if alike is None else f"nodes {alike[0].id} and {alike[1].id} look the same"
         places = tuple(
-            Candidate(node.id, found.node_from_robot, RecognizedNode(node, image, features, found))
-            for node, found in recalled
+            Candidate(
+                node.id, recognition.node_from_robot, RecognizedNode(node, image, features, recognition)
+            )
+            for node, recognition in recalled
         )
-        best, found = recalled[0]
-        return Candidates(places, ambiguous, f"node {best.id}: {found.inliers} landmarks agree")
+        best, recognition = recalled[0]
+        return Candidates(places, ambiguous, f"node {best.id}: {recognition.inliers} landmarks agree")
 
 
 class FleetMap:
     """The fleet's merged map as a source: a server, which knows whether another room looks the same."""
 
     def __init__(self, motion: MotionPrimitives) -> None:
-        """Take what asks, and stands until the answer comes."""
+        """Take the motion primitives, which ask and stand still until the answer comes."""
         self._motion = motion
         self._silent_until = 0.0
 
@@ -110,11 +112,11 @@ class FleetMap:
             self._silent_until = self._motion.now + (answer.retry_after or SILENCE)
         if not isinstance(answer.content, RelocalizeAnswer):
             return Candidates((), "", answer.error or "no answer")
-        told = answer.content
-        ambiguous = told.reason if told.certainty is Certainty.AMBIGUOUS else ""
-        found = told.candidates if told.certainty in (Certainty.FOUND, Certainty.PLACE) else ()
+        content = answer.content
+        ambiguous = content.reason if content.certainty is Certainty.AMBIGUOUS else ""
+        accepted = content.candidates if content.certainty in (Certainty.FOUND, Certainty.PLACE) else ()
         places = tuple(
             Candidate(place.node, place.node_from_robot, distance_known=place.distance_known)
-            for place in found
+            for place in accepted
         )
-        return Candidates(places, ambiguous, told.reason)
+        return Candidates(places, ambiguous, content.reason)

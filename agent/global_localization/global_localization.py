@@ -1,8 +1,8 @@
-"""Global localization: a lost robot looks, turns, drives on and asks until it knows where it is.
+"""Global localization: a lost robot takes views, turns, drives on and asks until it is localized.
 
-What it looks for is passed in: places of its own map, and of the fleet's if it has a fleet. It is the same
-search for a robot that has to get somewhere (one recognition will do) and for one that is to map on (two
-must agree); see `GlobalLocalizationSettings`.
+The sources of candidates are passed in: the robot's own map, and the fleet's if it has a fleet. A robot with
+a goal and a robot that is to map on use the same search: the first needs one recognition, the second two that
+agree; see `GlobalLocalizationSettings`.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Sift
 
 SURE = (0.06, 0.03)
-"""Standard deviations up to which a recognition is believed, m and rad."""
+"""Largest standard deviations of an accepted recognition, m and rad."""
 LENIENCY = 1.0
-"""And after each whole turn in vain this many times `sure` more."""
-LOOKS = 1
+"""After each full turn without success this many times `sure` more."""
+VIEWS_NEEDED = 1
 """Recognitions that must agree, 1 or 2; 2 counts the own map's alone."""
 TURNS = (1, 1)
 """Whole turns at the first place, and at each further one; one where anything is recognised."""
 PLACES = 0
-"""How many places it looks around at; 0 for no end."""
+"""How many places it searches from; 0 for no limit."""
 CARRIED_PAUSE = 0.5
-"""Seconds between two looks of a robot that somebody else moves."""
-CARRIED_LOOKS = 120
-"""How often such a robot looks in vain before it counts as lost."""
+"""Seconds between two views of a robot that a person moves."""
+CARRIED_VIEWS = 120
+"""Views without success after which such a robot counts as lost."""
 
 
 STILL = 0.2
-"""Seconds that the robot stands still before a look."""
-LOOK_TURN = 0.5
-"""Between two looks, rad."""
+"""Seconds that the robot stands still before a view."""
+TURN_STEP = 0.5
+"""Between two views, rad."""
 TURN_RATE = 0.6
 """rad/s."""
 MOVE = 1.0
-"""After looks all around in vain it looks from elsewhere: this far away, m, if there is room,"""
+"""After full turns without success it searches from elsewhere: this far away, m, if there is room,"""
 LEAST_MOVE = 0.2
 """and at least this far, m."""
 SPEED = 0.2
@@ -51,12 +51,12 @@ SPEED = 0.2
 LEAST_FEATURES = 8
 """A view with fewer cannot be recognised."""
 LEAST_VIEWS = 0.25
-"""If fewer looks had a view than this share, the robot has not looked around: the lens is covered."""
+"""If fewer images than this share had features, the turn does not count: the lens is covered."""
 
 LENIENT = 2.0
-"""A robot that has only just lost sight of everything believes recognitions that are so much less exact."""
+"""A robot that has only just lost all landmarks accepts recognitions that are so much less exact."""
 VAGUE = 3.0
-"""A recognition so many times less exact than one to go on from may still agree with such a one."""
+"""A recognition so many times less exact than `SURE` may still confirm an exact one."""
 
 FAMILIAR = 3
 """So many headings of nodes nearby are tried before a turn all around,"""
@@ -69,7 +69,7 @@ Search = Generator[Command, None, Candidate | None]
 
 
 class GlobalLocalization:
-    """Finds out where the robot is. Of two places that look the same it takes neither.
+    """Localizes a lost robot. Of two places that look the same it takes neither.
 
     Attributes:
         detail: what it does and sees, in words.
@@ -103,32 +103,32 @@ class GlobalLocalization:
         self._settings = settings or GlobalLocalizationSettings()
         self._hypotheses: list[PoseHypothesis] = []
         self._hint: tuple[int, Pose2] | None = None
-        self._look_again: Pose2 | None = None
+        self._confirm_at: Pose2 | None = None
         self._ambiguous = ""
-        self._looks = self._views = 0
+        self._attempts = self._views = 0
 
-    def search(self, believed: Pose2 | None = None) -> Search:
-        """Look around here, then elsewhere; None if that was in vain at as many places as the settings say.
+    def search(self, expected: Pose2 | None = None) -> Search:
+        """Search here, then elsewhere; None if all places of the settings were searched without success.
 
         Args:
-            believed: `map_from_robot` in the own map by the wheels, if the robot has only just lost sight of
-                everything: then it looks first where nodes nearby have looked.
+            expected: `map_from_robot` in the own map by the wheels, if the robot has only just lost all
+                landmarks: then it first turns to the headings of nearby nodes.
         """
         _s, motion = self._settings, self._motion
         self.detail, self._ambiguous = "looking", ""
-        for heading in self._familiar(believed):
+        for heading in self._familiar_headings(expected):
             yield from motion.turn(wrap_angle(heading - motion.odom_from_robot.heading), TURN_RATE)
             yield from motion.stand(STILL)
-            found = yield from self.look(LENIENT)
-            if found is not None:
-                return found
+            candidate = yield from self.look(LENIENT)
+            if candidate is not None:
+                return candidate
         place, begin = 1, motion.turned
         while True:
-            self._looks, self._views, self._hint = 0, 0, None
-            found = yield from self._look_around(TURNS[0] if place == 1 else TURNS[1], begin)
-            if found is not None:
-                return found
-            if self._views < LEAST_VIEWS * self._looks:
+            self._attempts, self._views, self._hint = 0, 0, None
+            candidate = yield from self._look_around(TURNS[0] if place == 1 else TURNS[1], begin)
+            if candidate is not None:
+                return candidate
+            if self._views < LEAST_VIEWS * self._attempts:
                 # With a covered lens, or in the dark, there is nothing to be learnt from going elsewhere.
                 continue
             last = place == PLACES
@@ -140,11 +140,11 @@ class GlobalLocalization:
         return None
 
     def wait(self) -> Search:
-        """Look while somebody else moves the robot; None after `carried_looks` views in vain."""
-        while self._views < CARRIED_LOOKS:
-            found = yield from self.look()
-            if found is not None:
-                return found
+        """Take views while a person moves the robot; None after `CARRIED_VIEWS` views without success."""
+        while self._views < CARRIED_VIEWS:
+            candidate = yield from self.look()
+            if candidate is not None:
+                return candidate
             self.detail = f"waiting to recognise a place of its own map: {self.detail}"
             yield from self._motion.stand(CARRIED_PAUSE)
         self._give_up(f"in {self._views} images")
@@ -156,7 +156,7 @@ class GlobalLocalization:
         Args:
             leniency: by how much a recognition may be less exact than `sure`.
         """
-        self._looks += 1
+        self._attempts += 1
         image = self._motion.observation.image
         if image is None:
             self.detail = "no image from the camera"
@@ -170,35 +170,35 @@ class GlobalLocalization:
         own = self._own.candidates(view, image, features)
         self._take_hint(own)
         self._ambiguous = own.ambiguous or self._ambiguous
-        if LOOKS > 1:
+        if VIEWS_NEEDED > 1:
             return self._second_of_two(own)
-        told = None if self._fleet is None else (yield from self._fleet.candidates(view))
-        return self._single(own, told, leniency)
+        fleet = None if self._fleet is None else (yield from self._fleet.candidates(view))
+        return self._single(own, fleet, leniency)
 
     # Verdicts
 
-    def _single(self, own: Candidates, told: Candidates | None, leniency: float) -> Candidate | None:
+    def _single(self, own: Candidates, fleet: Candidates | None, leniency: float) -> Candidate | None:
         """The place that one view shows, by the own map and by the fleet's, which must not contradict it."""
         sure = SURE
-        self.detail = own.reason if told is None else told.reason
-        if told is not None and told.ambiguous:
-            self._ambiguous = told.ambiguous
-            self.detail = f"ambiguous: {told.ambiguous}"
+        self.detail = own.reason if fleet is None else fleet.reason
+        if fleet is not None and fleet.ambiguous:
+            self._ambiguous = fleet.ambiguous
+            self.detail = f"ambiguous: {fleet.ambiguous}"
             return None
-        theirs = None if told is None else next(iter(told.places), None)
-        mine = None if own.ambiguous else next(iter(own.places), None)
-        if mine is not None and not exact_enough(mine.node_from_robot, sure, leniency):
-            mine = None
-        if mine is not None and not (theirs and self._elsewhere(theirs, mine)):
+        fleet_best = None if fleet is None else next(iter(fleet.places), None)
+        own_best = None if own.ambiguous else next(iter(own.places), None)
+        if own_best is not None and not exact_enough(own_best.node_from_robot, sure, leniency):
+            own_best = None
+        if own_best is not None and not (fleet_best and self._elsewhere(fleet_best, own_best)):
             self.detail = f"own map: {own.reason}"
-            # The robot has stood still while the answer was on its way.
-            return mine
+            # The robot stood still while it waited for the answer.
+            return own_best
         # How far away a photograph was taken shows on the way to it, not by looking again.
-        vague = theirs is not None and not exact_enough(theirs.node_from_robot, sure, leniency)
-        if theirs is not None and theirs.distance_known and vague:
+        vague = fleet_best is not None and not exact_enough(fleet_best.node_from_robot, sure, leniency)
+        if fleet_best is not None and fleet_best.distance_known and vague:
             self.detail += ", but not exactly enough"
             return None
-        return theirs
+        return fleet_best
 
     def _second_of_two(self, own: Candidates) -> Candidate | None:
         """The place that a view shows if an earlier view of other things agrees with it."""
@@ -213,52 +213,54 @@ class GlobalLocalization:
             return None
         self.detail = f"{own.reason}; another view must, too"
         motion = self._motion
-        here = self._own.map.nodes[best.node].map_from_robot.mean @ best.node_from_robot.mean
-        now = PoseHypothesis(here, motion.odom_from_robot, motion.way, motion.turned, exact)
-        agreeing = [earlier for earlier in self._hypotheses if consistent(earlier, now, s.consistency)]
-        self._hypotheses.append(now)
+        map_from_robot = self._own.map.nodes[best.node].map_from_robot.mean @ best.node_from_robot.mean
+        hypothesis = PoseHypothesis(map_from_robot, motion.odom_from_robot, motion.way, motion.turned, exact)
+        agreeing = [earlier for earlier in self._hypotheses if consistent(earlier, hypothesis, s.consistency)]
+        self._hypotheses.append(hypothesis)
         if exact and agreeing:
             return best
         if not exact:
-            self._look_again = next((h.odom_from_robot for h in agreeing if h.exact), None)
+            self._confirm_at = next((h.odom_from_robot for h in agreeing if h.exact), None)
         return None
 
-    def _elsewhere(self, told: Candidate, own: Candidate) -> bool:
+    def _elsewhere(self, fleet: Candidate, own: Candidate) -> bool:
         """Whether the fleet puts the robot elsewhere. It may not know yet what the own map knows."""
         nodes = self._own.map.nodes
-        if told.node not in nodes:
+        if fleet.node not in nodes:
             return True
-        there, here = (nodes[c.node].map_from_robot.mean @ c.node_from_robot.mean for c in (told, own))
-        return here.distance(there) > APART
+        by_fleet, by_own_map = (
+            nodes[c.node].map_from_robot.mean @ c.node_from_robot.mean for c in (fleet, own)
+        )
+        return by_own_map.distance(by_fleet) > APART
 
     def _give_up(self, where: str) -> None:
-        what = "no two views agreed" if self._hypotheses else "nothing was recognised"
-        self.detail = f"cannot find itself on its own map of {len(self._own.map.nodes)} nodes: {what} {where}"
+        why = "no two views agreed" if self._hypotheses else "nothing was recognised"
+        self.detail = f"cannot find itself on its own map of {len(self._own.map.nodes)} nodes: {why} {where}"
 
     # Moves
 
     def _look_around(self, turns: int, begin: float) -> Search:
-        """Look and turn, for whole turns; the search began when the robot had turned by `begin`, rad."""
+        """Take views through full turns; the search began when the robot had turned by `begin`, rad."""
         motion, start = self._motion, self._motion.turned
-        for _ in range(math.ceil(turns * math.tau / LOOK_TURN)):
+        for _ in range(math.ceil(turns * math.tau / TURN_STEP)):
             yield from motion.stand(STILL)
-            in_vain = (motion.turned - begin) / math.tau
-            found = yield from self.look(1.0 + LENIENCY * in_vain)
-            if found is not None:
-                return found
+            turns_so_far = (motion.turned - begin) / math.tau
+            candidate = yield from self.look(1.0 + LENIENCY * turns_so_far)
+            if candidate is not None:
+                return candidate
             if motion.turned - start >= (turns if self._hint is None else 1) * math.tau:
                 break
-            again, self._look_again = self._look_again, None
-            turn = LOOK_TURN
-            if again is not None:
-                turn = wrap_angle(again.heading - motion.odom_from_robot.heading)
+            confirm_at, self._confirm_at = self._confirm_at, None
+            turn = TURN_STEP
+            if confirm_at is not None:
+                turn = wrap_angle(confirm_at.heading - motion.odom_from_robot.heading)
             yield from motion.turn(turn, TURN_RATE)
         return None
 
     def _move(self) -> Generator[Command, None, bool]:
-        """Drive a little to look from elsewhere; returns whether there was room.
+        """Drive a little to search from elsewhere; returns whether there was room.
 
-        Whatever tells two places apart is to be seen from somewhere: a door that stands elsewhere, a picture
+        What distinguishes two places is visible from somewhere: a door in another position, a picture
         around the corner. A node that was recognised, though not well enough, is better seen from nearby.
         """
         motion = self._motion
@@ -267,15 +269,15 @@ class GlobalLocalization:
             _, odom_from_node = self._hint
             node = motion.odom_from_robot.inverse() @ odom_from_node
             toward = math.atan2(node.y, node.x)
-            near = min(motion.room(toward), math.hypot(node.x, node.y))
-            if near >= LEAST_MOVE:
-                way, direction = min(near, MOVE), toward
+            distance = min(motion.room(toward), math.hypot(node.x, node.y))
+            if distance >= LEAST_MOVE:
+                way, direction = min(distance, MOVE), toward
         if way < LEAST_MOVE:
-            self.detail = "no room to look from elsewhere"
+            self.detail = "no room to search from elsewhere"
             return False
         why = "nothing here is known" if self._hint is None else "nothing here is known well enough"
         why = f"ambiguous, {self._ambiguous}" if self._ambiguous else why
-        self.detail, self._ambiguous = f"{why}: driving on to look from elsewhere", ""
+        self.detail, self._ambiguous = f"{why}: driving on to search from elsewhere", ""
         yield from motion.turn(math.remainder(direction, math.tau), TURN_RATE)
         yield from motion.drive_on(way, SPEED)
         return True
@@ -287,20 +289,18 @@ class GlobalLocalization:
             robot_from_node = best.recognition.node_from_robot.mean.inverse()
             self._hint = best.recognition.inliers, self._motion.odom_from_robot @ robot_from_node
 
-    def _familiar(self, believed: Pose2 | None) -> list[float]:
-        """Headings in the wheels' frame, rad, in which own nodes nearby have looked; the nearest first."""
-        if believed is None:
+    def _familiar_headings(self, expected: Pose2 | None) -> list[float]:
+        """Headings in the wheels' frame, rad, of own nodes nearby; the nearest first."""
+        if expected is None:
             return []
-        here = self._motion.odom_from_robot.heading
+        heading = self._motion.odom_from_robot.heading
         poses = [n.map_from_robot.mean for n in self._own.map.nodes.values() if len(n.landmarks) >= RICH]
         turns = [
-            wrap_angle(there.heading - believed.heading)
-            for there in poses
-            if believed.distance(there) <= NEARBY
+            wrap_angle(pose.heading - expected.heading) for pose in poses if expected.distance(pose) <= NEARBY
         ]
         chosen: list[float] = []
-        # It has just looked straight on.
+        # The view straight ahead was just tried.
         for turn in sorted(turns, key=abs):
-            if all(abs(wrap_angle(turn - other)) >= LOOK_TURN for other in (0.0, *chosen)):
+            if all(abs(wrap_angle(turn - earlier)) >= TURN_STEP for earlier in (0.0, *chosen)):
                 chosen.append(turn)
-        return [wrap_angle(here + turn) for turn in chosen[:FAMILIAR]]
+        return [wrap_angle(heading + turn) for turn in chosen[:FAMILIAR]]

@@ -1,10 +1,10 @@
 """Two recognitions that agree where the robot is.
 
-One image may show what hangs in another room too, or stands on every shelf. So a robot that wants to map on
-asks for a second view that shows other things, because it has turned or driven on in between, and puts it at
-the same place. In a warehouse of alike shelves single views were wrong from 12 of 28 places where the robot
-had never been, two that agree from 1; in offices 36 of 37 places that were recognised by one view were
-recognised by two.
+One image may show something that occurs in another room or on every shelf, too. So a robot that wants to map
+on needs a second view of other things, because it has turned or driven on in between, that gives the same
+pose. In a warehouse of similar shelves single views were wrong from 12 of 28 places where the robot had never
+been, two that agree from 1; in offices 36 of 37 places that were recognised by one view were recognised by
+two.
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ class Resumption:
 
     Attributes:
         found: the place that was recognised in the last observation; None until then.
-        lost: whether it has tried everything in vain.
-        seen: `odom_from_robot` and readings of the rangers, (K,) m, while it looked around; the wheels' own
+        lost: whether it has tried everything without success.
+        seen: `odom_from_robot` and readings of the rangers, (K,) m, while it turned; the wheels' own
             frame begins where it began.
     """
 
@@ -38,10 +38,10 @@ class Resumption:
         settings: GlobalLocalizationSettings | None = None,
         seed: int = 0,
     ) -> None:
-        """Start to look.
+        """Start the search.
 
         Args:
-            description: the body.
+            description: of the robot.
             sift: features of an image.
             own_map: with at least one node.
             drives: whether it may turn and drive by itself.
@@ -65,7 +65,7 @@ class Resumption:
 
     @property
     def odom_from_robot(self) -> Pose2:
-        """Where the wheels have brought the robot since it began to look."""
+        """The robot's pose by the wheels since the search began."""
         return self._motion.odom_from_robot
 
     def step(self, observation: Observation, standing: bool = False) -> Command:

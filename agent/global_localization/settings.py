@@ -1,4 +1,4 @@
-"""How hard a robot tries to find itself, and what it believes."""
+"""Settings of global localization."""
 
 from __future__ import annotations
 

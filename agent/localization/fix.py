@@ -10,18 +10,18 @@ from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 
 TURN_SHARE = 0.15
-"""m/rad; a turn without landmarks in sight makes the robot as unsure as this way does."""
+"""m/rad; a turn without visible landmarks adds as much uncertainty as this way."""
 
 
 @dataclass(eq=False)
 class Fix:
-    """Where the robot is with respect to a node: by the node's landmarks in sight, else by the wheels.
+    """Where the robot is with respect to a node: by the node's visible landmarks, else by the wheels.
 
     Attributes:
         node: the node's id.
         node_from_robot: pose.
-        localizer: follows the node's landmarks; None if they are not known or not in sight.
-        blind: way since landmarks were last in sight, m.
+        localizer: follows the node's landmarks; None if they are unknown or not visible.
+        blind: way since landmarks were last visible, m.
     """
 
     node: NodeId
@@ -31,12 +31,12 @@ class Fix:
 
     @staticmethod
     def of(localizer: NodeLocalizer) -> Fix:
-        """A fix on a node whose landmarks are in sight."""
+        """A fix on a node whose landmarks are visible."""
         return Fix(localizer.node.id, localizer.pose, localizer)
 
     @property
     def in_sight(self) -> bool:
-        """Whether the node's landmarks are in sight."""
+        """Whether the node's landmarks are visible."""
         return self.localizer is not None and self.localizer.in_sight
 
     def follow(self, observation: Observation, description: RobotDescription) -> None:

@@ -14,17 +14,17 @@ from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.registration.levelling import level
-from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import RecognitionSettings, recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
 PLAUSIBLE = 0.3
-"""A recognition this far from where the robot believes to be is not believed, m."""
+"""Largest distance of a recognition from the expected pose, m."""
 PLAUSIBLE_TURN = 0.25
 """Likewise, rad."""
 MORE = 1.3
-"""What is tracked already is given up for a fresh look that finds this many times as many landmarks."""
+"""Tracks are given up for a detection that finds this many times as many landmarks."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,10 @@ class Expected(NamedTuple):
     """A node that may be in view.
 
     Attributes:
-        leg: whatever the caller knows it by.
+        leg: number by which the caller knows it.
         node: with its landmarks.
-        node_from_robot: where the robot believes to be.
-        doubt: how many times further than usual it may be off.
+        node_from_robot: expected pose.
+        doubt: factor on the tolerances.
         tracked: landmarks of the node that are tracked already.
     """
 
@@ -101,27 +101,30 @@ class NodeDetector:
         """
         s, features = self._settings, self._sift.extract(image)
         view = features.view(self._description.camera)
-        for one in wanted:
-            found = recognise(one.node, view, s.recognition, self._rng)
-            if found is None or not self._plausible(found.node_from_robot.mean, one):
+        for candidate in wanted:
+            recognition = recognise(candidate.node, view, s.recognition, self._rng)
+            if recognition is None or not self._plausible(recognition.node_from_robot.mean, candidate):
                 continue
-            if found.inliers > MORE * one.tracked:
-                node, closer = one.node, look_closer(one.node, view, found, s.recognition.pose)
+            if recognition.inliers > MORE * candidate.tracked:
+                node, node_from_robot = (
+                    candidate.node,
+                    refine_pose(candidate.node, view, recognition, s.recognition.pose),
+                )
                 if node.landmarks.scale_share:
-                    levelled = level(node, view, found)
-                    if self._plausible(levelled.node_from_robot.mean, one):
-                        node, closer = levelled.node, levelled.node_from_robot
-                found = replace(found, node_from_robot=closer)
-                return one.leg, NodeLocalizer(
-                    self._description, self._lens, node, image, features, found, s.localizer
+                    levelled = level(node, view, recognition)
+                    if self._plausible(levelled.node_from_robot.mean, candidate):
+                        node, node_from_robot = levelled.node, levelled.node_from_robot
+                recognition = replace(recognition, node_from_robot=node_from_robot)
+                return candidate.leg, NodeLocalizer(
+                    self._description, self._lens, node, image, features, recognition, s.localizer
                 )
         return None
 
-    def _plausible(self, found: Pose2, expected: Expected) -> bool:
-        """Whether the robot may be there, by what it believes."""
-        _s, believed = self._settings, expected.node_from_robot
-        turned = abs(wrap_angle(found.heading - believed.heading))
+    def _plausible(self, measured: Pose2, expected: Expected) -> bool:
+        """Whether the robot may be there, given the expected pose."""
+        _s, predicted = self._settings, expected.node_from_robot
+        turned = abs(wrap_angle(measured.heading - predicted.heading))
         return (
-            found.distance(believed) <= PLAUSIBLE * expected.doubt
+            measured.distance(predicted) <= PLAUSIBLE * expected.doubt
             and turned <= PLAUSIBLE_TURN * expected.doubt
         )

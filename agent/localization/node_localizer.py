@@ -25,7 +25,7 @@ STRIKES = 3
 
 @dataclass(frozen=True)
 class NodeLocalizerSettings:
-    """When a node's landmarks count as in sight.
+    """When a node's landmarks count as visible.
 
     Attributes:
         tracker: tracks of the node's landmarks.
@@ -83,7 +83,7 @@ class NodeLocalizer:
         return len(self._tracks.ids) >= LEAST and self._filter.healthy
 
     def restart(self, pose: PoseGaussian) -> None:
-        """Believe a pose that is known better than by what was tracked so far.
+        """Restart at a pose that is known better than by the tracks so far.
 
         By the same landmarks: so from then on they learn nothing from where the robot is.
         """
@@ -115,10 +115,10 @@ class NodeLocalizer:
         if observation.image is None:
             return
         self._tracks.follow(observation.image, self._expected())
-        gone = ~np.isin(self._filter.ids, self._tracks.ids)
-        if gone.any():
-            self._note(gone)
-            self._filter.remove(self._filter.ids[gone])
+        lost = ~np.isin(self._filter.ids, self._tracks.ids)
+        if lost.any():
+            self._note(lost)
+            self._filter.remove(self._filter.ids[lost])
         if len(self._tracks.ids):
             report = self._filter.update(self._tracks.ids, self._tracks.pixels)
             bad = self._tracks.judge(report.accepted)

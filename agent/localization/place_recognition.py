@@ -20,7 +20,7 @@ class PlaceRecognitionSettings:
 
     Attributes:
         tries: nodes that are verified, by descending votes.
-        least_inliers: landmarks that must agree: one node speaks alone here, and the map is small.
+        least_inliers: landmarks that must agree: a single node decides here, and the map is small.
         votes: a node with fewer votes is not tried.
     """
 
@@ -66,17 +66,17 @@ def recognise_places(
     nodes = [n for n in hybrid_map.nodes.values() if len(n.landmarks)]
     if not nodes or not len(view):
         return []
-    known = np.concatenate([decode(n.landmarks.codes) for n in nodes])
+    descriptors = np.concatenate([decode(n.landmarks.codes) for n in nodes])
     owner = np.repeat(np.arange(len(nodes)), [len(n.landmarks) for n in nodes])
-    nearest = (decode(view.codes) @ known.T - 0.5 * (known**2).sum(axis=1)).argmax(axis=1)
+    nearest = (decode(view.codes) @ descriptors.T - 0.5 * (descriptors**2).sum(axis=1)).argmax(axis=1)
     votes = np.bincount(owner[nearest], minlength=len(nodes))
     recalled: list[tuple[Node, Recognition]] = []
     for index in np.argsort(-votes, kind="stable")[: settings.tries]:
         if votes[index] < settings.votes:
             break
-        found = recognise(nodes[index], view, None, rng)
-        if found is not None and found.inliers >= settings.least_inliers:
-            recalled.append((nodes[index], found))
+        recognition = recognise(nodes[index], view, None, rng)
+        if recognition is not None and recognition.inliers >= settings.least_inliers:
+            recalled.append((nodes[index], recognition))
     return sorted(recalled, key=lambda pair: -pair[1].inliers)
 
 
@@ -87,22 +87,25 @@ def lookalikes(
 
     Args:
         recalled: most inliers first, as `recall_all` returns them.
-        rival: another node has a say too with this share of the best one's inliers;
+        rival: another node is a rival with this share of the best node's inliers;
         apart: it is elsewhere if it puts the robot further away than this, m.
     """
     if not recalled:
         return None
     node, best = recalled[0]
-    here = node.map_from_robot.mean @ best.node_from_robot.mean
-    for other, also in recalled[1:]:
-        there = other.map_from_robot.mean @ also.node_from_robot.mean
-        if also.inliers >= rival * best.inliers and here.distance(there) > apart:
+    robot_in_map = node.map_from_robot.mean @ best.node_from_robot.mean
+    for other, other_recognition in recalled[1:]:
+        other_robot_in_map = other.map_from_robot.mean @ other_recognition.node_from_robot.mean
+        if (
+            other_recognition.inliers >= rival * best.inliers
+            and robot_in_map.distance(other_robot_in_map) > apart
+        ):
             return node, other
     return None
 
 
 def exact_enough(pose: PoseGaussian, sure: tuple[float, float], leniency: float = 1.0) -> bool:
-    """Whether a recognition is exact enough to go on from; else another look, elsewhere, costs little.
+    """Whether a recognition is exact enough to go on from; else another view, elsewhere, costs little.
 
     Args:
         pose: `node_from_robot`.

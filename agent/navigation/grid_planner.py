@@ -48,8 +48,8 @@ class GridPlanner:
             entering.append((costs[origin], np.where(may, length * self._price, np.inf)))
         while True:
             before = inner.copy()
-            for costs_there, toll in entering:
-                np.minimum(inner, costs_there + toll, out=inner)
+            for neighbour_costs, toll in entering:
+                np.minimum(inner, neighbour_costs + toll, out=inner)
             if np.array_equal(before, inner):
                 return
 
@@ -67,10 +67,10 @@ class GridPlanner:
             around = at + _STEPS
             inside = (around >= 0).all(axis=1) & (around < self.costs.shape).all(axis=1)
             around, lengths = around[inside], _LENGTHS[inside]
-            there = tuple(around.T)
-            totals = self.costs[there] + lengths * self._price[tuple(at)]
+            neighbours = tuple(around.T)
+            totals = self.costs[neighbours] + lengths * self._price[tuple(at)]
             at = around[
-                np.where(self._may(self._room[there], self._room[tuple(at)]), totals, np.inf).argmin()
+                np.where(self._may(self._room[neighbours], self._room[tuple(at)]), totals, np.inf).argmin()
             ]
             way.append(at)
         return np.array(way[::-1])

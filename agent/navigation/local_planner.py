@@ -17,7 +17,7 @@ from mapweave.hybridmap.pose import Array, Pose2
 REPLAN_EVERY = 5
 """Ticks between two plans."""
 LEAST = 0.065
-"""Room beside the footprint that a way needs, m."""
+"""Clearance around the footprint that a way needs, m."""
 WISHED = 0.2
 """Room above which more is worth nothing, m."""
 AHEAD = 0.6
@@ -67,9 +67,9 @@ class LocalPlanner:
     def see(self, observation: Observation) -> None:
         """Take in what the robot senses, every tick."""
         self._tick += 1
-        self._odom_from_robot = here = self._odom_from_robot @ observation.odometry.motion()
-        self._floor.roll(np.array([here.x, here.y]))
-        self._floor.see(here, observation.proximity)
+        self._odom_from_robot = odom_from_robot = self._odom_from_robot @ observation.odometry.motion()
+        self._floor.roll(np.array([odom_from_robot.x, odom_from_robot.y]))
+        self._floor.see(odom_from_robot, observation.proximity)
         self._points = ranger_points(observation.proximity, self._description)
 
     def toward(self, robot_from_target: Pose2) -> Command:
@@ -78,13 +78,13 @@ class LocalPlanner:
         Args:
             robot_from_target: where it is; its heading does not matter.
         """
-        s, here = self._settings, self._odom_from_robot
-        start = np.array([here.x, here.y])
-        goal = here.apply(np.array([robot_from_target.x, robot_from_target.y]))
+        s, odom_from_robot = self._settings, self._odom_from_robot
+        start = np.array([odom_from_robot.x, odom_from_robot.y])
+        goal = odom_from_robot.apply(np.array([robot_from_target.x, robot_from_target.y]))
         if self._tick >= self._replan_at:
             self._replan_at = self._tick + REPLAN_EVERY
             self._way = self._plan(start, goal)
-        ahead = here.inverse().apply(self._steered_to(start, goal))
+        ahead = odom_from_robot.inverse().apply(self._steered_to(start, goal))
         speed = min(s.speed, 0.8 * float(np.hypot(*ahead)))
         return self._arcs.toward(ahead, self._points, speed, s.turn_rate)
 
@@ -92,7 +92,7 @@ class LocalPlanner:
         """(N, 2) m in odom, points of the way around; none if the straight way is free."""
         s, room = self._settings, self._floor.room()
         least, wished = (self._description.radius + extra for extra in (LEAST, WISHED))
-        # The robot stands in the middle of the grid; what lies beyond its border nobody has seen.
+        # The robot is in the middle of the grid; beyond its border everything is unknown.
         goal = start + (goal - start) * min(1.0, 0.5 * s.floor.side / max(np.abs(goal - start).max(), 1e-9))
         count = int(np.hypot(*(goal - start)) / (0.5 * s.floor.cell)) + 2
         line = self._floor.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start))
@@ -104,7 +104,7 @@ class LocalPlanner:
         return np.array([self._floor.centre((int(a), int(b))) for a, b in cells[1:]]).reshape(-1, 2)
 
     def _steered_to(self, start: Array, goal: Array) -> Array:
-        """(2,) m in odom: the furthest point of the way to which a straight line keeps beside the way."""
+        """(2,) m in odom: the furthest point of the way up to which a straight line stays near the way."""
         if not len(self._way):
             return goal
         s = self._settings

@@ -43,7 +43,7 @@ TRUSTED = 1.0
 
 
 HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
-NOTHING_NEAR = "it gets no further, though nothing is near"
+NO_PROGRESS = "it gets no further, though nothing is near"
 
 
 @dataclass(frozen=True)
@@ -123,19 +123,19 @@ class Navigator:
         self._own_map = own_map
         self._settings = s = settings or NavigatorSettings()
         self._rng = np.random.default_rng(seed)
-        self._detour = LocalPlanner(description, s.detour)
+        self._local_planner = LocalPlanner(description, s.detour)
         self._motion = MotionPrimitives(description, ANSWER_PATIENCE)
         self._localization = GlobalLocalization(
             description, sift, self._motion, OwnMap(own_map, self._rng), FleetMap(self._motion),
             s.localization,
         )  # fmt: skip
         self._blocks = BlockedEdges(s.blocks)
-        self._surveyor = TraverseRecorder(description, s.surveyor)
+        self._traverse_recorder = TraverseRecorder(description, s.surveyor)
         self._refinement = LandmarkRefinement(own_map, s.refinement)
-        self._believed: Pose2 | None = None
-        self._vain_looks = 0
+        self._expected: Pose2 | None = None
+        self._failed_views = 0
         self._goal_hidden = False
-        self._following = self._searching = self._parked_anew = False
+        self._following = self._searching = self._parking_retried = False
         self._behaviour = self._go()
 
     @property
@@ -154,13 +154,13 @@ class Navigator:
             standing: the robot must not move; the behaviour waits, and where the robot is is kept up.
         """
         self._motion.take_in(observation, answers)
-        self._detour.see(observation)
+        self._local_planner.see(observation)
         if self.fix is not None and (standing or not self._following):
             self.fix.follow(observation, self._description)
         command = Command() if standing else next(self._behaviour)
-        known = None if self._searching else self.fix
-        self.traverse = self._surveyor.see(known, observation)
-        self.refined = self._refinement.see(None if self.arrived else known)
+        fix = None if self._searching else self.fix
+        self.traverse = self._traverse_recorder.see(fix, observation)
+        self.refined = self._refinement.see(None if self.arrived else fix)
         if self._searching:
             self.detail = self._localization.detail
         return command, self._motion.questions()
@@ -182,30 +182,30 @@ class Navigator:
 
     def _find(self) -> Behaviour:
         self.stage, self._searching, self._goal_hidden = Stage.LOST, True, False
-        believed, self._believed = self._believed, None
-        place = yield from self._localization.search(believed)
-        self._found(place)
+        expected, self._expected = self._expected, None
+        place = yield from self._localization.search(expected)
+        self._start_from(place)
 
-    def _found(self, place: Candidate | None) -> None:
+    def _start_from(self, place: Candidate | None) -> None:
         """Go on from the place that was found, if one was."""
         self._searching, self.detail, self.fix = False, self._localization.detail, None
         if place is None:
             return
         self.tally = self.tally.found()
-        if (seen := place.recognized) is None:
+        if (recognized := place.recognized) is None:
             self.fix = Fix(place.node, place.node_from_robot)
         else:
             localizer = NodeLocalizer(
-                self._description, self._lens, seen.node, seen.image, seen.features, seen.recognition,
-                self._settings.localizer,
+                self._description, self._lens, recognized.node, recognized.image, recognized.features,
+                recognized.recognition, self._settings.localizer,
             )  # fmt: skip
             self.fix = Fix.of(localizer)
 
     def _get_route(self, fix: Fix) -> Generator[Command, None, tuple[RouteLeg, ...]]:
-        """Ask the fleet's map; where nobody answers, the own map must do."""
+        """Ask the fleet's map; without an answer use the own map."""
         self.stage = Stage.ASKING
-        here, blocked = fix.node_from_robot.mean, self._blocks.at(self._motion.now)
-        question = WhichWay(self._motion.number(), fix.node, self.goal, here, blocked)
+        node_from_robot, blocked = fix.node_from_robot.mean, self._blocks.at(self._motion.now)
+        question = WhichWay(self._motion.number(), fix.node, self.goal, node_from_robot, blocked)
         answer = yield from self._motion.ask(question)
         content, trouble = answer.content, ""
         if not isinstance(content, RouteAnswer):
@@ -225,8 +225,8 @@ class Navigator:
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
         """Follow a route until it is driven, or blocked, or the robot does not know where it is."""
         follower = RouteFollower(
-            self._description, self._lens, self._sift, route, fix, self._detour, self._settings.follower,
-            self._rng,
+            self._description, self._lens, self._sift, route, fix, self._local_planner,
+            self._settings.follower, self._rng,
         )  # fmt: skip
         self._following = True
         while True:
@@ -235,7 +235,7 @@ class Navigator:
             self.fix, self.stage, self.detail = follower.fix, follower.progress, follower.detail
             self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
-                self._vain_looks = 0
+                self._failed_views = 0
             if follower.progress not in (RouteProgress.DRIVING, RouteProgress.PARKING):
                 break
             yield command
@@ -243,58 +243,58 @@ class Navigator:
         match follower.progress:
             case RouteProgress.ARRIVED:
                 self.tally = self.tally.passed([0.0])
-            case RouteProgress.BLOCKED if not self._parked_anew and self._only_parking(follower):
-                # Nothing keeps it from its goal but its own precision: that is no block for anybody.
-                self.detail, self._parked_anew = "parking came to no end: once more", True
+            case RouteProgress.BLOCKED if not self._parking_retried and self._stuck_at_goal(follower):
+                # Nothing keeps it from its goal but its own precision: that blocks no other robot.
+                self.detail, self._parking_retried = "parking came to no end: once more", True
             case RouteProgress.BLOCKED:
-                yield from self._meet_block(*follower.blocked)
-                if self._parked_anew:
+                yield from self._report_block(*follower.blocked)
+                if self._parking_retried:
                     # Twice: it begins from another heading, by what it sees then.
-                    self.fix, self._believed, self._parked_anew = None, self._on_own_map(self.fix), False
+                    self.fix, self._expected, self._parking_retried = None, self._on_own_map(self.fix), False
             case RouteProgress.UNSURE if (
                 self._goal_hidden and follower.fix.blind < self._settings.follower.blind
             ):
                 self.stage, self.detail = Stage.ARRIVED, HIDDEN
                 self.tally = self.tally.passed([0.0])
             case RouteProgress.UNSURE:
-                # Not blind for long, it stands at the goal by what it has seen before, and sees none of it.
+                # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
                 self._goal_hidden = follower.fix.blind < self._settings.follower.blind
-                yield from self._make_sure()
+                yield from self._relocalize()
 
-    def _meet_block(self, a: NodeId, b: NodeId) -> Behaviour:
-        """Something is in the way: say what, give it time to go, then let another way be found."""
+    def _report_block(self, a: NodeId, b: NodeId) -> Behaviour:
+        """Something is in the way: report it, wait, then plan another route."""
         self._blocks.add(a, b, self._motion.now)
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
-        self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._in_the_way() or NOTHING_NEAR}"
+        self.stage, self.detail = Stage.BLOCKED, f"{where}: {self._obstacle() or NO_PROGRESS}"
         yield from self._motion.stand(PAUSE)
         if self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED:
-            self.fix, self._believed = None, self._on_own_map(self.fix)
+            self.fix, self._expected = None, self._on_own_map(self.fix)
 
-    def _make_sure(self) -> Behaviour:
-        """No landmark was in sight for a while: one look from here; if in vain, on by wheels a little."""
+    def _relocalize(self) -> Behaviour:
+        """No landmark was visible for a while: try one view, else drive on by odometry a little."""
         self._searching, self._localization.detail = True, self.detail
         yield from self._motion.stand(STILL)
         before, s = self.fix, self._settings
         place = yield from self._localization.look(LENIENT)
-        if place is None and before is not None and self._vain_looks < s.looks:
-            self._vain_looks, self._searching = self._vain_looks + 1, False
+        if place is None and before is not None and self._failed_views < s.looks:
+            self._failed_views, self._searching = self._failed_views + 1, False
             blind = max(s.follower.blind - s.further, 0.0)
             self.fix = Fix(before.node, before.node_from_robot, None, blind)
             return
         if place is None:
-            self._believed = self._on_own_map(before)
-        self._vain_looks = 0
-        self._found(place)
+            self._expected = self._on_own_map(before)
+        self._failed_views = 0
+        self._start_from(place)
 
     def _on_own_map(self, fix: Fix | None) -> Pose2 | None:
         """`map_from_robot` in the own map, if the fix is on one of its nodes."""
-        known = None if fix is None else self._own_map.nodes.get(fix.node)
-        if fix is None or known is None:
+        node = None if fix is None else self._own_map.nodes.get(fix.node)
+        if fix is None or node is None:
             return None
-        return known.map_from_robot.mean @ fix.node_from_robot.mean
+        return node.map_from_robot.mean @ fix.node_from_robot.mean
 
-    def _in_the_way(self) -> str:
+    def _obstacle(self) -> str:
         """What keeps the robot from getting on; empty if nothing is near."""
         ranges = self._motion.observation.proximity
         bearings = self._description.ranger_bearings
@@ -305,6 +305,6 @@ class Navigator:
                 return f"something is {ranges[nearest]:.2f} m off, at {side:.0f} degrees to the left"
         return ""
 
-    def _only_parking(self, follower: RouteFollower) -> bool:
+    def _stuck_at_goal(self, follower: RouteFollower) -> bool:
         """Whether the robot is about at the route's last node, with nothing in its way."""
-        return follower.to_goal <= NEAR and not self._in_the_way()
+        return follower.to_goal <= NEAR and not self._obstacle()

@@ -32,13 +32,13 @@ def onboard_route(
         goal: where it shall be.
         blocked: pairs of nodes, in either order, between which the robot cannot drive.
     """
-    found = find_route(own_map, start, goal, blocked=blocked, closed=closed_edges(own_map))
-    if not found.nodes:
-        return RouteAnswer((), f"own map: {found.reason}")
-    here = PoseGaussian(Pose2(), np.zeros((3, 3)))
-    legs = [RouteLeg(own_map.nodes[start], here, None)]
-    for (before, node), edge in zip(pairwise(found.nodes), found.edges, strict=True):
+    route = find_route(own_map, start, goal, blocked=blocked, closed=closed_edges(own_map))
+    if not route.nodes:
+        return RouteAnswer((), f"own map: {route.reason}")
+    origin = PoseGaussian(Pose2(), np.zeros((3, 3)))
+    legs = [RouteLeg(own_map.nodes[start], origin, None)]
+    for (before, node), edge in zip(pairwise(route.nodes), route.edges, strict=True):
         relative = own_map.edge_between(before, node)
         assert relative is not None, "the route runs along edges"
         legs.append(RouteLeg(own_map.nodes[node], relative, own_map.edges[edge].kind))
-    return RouteAnswer(tuple(legs), f"own map: {found.reason}")
+    return RouteAnswer(tuple(legs), f"own map: {route.reason}")

@@ -13,7 +13,7 @@ class ProgressMonitor:
     Attributes:
         step: m, nearer by this counts.
         best: m, the nearest so far.
-        stood: s since it last came nearer.
+        stood: s since the distance last decreased.
     """
 
     step: float = 0.03

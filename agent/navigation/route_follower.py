@@ -1,4 +1,4 @@
-"""Following one route: servo to the nodes in sight, drive to those that are not, park at the last."""
+"""Following one route: servo to visible nodes, drive to the others, park at the last."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from mapweave.vision.sift import Sift
 
 PASSED = 0.22
 """An intermediate node is passed within this distance, m."""
-SIGHT_TURN = 0.6
-"""A node's landmarks are looked for when the robot's heading is within this of it, rad."""
-SIGHT_REACH = 1.4
+DETECTION_TURN = 0.6
+"""A node is searched for in the image when the robot's heading is within this of the node's, rad."""
+DETECTION_REACH = 1.4
 """And the robot within this distance of it, m."""
-LOOK_EVERY = 4
-"""Ticks between two looks for the next nodes' landmarks."""
+DETECT_EVERY = 4
+"""Ticks between two detections of the next nodes."""
 SKIP = 2
-"""Nodes further along the route that are looked for as well."""
-GOAL_LOOKS = 4
-"""Fresh looks at the goal, averaged, that decide whether the robot stands there."""
+"""Nodes further along the route that are searched for as well."""
+GOAL_VIEWS = 4
+"""Detections at the goal, averaged, that decide whether the robot is there."""
 HIDDEN = 2.0
-"""Seconds at the goal without its landmarks in sight, or recognised, after which it is not there, s."""
+"""Seconds at the goal without its landmarks visible, or recognised, after which it is not there, s."""
 PATIENCE = 6.0
 """Seconds without getting on before an edge counts as blocked."""
 STALLED = 3.0
@@ -49,7 +49,7 @@ BARRED = 5.0
 """How long it drives around then, s."""
 
 
-MOST_LOOKED_FOR = 8
+MOST_CANDIDATES = 8
 """Nodes tried in one image: a route may put any number of them into one place."""
 
 
@@ -103,12 +103,12 @@ class RouteFollower:
         self.detail = ""
         self.fix = fix
         self._description = description
-        self._lookout = NodeDetector(description, lens, sift, settings.lookout, rng)
+        self._detector = NodeDetector(description, lens, sift, settings.lookout, rng)
         self._route = route
         self._start_from_leg = [Pose2()]
         for hop in route[1:]:
             self._start_from_leg.append(self._start_from_leg[-1] @ hop.previous_from_node.mean)
-        self._detour = detour
+        self._local_planner = detour
         self._settings = settings
         self._servo = Servo(description)
         self._servoing = -1
@@ -119,7 +119,7 @@ class RouteFollower:
         if fix.node != route[0].node.id:
             pose = route[0].previous_from_node.inverse() @ fix.node_from_robot
             self.fix = Fix(route[0].node.id, pose, None, fix.blind)
-        # The route may begin at a node that the robot does not stand at: then that is the first to reach.
+        # The route may begin at a node away from the robot: then that node is the first to reach.
         self.leg = min(1 if self._off_reference() < PASSED else 0, self._last)
         self._tick = 0
         self._progressed = ProgressMonitor()
@@ -128,7 +128,7 @@ class RouteFollower:
         self._approaching = False
         self._hidden = 0.0
         self._confirmed = False
-        self._looks: list[PoseGaussian] = []
+        self._goal_poses: list[PoseGaussian] = []
 
     @property
     def blocked(self) -> tuple[NodeId, NodeId]:
@@ -143,16 +143,16 @@ class RouteFollower:
 
     def distance(self, leg: int) -> float:
         """How far the robot is from a leg's node, m."""
-        there = self._from_reference(leg) @ self.fix.node_from_robot.mean
-        return math.hypot(there.x, there.y)
+        leg_from_robot = self._from_reference(leg) @ self.fix.node_from_robot.mean
+        return math.hypot(leg_from_robot.x, leg_from_robot.y)
 
     def step(self, observation: Observation) -> Command:
         """One tick; `progress` says whether it is the last one."""
         s = self._settings
         self._tick += 1
         self.fix.follow(observation, self._description)
-        if self._tick % LOOK_EVERY == 0:
-            self._look_for(self._ahead(), observation)
+        if self._tick % DETECT_EVERY == 0:
+            self._detect(self._ahead(), observation)
         self._pass_nodes()
         target = self._target()
         distance = math.hypot(target.x, target.y)
@@ -172,7 +172,7 @@ class RouteFollower:
     # Driving
 
     def _drive(self, target: Pose2, distance: float, parking: bool, observation: Observation) -> Command:
-        """Servo if the target's landmarks are in sight, else drive to its position, at the goal blindly."""
+        """Servo if the target's landmarks are visible, else drive to its position, at the goal blindly."""
         obstacles = ranger_points(observation.proximity, self._description)
         localizer = self.fix.localizer
         if localizer is not None and self._may_servo(target, distance, parking):
@@ -193,8 +193,8 @@ class RouteFollower:
         self._servoing = -1
         if not parking or distance > NEAR:
             self._approaching = False
-            command = self._detour.toward(target.inverse())
-            if self._detour.around:
+            command = self._local_planner.toward(target.inverse())
+            if self._local_planner.around:
                 self.detail += ", around an obstacle"
             return command
         if not self._approaching:
@@ -206,11 +206,11 @@ class RouteFollower:
             self.progress = RouteProgress.UNSURE
         return step.command
 
-    def _look_at_goal(self, observation: Observation) -> NodeLocalizer | None:
+    def _detect_goal(self, observation: Observation) -> NodeLocalizer | None:
         if observation.image is None:
             return None
-        found = self._lookout.find(observation.image, [self._expected(self._last)])
-        return None if found is None else found[1]
+        detection = self._detector.find(observation.image, [self._expected(self._last)])
+        return None if detection is None else detection[1]
 
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
         """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
@@ -225,20 +225,20 @@ class RouteFollower:
         return self._servo_barred == 0.0
 
     def _confirm(self, state: State, observation: Observation) -> None:
-        """At the goal look afresh: what was tracked all the way has slid a little, and all of it alike.
+        """At the goal detect it again: tracks have drifted a little on the way, all in the same direction.
 
-        A view from where the node's was taken shows its features at their own scale, so nothing tells better
-        where the robot is; a few looks better than one. Only if it then still stands at the goal is it there.
+        A view from the node's own pose shows its features at their own scale, so this is the most precise
+        measurement of the pose; several are averaged. The robot has arrived if it is then still at the goal.
         """
         if state != "arrived":
-            self._confirmed, self._hidden, self._looks = False, 0.0, []
+            self._confirmed, self._hidden, self._goal_poses = False, 0.0, []
         elif self._confirmed:
             self.progress = RouteProgress.ARRIVED
-        elif (localizer := self._look_at_goal(observation)) is not None:
-            self._looks.append(localizer.pose)
-            if len(self._looks) == GOAL_LOOKS:
-                localizer.restart(averaged(self._looks))
-                self._looks, self._confirmed, self.fix = [], True, Fix.of(localizer)
+        elif (localizer := self._detect_goal(observation)) is not None:
+            self._goal_poses.append(localizer.pose)
+            if len(self._goal_poses) == GOAL_VIEWS:
+                localizer.restart(averaged(self._goal_poses))
+                self._goal_poses, self._confirmed, self.fix = [], True, Fix.of(localizer)
         else:
             self._hidden += self._description.tick
             if self._hidden > HIDDEN:
@@ -247,7 +247,7 @@ class RouteFollower:
     # Nodes ahead
 
     def _pass_nodes(self) -> None:
-        """Go on to the next node where one is passed, or a later one is in sight already."""
+        """Go on to the next node where one is passed, or a later one is visible already."""
         before = self.leg
         if self._reference > self.leg:
             self.leg = self._reference
@@ -258,37 +258,40 @@ class RouteFollower:
         if self.leg != before:
             self._progressed = ProgressMonitor()
 
-    def _look_for(self, wanted: Sequence[Expected], observation: Observation) -> bool:
-        """Look for landmarks, furthest first; returns whether some were found: then the fix is on them."""
+    def _detect(self, wanted: Sequence[Expected], observation: Observation) -> bool:
+        """Search the image for nodes, furthest first; returns whether the fix is now on one of them."""
         if observation.image is None or not wanted:
             return False
-        found = self._lookout.find(observation.image, wanted)
-        if found is not None:
-            self._reference, localizer = found
+        detection = self._detector.find(observation.image, wanted)
+        if detection is not None:
+            self._reference, localizer = detection
             self.fix = Fix.of(localizer)
-        return found is not None
+        return detection is not None
 
     def _ahead(self) -> list[Expected]:
         """Nodes whose landmarks may be in view, furthest first."""
         first = self._reference + 1 if self.fix.in_sight else 0
         wanted: list[Expected] = []
         for index in range(min(self.leg + SKIP, self._last), first - 1, -1):
-            if len(wanted) == MOST_LOOKED_FOR:
+            if len(wanted) == MOST_CANDIDATES:
                 break
             expected = self._expected(index)
-            there = expected.node_from_robot
-            if math.hypot(there.x, there.y) < SIGHT_REACH and abs(wrap_angle(there.heading)) < SIGHT_TURN:
+            pose = expected.node_from_robot
+            if (
+                math.hypot(pose.x, pose.y) < DETECTION_REACH
+                and abs(wrap_angle(pose.heading)) < DETECTION_TURN
+            ):
                 wanted.append(expected)
-        # At the goal more of its landmarks come into view: a fresh look makes the last millimetres better.
-        if self._reference == self._last and self.fix.in_sight and self._tick % (3 * LOOK_EVERY) == 0:
+        # At the goal more of its landmarks are in view: a new detection improves the last millimetres.
+        if self._reference == self._last and self.fix.in_sight and self._tick % (3 * DETECT_EVERY) == 0:
             tracked = len(self.fix.localizer.visible) if self.fix.localizer is not None else 0
             wanted.append(self._expected(self._last)._replace(tracked=tracked))
         return wanted
 
     def _expected(self, index: int) -> Expected:
         """A leg's node, with where the robot should be from it."""
-        there = self._from_reference(index) @ self.fix.node_from_robot.mean
-        return Expected(index, self._route[index].node, there, 1.0 + self.fix.blind)
+        node_from_robot = self._from_reference(index) @ self.fix.node_from_robot.mean
+        return Expected(index, self._route[index].node, node_from_robot, 1.0 + self.fix.blind)
 
     def _target(self) -> Pose2:
         """`target_from_robot`."""
@@ -303,6 +306,10 @@ class RouteFollower:
 
 
 def _lies_ahead(target_from_robot: Pose2) -> bool:
-    """Whether a pose can be servoed to without a manoeuvre: ahead, and facing alike."""
-    there = target_from_robot.inverse()
-    return abs(target_from_robot.heading) < 0.5 and there.x > 0.1 and abs(there.y) < 0.6 * there.x
+    """Whether a pose can be servoed to without a manoeuvre: ahead, and with a similar heading."""
+    robot_from_target = target_from_robot.inverse()
+    return (
+        abs(target_from_robot.heading) < 0.5
+        and robot_from_target.x > 0.1
+        and abs(robot_from_target.y) < 0.6 * robot_from_target.x
+    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from mapweave.agent.localization.node_detector import NodeDetectorSettings
 
 NEAR = 0.35
-"""Within this distance of the goal the last, blind turns are made if it is not in sight, m."""
+"""Within this distance of the goal the last, blind turns are made if it is not visible, m."""
 
 
 @dataclass(frozen=True)

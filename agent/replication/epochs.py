@@ -12,7 +12,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import NewestMap
 
 LARGEST = 999_999
-"""Epochs are counted: a server that knows a larger one is not believed, or it could use the numbers up."""
+"""Epochs are counted: a larger one from a server is refused, or a server could use the numbers up."""
 
 FOUR_DIGITS = range(1000, 10_000)
 
@@ -53,8 +53,8 @@ def newest_on_server(bus: Bus, keys: Keys, server: str, agent: str, patience: fl
 def next_epoch(taken: Collection[int], stored: int | None) -> int:
     """The number of a new map: one more than any that is known.
 
-    A robot that knows of no map of its own is either new or has lost its disk. Only a server can tell which.
-    Without one the number is drawn from four digits: another life of this robot has most probably not used
+    A robot without a map of its own is either new or has lost its disk. Only a server knows which. Without a
+    server the number is drawn from four digits: an earlier run of this robot has most probably not used
     it, and if it has, the server says so (the log id differs) and mixes nothing up.
 
     Args:

@@ -1,4 +1,4 @@
-"""The agent's own disk: every change of its maps, written before anybody else hears of it."""
+"""The agent's own disk: every change of its maps, written before it is sent."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ READ_AT_ONCE = 256
 
 
 class Entry(NamedTuple):
-    """One change of a log: which node or edge it puts, or retires, and its body; None if that is damaged."""
+    """One change of a log: the node or edge that it writes or retires; body None if damaged."""
 
     sequence: int
     element: NodeId
@@ -89,7 +89,7 @@ class Journal:
             agent: whose; None takes whose it is, and begins none.
 
         Raises:
-            InvalidFile: damaged, of another kind, another agent's, nobody's, or in use.
+            InvalidFile: damaged, of another kind, another agent's, without an owner, or in use.
         """
         if agent is not None:
             check_name(agent)
@@ -101,7 +101,7 @@ class Journal:
                 if owner is None and agent is not None:
                     rows.execute("INSERT INTO owner VALUES (?)", (agent,))
                 elif owner is None:
-                    raise InvalidFile(f"{path}: is nobody's journal")
+                    raise InvalidFile(f"{path}: this journal has no owner")
                 elif agent not in (None, owner[0]):
                     raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
             self.agent = str(owner[0]) if agent is None else agent
@@ -138,10 +138,10 @@ class Journal:
         Raises:
             InvalidValue: no such map was opened.
         """
-        found = self._read("SELECT log_id FROM map WHERE epoch = ?", self._epoch(map_id))
-        if not found:
+        rows = self._read("SELECT log_id FROM map WHERE epoch = ?", self._epoch(map_id))
+        if not rows:
             raise InvalidValue(f"map {map_id} was never opened in this journal")
-        return int(found[0][0])
+        return int(rows[0][0])
 
     def head(self, map_id: MapId) -> int:
         """Sequence number of the newest change, 0 if there is none."""
@@ -187,7 +187,7 @@ class Journal:
     def rows(self, map_id: MapId, first: int, last: int) -> list[tuple[int, bytes]]:
         """Changes first to last, both included, as (sequence, encoded change).
 
-        An empty one stands for a change that the disk has damaged: servers refuse it and go on behind it.
+        An empty one represents a change that the disk has damaged: servers refuse it and go on after it.
         """
         return [
             (sequence, b"" if body is None else wrap_body(sequence, stamp_ns, body))
@@ -226,14 +226,14 @@ class Journal:
                 decoded = None
             yield Entry(sequence, NodeId(*map_id, number), bool(put), decoded)
 
-    def acknowledge(self, server: str, map_id: MapId, watermark: int, anew: bool = False) -> None:
+    def acknowledge(self, server: str, map_id: MapId, watermark: int, reset: bool = False) -> None:
         """Remember that a server has every change up to the watermark; it never goes back.
 
         Args:
             server: which.
             map_id: which map.
             watermark: up to which change.
-            anew: the server has lost its store, so it may go back.
+            reset: the server has lost its store, so it may go back.
 
         Raises:
             InvalidValue: the log is not that long.
@@ -247,7 +247,7 @@ class Journal:
                 rows.execute(
                     "INSERT INTO ack VALUES (?, ?, ?) ON CONFLICT (epoch, server) "
                     "DO UPDATE SET watermark = max(watermark * ?, excluded.watermark)",
-                    (map_id.epoch, check_name(server), watermark, not anew),
+                    (map_id.epoch, check_name(server), watermark, not reset),
                 )
 
     def acknowledged(self, map_id: MapId) -> dict[str, int]:
@@ -268,8 +268,8 @@ class Journal:
             InvalidFile: the disk does not take it.
         """
         with self._lock:
-            known = self.acknowledged(map_id)
-            limit = min((known.get(server, 0) for server in servers), default=0)
+            acknowledged = self.acknowledged(map_id)
+            limit = min((acknowledged.get(server, 0) for server in servers), default=0)
             with self._database.transaction() as rows:
                 dropped = rows.execute(
                     "DELETE FROM change WHERE epoch = :epoch AND sequence <= :limit AND put AND EXISTS ("

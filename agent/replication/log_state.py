@@ -1,4 +1,4 @@
-"""What is known of one of the agent's own logs: how long it is, and who has how much of it."""
+"""State of one of the agent's own logs: its length, and each server's watermark."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class LogState:
         return ack.watermark < self.acknowledged.get(server, 0)
 
     def take(self, server: str, ack: Ack) -> list[str]:
-        """Note what an acknowledgement says besides its watermark.
+        """Note the contents of an acknowledgement other than its watermark.
 
         Returns:
             What is new and worth a line in the log.

@@ -1,7 +1,7 @@
-"""Where an agent's nodes lie in the merged map, as its server tells it.
+"""Poses of an agent's nodes in the merged map, as its server sends them.
 
-It is kept beside the map and changes nothing in it. What is told may be lost on the way; each news says which
-one must be known before it, and where one is missing all are asked for.
+They are kept beside the map and change nothing in it. Messages may be lost; each names the message that must
+precede it, and where one is missing all poses are asked for.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class MergedPoses:
             bus: the connection; stays the caller's.
             keys: of the fleet.
             agent: whose nodes.
-            server: that is believed.
+            server: whose poses are taken.
             timeout: how long a question may take, s.
         """
         self._bus, self._agent, self._timeout = bus, agent, timeout
@@ -46,7 +46,7 @@ class MergedPoses:
         ]
 
     def of(self, node: NodeId) -> MergedPose | None:
-        """Where a node lies, as far as was told; None if it is not known."""
+        """Pose of a node in the merged map; None if it is unknown."""
         return self._places.get(node)
 
     def count(self, map_id: MapId) -> int:

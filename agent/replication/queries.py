@@ -26,7 +26,7 @@ cars lie up to ten metres apart."""
 
 
 def encode_query(keys: Keys, question: Question) -> tuple[str, bytes]:
-    """Whom to ask, and how.
+    """Which server to ask, and how.
 
     Args:
         keys: of the fleet.
@@ -45,16 +45,16 @@ def encode_query(keys: Keys, question: Question) -> tuple[str, bytes]:
 
 
 def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | RouteAnswer | KnownAnswer:
-    """What a server says to a question.
+    """A server's answer to a question.
 
     Raises:
         InvalidMessage: it is no answer to it, or one that no robot can act on.
     """
     if isinstance(question, WhereAmI):
-        found = decode_relocalize_answer(payload)
-        for best in found.candidates[:1]:
+        answer = decode_relocalize_answer(payload)
+        for best in answer.candidates[:1]:
             _check_near(best.node_from_robot.mean, f"whereabouts: the robot, seen from node {best.node},")
-        return found
+        return answer
     if isinstance(question, WhatIsKnown):
         return decode_known_answer(payload)
     route = decode_route_answer(payload)
@@ -65,7 +65,7 @@ def decode_answer(question: Question, payload: bytes) -> RelocalizeAnswer | Rout
     return route
 
 
-def _check_near(pose: Pose2, what: str) -> None:
+def _check_near(pose: Pose2, name: str) -> None:
     distance = math.hypot(pose.x, pose.y)
     if distance > FARTHEST:
-        raise InvalidMessage(f"{what} is {distance:.0f} m away, more than {FARTHEST:g} m")
+        raise InvalidMessage(f"{name} is {distance:.0f} m away, more than {FARTHEST:g} m")

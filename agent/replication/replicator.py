@@ -1,7 +1,7 @@
 """Carries an agent's changes to its disk and from there to the servers, beside the robot's loop.
 
 The loop only hands changes over. One thread does the rest, in this order: commit to the journal, publish
-best-effort, and let servers pull whatever got lost. What makes that lossless is not the publishing but the
+best-effort, and let servers pull what got lost. Lossless is not the publishing but the
 beacon, which tells servers how long the log is, and the log itself, which answers for any range. That goes
 for every map in the journal: one that was left for a fresh map before a server had it is still handed over.
 """
@@ -104,7 +104,7 @@ class Replicator:
         self._settings = settings or ReplicationSettings()
         self._changed = threading.Condition()
         self._current = LogState.of(journal, map_id)
-        self._logs = {one: LogState.of(journal, one) for one in journal.maps()} | {map_id: self._current}
+        self._logs = {m: LogState.of(journal, m) for m in journal.maps()} | {map_id: self._current}
         self._submitted = 0
         self._committed = 0
         self._bytes_sent = 0
@@ -114,8 +114,8 @@ class Replicator:
         self._pending: list[Draft] = []
         self._retry_at = 0.0
         self._beacons = 0
-        for one in self._logs:
-            journal.prune(one, self._servers)
+        for m in self._logs:
+            journal.prune(m, self._servers)
         self._work: queue.SimpleQueue[list[Draft] | Sample | Request | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
@@ -167,7 +167,7 @@ class Replicator:
                 unacknowledged=self._unacknowledged(),
                 bytes_sent=self._bytes_sent,
                 since_ack=since,
-                refused=sum(len(one.refusals) for one in self._logs.values()),
+                refused=sum(len(state.refusals) for state in self._logs.values()),
                 failure=self._disk_failure or self._current.failure,
             )
 
@@ -189,7 +189,7 @@ class Replicator:
         self._thread.join()
 
     def _unacknowledged(self) -> int:
-        return sum(one.unsettled(self._servers) for one in self._logs.values())
+        return sum(state.unsettled(self._servers) for state in self._logs.values())
 
     def _run(self) -> None:
         next_beacon = time.monotonic()
@@ -225,12 +225,12 @@ class Replicator:
         return min(next_beacon, self._retry_at) if self._pending else next_beacon
 
     def _commit(self) -> None:
-        """Disk first, then the network: whoever hears of a change may rely on it."""
+        """Disk first, then the network: a change that was sent is safe."""
         drafts, self._pending = self._pending, []
         try:
             first = self._journal.write(self._map, drafts)
         except InvalidFile as error:
-            # A full disk can be emptied: keep the changes and try again, and say so once.
+            # A full disk can be emptied: keep the changes and try again, and log it once.
             self._pending = drafts
             self._retry_at = time.monotonic() + self._settings.retry_interval
             with self._changed:
@@ -254,9 +254,9 @@ class Replicator:
     def _send_beacons(self) -> None:
         everyone = self._beacons % SETTLED_BEACONS == 0
         self._beacons += 1
-        for one in self._logs.values():
-            if everyone or one is self._current or one.unsettled(self._servers):
-                self._bus.publish(self._keys.head(one.map), one.head().encode())
+        for state in self._logs.values():
+            if everyone or state is self._current or state.unsettled(self._servers):
+                self._bus.publish(self._keys.head(state.map), state.head().encode())
 
     def _take_ack(self, sample: Sample) -> None:
         try:
@@ -265,39 +265,39 @@ class Replicator:
         except InvalidMessage as error:
             log.warning("%s", error)
             return
-        one = self._logs.get(ack.map)
-        if one is None or ack.log_id != one.log_id:
+        state = self._logs.get(ack.map)
+        if state is None or ack.log_id != state.log_id:
             return
         with self._changed:
-            news = one.take(server, ack)
-            lost = one.lost(server, ack)
+            news = state.take(server, ack)
+            lost = state.lost(server, ack)
         for line in news:
             log.warning("%s", line)
         if lost:
             log.warning(
-                "%s has lost what it had of %s after %d: it gets it again", server, one.map, ack.watermark
+                "%s has lost what it had of %s after %d: it gets it again", server, state.map, ack.watermark
             )
-        elif not one.acknowledged.get(server, 0) < ack.watermark <= one.newest:
+        elif not state.acknowledged.get(server, 0) < ack.watermark <= state.newest:
             return
         try:
-            self._journal.acknowledge(server, one.map, ack.watermark, anew=lost)
+            self._journal.acknowledge(server, state.map, ack.watermark, reset=lost)
         except MapweaveError as error:
-            # The server says it again, because the next beacon shows that it was not noted.
+            # The server sends it again, because the next beacon shows that it was not noted.
             log.warning("%s", error)
             return
         with self._changed:
-            one.acknowledged[server] = ack.watermark
+            state.acknowledged[server] = ack.watermark
             self._last_ack = time.monotonic()
             self._changed.notify_all()
 
     def _answer(self, question: Request) -> None:
         try:
             asked = LogRequest.decode(question.payload)
-            one = self._logs.get(self._keys.parse_log(question.key))
-            if one is None:
+            state = self._logs.get(self._keys.parse_log(question.key))
+            if state is None:
                 raise InvalidMessage(f"{question.key}: no such log")
-            last = min(asked.last, asked.first + MAX_ROWS - 1, one.newest)
-            rows = self._journal.rows(one.map, asked.first, last)
+            last = min(asked.last, asked.first + MAX_ROWS - 1, state.newest)
+            rows = self._journal.rows(state.map, asked.first, last)
         except MapweaveError as error:
             question.refuse(str(error))
             return
@@ -308,7 +308,7 @@ class Replicator:
                 # The last one that fits is how far the answer reaches.
                 rows, last = rows[:count], rows[count - 1][0]
                 break
-        answer = LogAnswer(one.log_id, asked.first, max(last, asked.first - 1), tuple(rows))
+        answer = LogAnswer(state.log_id, asked.first, max(last, asked.first - 1), tuple(rows))
         with self._changed:
             self._bytes_sent += sum(len(change) for _, change in rows)
         question.reply(answer.encode())

@@ -29,7 +29,7 @@ class RetainedMap:
         """Read a map that was opened in a journal.
 
         What the disk has damaged is left out, with the edges at nodes that are missing for it. A damaged
-        retirement still retires. Where a newer state of an element is damaged an older one stands.
+        retirement still retires. Where a newer state of an element is damaged an older one is used.
 
         Raises:
             InvalidValue: the map is another agent's.

@@ -15,7 +15,7 @@ from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.pose import Array
 
 HORIZON = 0.8
-"""An arc is driven in thought for this long, s."""
+"""An arc is simulated for this long, s."""
 MARGIN = 0.055
 """Room that an arc leaves between the footprint and anything seen, m; more than the guard's, or that would
 stop what is chosen here."""
@@ -56,7 +56,7 @@ class DynamicWindow:
             rate: rad/s, largest.
         """
         error, distance = math.atan2(ahead[1], ahead[0]), float(np.hypot(*ahead))
-        # Beside the fan the turn that ends just facing the point.
+        # In addition to the fan, the turn that ends facing the point.
         exact = float(np.clip(error / HORIZON, -rate, rate))
         turns = rate * np.concatenate([TURNS, [0.0], -np.array(TURNS)])
         fan_turns = np.append(turns, exact)

@@ -1,4 +1,4 @@
-"""The field of view as one number: how much room is left before too few landmarks are in sight."""
+"""The field of view as one number: the margin before too few landmarks are visible."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def _free_half_cells(
 ) -> NDArray[np.bool_]:
     """(2X-1, 2Y-1) whether cells and the points half way between them are clear of obstacles.
 
-    Away from start and goal a little more room is asked for: what lies between two such points must be clear.
+    Away from start and goal a little more clearance is required: the way between two points must be clear.
     """
     x, y = np.meshgrid(
         0.5 * cell * np.arange(2 * low[0], 2 * high[0] + 1),
@@ -110,7 +110,7 @@ def _nearest(
 ) -> tuple[int, int, int] | None:
     """The allowed state nearest to the start, within a cell and two headings."""
     i, j = round(start.x / cell) - int(low[0]), round(start.y / cell) - int(low[1])
-    best, found = math.inf, None
+    best, nearest = math.inf, None
     for di in (-1, 0, 1):
         for dj in (-1, 0, 1):
             for h in range(_COUNT):
@@ -121,8 +121,8 @@ def _nearest(
                     (i + di + int(low[0])) * cell - start.x, (j + dj + int(low[1])) * cell - start.y
                 )
                 if aside + 0.3 * turn < best:
-                    best, found = aside + 0.3 * turn, (h, i + di, j + dj)
-    return found
+                    best, nearest = aside + 0.3 * turn, (h, i + di, j + dj)
+    return nearest
 
 
 def _costs_to_go(
@@ -197,9 +197,9 @@ def _descend(
         h, i, j = state
         options: list[tuple[float, tuple[int, int, int]]] = []
         for side in (-1, 1):
-            other = (h + side) % _COUNT
-            turned = abs(wrap_angle(float(_HEADINGS[other] - _HEADINGS[h])))
-            options.append((float(costs[other, i, j]) + price.turn * turned, (other, i, j)))
+            neighbour = (h + side) % _COUNT
+            turned = abs(wrap_angle(float(_HEADINGS[neighbour] - _HEADINGS[h])))
+            options.append((float(costs[neighbour, i, j]) + price.turn * turned, (neighbour, i, j)))
             a, b = i + side * int(_STEPS[h, 0]), j + side * int(_STEPS[h, 1])
             if 0 <= a < nx and 0 <= b < ny and free[i + a, j + b]:
                 step = cell * math.hypot(*_STEPS[h])

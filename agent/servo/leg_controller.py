@@ -34,7 +34,7 @@ class Limits:
 
 
 class LegController:
-    """Drives one leg. The line is drawn anew, from where the robot is when it starts to drive."""
+    """Drives one leg, along the line from the pose where the robot starts to drive."""
 
     def __init__(self, leg: Leg, last: bool, settings: ServoSettings, limits: Limits) -> None:
         """Take a leg.
@@ -85,7 +85,7 @@ class LegController:
         )
 
     def _aim(self, pose: Pose2) -> None:
-        """Head from here to the leg's end, unless that is too near to say where it lies."""
+        """Head from here to the leg's end, unless that is too near to have a direction."""
         dx, dy = self.leg.x - pose.x, self.leg.y - pose.y
         if math.hypot(dx, dy) > 0.03:
             along = math.atan2(self.leg.direction * dy, self.leg.direction * dx)

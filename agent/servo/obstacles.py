@@ -35,14 +35,14 @@ class ObstacleMemory:
         """Take one tick's points; returns whether a cell is new.
 
         Args:
-            frame_from_robot: where the robot stands in the memory's frame.
+            frame_from_robot: pose of the robot in the memory's frame.
             points_in_robot: (K, 2) m, in robot.
         """
         self._tick += 1
         before = len(self._points)
-        seen = frame_from_robot.apply(np.asarray(points_in_robot, dtype=np.float64).reshape(-1, 2))
+        points_in_frame = frame_from_robot.apply(np.asarray(points_in_robot, dtype=np.float64).reshape(-1, 2))
         fresh = False
-        for x, y in seen.tolist():
+        for x, y in points_in_frame.tolist():
             key = (round(x / self._cell), round(y / self._cell))
             fresh |= key not in self._points
             self._points.pop(key, None)
@@ -52,6 +52,6 @@ class ObstacleMemory:
             if len(self._points) <= self._most and self._tick - self._points[oldest][2] <= self._life:
                 break
             del self._points[oldest]
-        if len(seen) or len(self._points) != before:
+        if len(points_in_frame) or len(self._points) != before:
             self._array = np.array([p[:2] for p in self._points.values()]).reshape(-1, 2)
         return fresh

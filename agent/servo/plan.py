@@ -74,15 +74,15 @@ class Plan:
 def sample(start: Pose2, legs: Sequence[Leg]) -> Array:
     """(M, 3) dense poses from a start along legs to the goal's heading (the turn of it nearest)."""
     parts = []
-    here = start.vector
+    start_vector = start.vector
     for leg in legs:
-        turned = np.array([here[0], here[1], leg.heading])
-        there = np.array([leg.x, leg.y, leg.heading])
-        parts += [_between(here, turned), _between(turned, there)]
-        here = there
-    final = here.copy()
-    final[2] = 2.0 * math.pi * round(here[2] / (2.0 * math.pi))
-    parts.append(_between(here, final))
+        turned = np.array([start_vector[0], start_vector[1], leg.heading])
+        end_vector = np.array([leg.x, leg.y, leg.heading])
+        parts += [_between(start_vector, turned), _between(turned, end_vector)]
+        start_vector = end_vector
+    final = start_vector.copy()
+    final[2] = 2.0 * math.pi * round(start_vector[2] / (2.0 * math.pi))
+    parts.append(_between(start_vector, final))
     return np.concatenate(parts)
 
 
@@ -94,7 +94,7 @@ def _between(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Price:
-    """What a plan costs besides its length.
+    """What a plan costs in addition to its length.
 
     Attributes:
         turn: m a radian.
@@ -113,7 +113,7 @@ class Price:
 
 
 class Surroundings:
-    """Where the robot may stand: enough landmarks in view, and clear of obstacles."""
+    """Which poses are allowed: enough landmarks in view, and clear of obstacles."""
 
     def __init__(self, field: FieldOfView, obstacles_in_goal: NDArray[Any], clearance: float) -> None:
         """Join a field of view and obstacles.

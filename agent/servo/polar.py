@@ -16,7 +16,7 @@ TURN = 2.0 * math.pi
 
 @dataclass(frozen=True, slots=True)
 class Polar:
-    """Where the robot stands, seen from the goal.
+    """Pose of the robot in polar coordinates around the goal.
 
     Attributes:
         rho: distance to the goal, m.
@@ -47,11 +47,11 @@ def polar_of(goal_from_robot: Pose2) -> Polar:
 
 def continued(goal_from_robot: Pose2, before: Polar) -> Polar:
     """Coordinates on the branch that continues `before`, so that a law that goes on sees no jump."""
-    here = polar_of(goal_from_robot)
+    polar = polar_of(goal_from_robot)
     return Polar(
-        here.rho,
-        before.phi + wrap_angle(here.phi - before.phi),
-        before.beta + wrap_angle(here.beta - before.beta),
+        polar.rho,
+        before.phi + wrap_angle(polar.phi - before.phi),
+        before.beta + wrap_angle(polar.beta - before.beta),
     )
 
 

@@ -59,9 +59,9 @@ def guard(command: Command, proximity: NDArray[Any], description: RobotDescripti
     """The command, or as much of it as cannot touch what the rangers see before the robot could stop.
 
     The round footprint is swept along the arc of the command for two ticks and the stopping distance, and as
-    far again: what stands there may be another robot that comes the other way and brakes no sooner. A turn
-    on the spot moves no round footprint and always passes; so does a motion that leads away from a point
-    which is too near already.
+    far again: it may be another robot that comes the other way and brakes no sooner. A turn on the spot
+    moves no round footprint and always passes; so does a motion that leads away from a point which is too
+    near already.
 
     Args:
         command: wanted.

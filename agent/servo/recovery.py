@@ -17,7 +17,7 @@ RETREAT = 0.6
 
 
 _OFFSETS = np.linspace(-0.8, 0.8, 33)
-"""rad, turns on the spot that are looked at."""
+"""rad, turns on the spot that are tried."""
 
 
 class Recovery:

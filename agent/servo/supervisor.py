@@ -53,10 +53,10 @@ CRUISE = 1.0
 class Servo:
     """Parks the robot at the goal, keeping enough landmarks in view at every instant.
 
-    The order of preference: (1) inside the dead zone turn on the spot to the goal's heading; (2) go on with
-    the law at work while its roll-out keeps the constraints; (3) a law whose roll-out parks and costs little
-    more than a plan; (4) a plan of legs, re-made wherever it turns out to be wrong; (5) turn, then retreat,
-    to where landmarks are in view again; (6) say that it is stuck.
+    The order of preference: (1) inside the dead zone turn on the spot to the goal's heading; (2) continue
+    the present law while its roll-out keeps the constraints; (3) a law whose roll-out parks and costs little
+    more than a plan; (4) a plan of legs, made again when it turns out to be wrong; (5) turn, then retreat,
+    to where landmarks are in view again; (6) report that it is stuck.
     """
 
     def __init__(self, description: RobotDescription, settings: ServoSettings | None = None) -> None:
@@ -85,7 +85,7 @@ class Servo:
             Whether a way is known already; if not, `command` makes a longer search with the robot at rest.
         """
         self.switches = 0
-        self._sight = Visibility(self._description.camera, self.settings)
+        self._visibility = Visibility(self._description.camera, self.settings)
         self._memory = ObstacleMemory()
         self._law: int | None = None
         self._polar = Polar(0.0, 0.0, 0.0)  # continued from tick to tick while a law is at work
@@ -97,7 +97,7 @@ class Servo:
         self._settled = 0
         self._recovery = Recovery(self.settings, self._limits)
         self._wait, self._patience, self._thinking = 0, 2, False
-        self._sight.update(goal_from_robot, points_in_goal, None)
+        self._visibility.update(goal_from_robot, points_in_goal, None)
         self._choose(goal_from_robot, self._surroundings(goal_from_robot))
         self._thinking = False
         return self._law is not None or self._plan is not None
@@ -126,16 +126,16 @@ class Servo:
             InvalidValue: landmarks of another shape.
         """
         pose = Pose2(goal_from_robot.x, goal_from_robot.y, wrap_angle(goal_from_robot.heading))
-        self._sight.update(pose, points_in_goal, visible)
+        self._visibility.update(pose, points_in_goal, visible)
         self._memory.add(pose, obstacles)
         final = self._final_turn(pose)
         if final is not None:
             return final
         surroundings = self._surroundings(pose)
-        if self._sight.field.slack(pose.vector) < LEAST_MARGIN:
+        if self._visibility.field.slack(pose.vector) < LEAST_MARGIN:
             self._law = None
             self._drop_plan()
-            return self._step(*self._recovery.command(pose, self._sight.field, surroundings), pose)
+            return self._step(*self._recovery.command(pose, self._visibility.field, surroundings), pose)
         self._recovery.over()
         for _ in range(3):
             self._keep_or_drop(pose, surroundings)
@@ -157,9 +157,9 @@ class Servo:
     # ---- constraints
 
     def _surroundings(self, pose: Pose2) -> Surroundings:
-        """Constraints now; where goal or robot already stand nearer to an obstacle, as near is allowed."""
+        """Constraints now; where goal or robot are already nearer to an obstacle, as near is allowed."""
         wanted = self._description.radius + CLEARANCE
-        around = Surroundings(self._sight.planning_field, self._memory.points, wanted)
+        around = Surroundings(self._visibility.planning_field, self._memory.points, wanted)
         if len(self._memory.points):
             nearest = float(around.distance(np.array([pose.vector, [0.0, 0.0, 0.0]])).min())
             floor = self._description.radius + 0.01
@@ -180,11 +180,11 @@ class Servo:
                 self._broken_laws += 1
         elif self._plan is not None:
             rest = self._plan.legs[self._leg :]
-            here = Pose2(pose.x, pose.y, _branch(pose.heading, self._plan.start.heading))
-            if not around.admits(sample(here, rest), min(hard, self._plan.margin)):
+            pose_near_start = Pose2(pose.x, pose.y, _branch(pose.heading, self._plan.start.heading))
+            if not around.admits(sample(pose_near_start, rest), min(hard, self._plan.margin)):
                 self._drop_plan()
                 return
-            cost = self.settings.price.of(here, rest)
+            cost = self.settings.price.of(pose_near_start, rest)
             law = self._best_law(polar_of(pose), around, cost)
             if law is not None:
                 self._drop_plan()
@@ -198,7 +198,7 @@ class Servo:
         if self._wait > 0:
             self._wait -= 1
             return
-        if math.hypot(pose.x, pose.y) < 1e-9 or self._sight.field.count < MIN_VISIBLE:
+        if math.hypot(pose.x, pose.y) < 1e-9 or self._visibility.field.count < MIN_VISIBLE:
             return
         search = thorough_plan if self._thinking else quick_plan
         plan = search(around, pose, self.settings)
@@ -304,7 +304,7 @@ class Servo:
     def _checked(
         self, command: Command, state: State, reason: str, pose: Pose2, around: Surroundings
     ) -> ServoStep:
-        """The last check: a command that would break a constraint within the look-ahead does not leave."""
+        """The last check: a command that would break a constraint within the look-ahead is stopped."""
         if around.admits(arc(pose, command.forward, command.turn, HORIZON), 0.0):
             return self._step(command, state, reason, pose)
         self._law = None
@@ -312,12 +312,12 @@ class Servo:
         return self._step(Command(), state, f"stopped: {reason} would leave what is allowed", pose)
 
     def _step(self, command: Command, state: State, reason: str, pose: Pose2) -> ServoStep:
-        rooms = self._sight.field.rooms(arc(pose, command.forward, command.turn, HORIZON))
+        rooms = self._visibility.field.rooms(arc(pose, command.forward, command.turn, HORIZON))
         seen = int((rooms >= 0.0).sum(axis=-1).min())
         law = self._law if state == "driving" else None
         return ServoStep(command, state, law, reason, seen)
 
 
-def _branch(angle: float, near: float) -> float:
+def _branch(angle: float, reference: float) -> float:
     """The angle plus the multiple of 2 pi that brings it nearest to another."""
-    return near + wrap_angle(angle - near)
+    return reference + wrap_angle(angle - reference)

@@ -13,7 +13,7 @@ _SPACING = 0.06
 """rad between candidate headings."""
 
 _REACH = 1.5
-"""rad to either side in which headings are looked for."""
+"""rad to either side in which headings are searched."""
 
 _ALONG: Array = np.linspace(0.0, 1.0, 9)[1:]
 

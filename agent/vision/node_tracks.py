@@ -50,7 +50,7 @@ class NodeTracks:
         return self._tracker.pixels
 
     def renew(self, features: Features, pairs: NDArray[np.integer]) -> None:
-        """Go on from where a fresh look finds the landmarks in the last image; the strikes begin anew."""
+        """Continue from a detection of the landmarks in the last image; rejections are counted from zero."""
         self._tracker.clear()
         self._tracker.add(pairs[:, 0].astype(np.int64), features.raw[pairs[:, 1]])
         self._strikes.forget()
@@ -60,7 +60,7 @@ class NodeTracks:
         self._tracker.track(image, expected)
 
     def judge(self, accepted: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Tell which of the tracks were believed, (N,); returns the landmarks given up, tracked no more."""
+        """Take in which tracks the filter accepted, (N,); returns the landmarks that are dropped."""
         given_up = self._strikes.judge(self.ids, accepted)
         self._tracker.keep(~np.isin(self.ids, given_up))
         return given_up

@@ -1,4 +1,4 @@
-"""Points that were lost while they should still be in view: somebody walks past, and they come back."""
+"""Points that were lost while they should still be in view: a person walks past, and they come back."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ IMAGES = 60
 
 @dataclass(frozen=True, slots=True)
 class OccludedTrackSettings:
-    """How long and how hidden points are looked for.
+    """How long and how occluded points are searched for.
 
     Attributes:
         template: how its patch is found again: further from the expected place than that of a point that is
-            tracked, and therefore only if it looks more like what it was.
+            tracked, and therefore only with a higher correlation.
     """
 
     template: TemplateSettings = field(
@@ -44,7 +44,7 @@ class OccludedTracks:
         self._waited: NDArray[np.int64] = np.zeros(0, np.int64)
 
     def take(self, ids: NDArray[np.int64], templates: Templates) -> None:
-        """Look for (N,) lost points and their patches from now on."""
+        """Search for (N,) lost points and their patches from now on."""
         self.ids = np.concatenate([self.ids, ids])
         self._templates = self._templates.joined(templates)
         self._waited = np.concatenate([self._waited, np.zeros(len(ids), np.int64)])
@@ -56,7 +56,7 @@ class OccludedTracks:
             self._templates = self._templates.chosen(mask)
 
     def seek(self, image: NDArray[np.uint8], expected: Array) -> tuple[NDArray[np.int64], Array, Templates]:
-        """Look for the points in an image; those found, and those looked for too long, are hidden no more.
+        """Search for the points in an image; found points, and those searched for too long, are dropped.
 
         Args:
             image: (H, W) grey.
@@ -67,8 +67,8 @@ class OccludedTracks:
         """
         inside: NDArray[np.bool_] = np.asarray(np.isfinite(expected).all(axis=1))
         match = self._matcher.match(self._templates, image, np.where(inside[:, None], expected, -1e3))
-        found = inside & match.held
-        out = self.ids[found], match.raw[found], match.templates.chosen(found)
+        redetected = inside & match.held
+        out = self.ids[redetected], match.raw[redetected], match.templates.chosen(redetected)
         self._waited = self._waited + 1
-        self.keep(~found & (self._waited < IMAGES))
+        self.keep(~redetected & (self._waited < IMAGES))
         return out

@@ -26,5 +26,5 @@ class RejectionCounter:
         return np.array(given_up, np.int64)
 
     def forget(self) -> None:
-        """Begin anew with all."""
+        """Reset all counters."""
         self._counts = {}

@@ -1,8 +1,8 @@
 """Patches of points as they were first seen, to which tracks are held: what keeps them from drifting.
 
-Lucas-Kanade from frame to frame adds up its errors, and a patch that grows while the robot approaches pulls
-it aside in every frame alike. The way from the first image to the present one is a single match, whose error
-does not grow with time (Shi and Tomasi 1994 watch their tracks that way). The match is the inverse
+Lucas-Kanade from frame to frame accumulates its errors, and a patch that grows while the robot approaches
+biases all of them in the same direction. A match from the first image to the present one has an error that
+does not grow with time (Shi and Tomasi 1994 monitor their tracks this way). The match is the inverse
 compositional one of Baker and Matthews (2004), so that all derivatives are taken once, when a patch is cut.
 """
 
@@ -22,16 +22,16 @@ SIGMA_PX = 4.0
 """Of the Gaussian by which pixels far from the point count less: they are on another surface, or on a
 slanted one, more often than those near it."""
 MOST_SCALE = 1.7
-"""Once a patch has grown or shrunk by more than this it is cut anew from the present image."""
+"""Once a patch has grown or shrunk by more than this it is cut again from the present image."""
 
 
 Floats = NDArray[np.float32]
 
 FAINT = 0.5
-"""Grey levels: a patch is taken to have at least this deviation, for a blank one has no looks at all."""
+"""Grey levels: a patch is taken to have at least this deviation, for a blank one cannot be normalised."""
 
 RIDGE = 1e-3
-"""Added to the normal equations, whose entries are about 1: a patch may tell nothing of its size."""
+"""Added to the normal equations, whose entries are about 1: a patch may not constrain its size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +40,8 @@ class TemplateSettings:
 
     Attributes:
         iterations: of Gauss and Newton. The guess is a track and good to a fraction of a pixel.
-        agree_px: a match further than this from the track is another thing that looks alike.
-        least_correlation: of the patch then and now, 1 for the same looks in whatever light.
+        agree_px: a match further than this from the track is another, similar feature.
+        least_correlation: of the patch then and now, 1 for the same appearance in any light.
     """
 
     iterations: int = 2
@@ -55,7 +55,7 @@ class Templates:
 
     Attributes:
         looks: (N, P) grey, of mean 0 and deviation 1 by the pixels' weights.
-        slopes: (N, 3, P) weighted derivative of the looks by (shift right px, shift down px, growth), without
+        slopes: (N, 3, P) weighted derivative of the patch by (shift right px, shift down px, growth), without
             what brightness and contrast could do as well.
         solve: (N, 3, 3) inverse of the normal equations of these.
         scales: (N,) how large the patch is now, 1 as it was cut.
@@ -72,7 +72,7 @@ class Templates:
 
     @property
     def columns(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Looks, slopes, solve and scales."""
+        """Patches, slopes, solve and scales."""
         return self.looks, self.slopes, self.solve, self.scales
 
     def chosen(self, which: NDArray[np.bool_]) -> Templates:
@@ -81,9 +81,9 @@ class Templates:
             return self
         return Templates(*(column[which] for column in self.columns))
 
-    def joined(self, others: Templates) -> Templates:
+    def joined(self, added: Templates) -> Templates:
         """These and then others."""
-        pairs = zip(self.columns, others.columns, strict=True)
+        pairs = zip(self.columns, added.columns, strict=True)
         return Templates(*(np.concatenate(pair) for pair in pairs))
 
 
@@ -93,8 +93,8 @@ class Match:
 
     Attributes:
         raw: (N, 2) px in the real image: found where they are held, else as they were given.
-        held: (N,) whether a patch was found near its track and looks as it did.
-        templates: the same patches with their present size; some cut anew.
+        held: (N,) whether a patch was found near its track and is unchanged.
+        templates: the same patches with their present size; some cut again.
     """
 
     raw: Array
@@ -152,7 +152,7 @@ class TemplateMatcher:
         return Match(found, held, self._renewed(now, held, grey, found))
 
     def _renewed(self, templates: Templates, held: NDArray[np.bool_], grey: Floats, raw: Array) -> Templates:
-        """The patches, those that have changed their size too much cut anew where they are held now."""
+        """The patches, those that have changed their size too much cut again at their present positions."""
         most = MOST_SCALE
         strange = held & ((templates.scales > most) | (templates.scales < 1 / most))
         if not strange.any():
@@ -173,7 +173,7 @@ class TemplateMatcher:
         )
         growth = right * self._spots[:, 0] + down * self._spots[:, 1]
         slopes = np.stack([right, down, growth], axis=1)
-        # A change along 1 or along the looks themselves is one of brightness or contrast, and no motion.
+        # A change along 1 or along the patch itself is one of brightness or contrast, and no motion.
         slopes = slopes - np.einsum("nip,p->ni", slopes, self._weights)[..., None]
         alike = np.einsum("nip,np,p->ni", slopes, looks, self._weights)
         slopes = slopes - alike[..., None] * looks[:, None]

@@ -24,8 +24,7 @@ class TrackQuality:
         age_longest: and the most; 0 without tracks.
         held: share of them that was found by the patch in which it was first seen, not only from frame to
             frame; NaN without tracks.
-        error_px_median: distance of the tracks that the filter believed from where it had expected them, px,
-            median; NaN if it believed none.
+        error_px_median: distance of the accepted tracks from their prediction, px, median; NaN without any.
         error_px_p95: likewise, 95th percentile.
         coverage: share of the image's cells in which there is a track.
     """
@@ -49,7 +48,7 @@ class TrackQuality:
             pixels: (N, 2) px in the ideal image, of the tracks.
             ages: (N,) images over which they were followed.
             held: (N,) whether they were found by their first patch.
-            misses_px: (K, 2) px, of the tracks that the filter believed: seen minus expected.
+            misses_px: (K, 2) px, of the tracks that the filter accepted: measured minus predicted.
         """
         n = len(pixels)
         median, worst = float("nan"), float("nan")

@@ -102,24 +102,24 @@ class Tracker:
         guess_given = guess.copy()
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
         window = (s.window_px, s.window_px)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
+        forward, found_forward, _ = cv2.calcOpticalFlowPyrLK(
             before, image, start, guess, winSize=window, maxLevel=LEVELS, criteria=criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE / EIGENVALUE_UNIT,
         )  # fmt: skip
         # The way back starts from the expected displacement, not from the answer, which would hide errors.
-        way_back = there - (guess_given - start)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-            image, before, there, way_back, winSize=window, maxLevel=LEVELS, criteria=criteria,
+        way_back = forward - (guess_given - start)
+        backward, found_back, _ = cv2.calcOpticalFlowPyrLK(
+            image, before, forward, way_back, winSize=window, maxLevel=LEVELS, criteria=criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE / EIGENVALUE_UNIT,
         )  # fmt: skip
         height, width = image.shape
-        there, back = there[:, 0], back[:, 0]
-        kept = (found[:, 0] == 1) & (found_back[:, 0] == 1)
-        kept &= np.linalg.norm(back - start[:, 0], axis=1) <= BACKWARD_PX
-        kept &= (there >= BORDER_PX).all(axis=1)
-        kept &= (there[:, 0] < width - BORDER_PX) & (there[:, 1] < height - BORDER_PX)
+        forward, backward = forward[:, 0], backward[:, 0]
+        kept = (found_forward[:, 0] == 1) & (found_back[:, 0] == 1)
+        kept &= np.linalg.norm(backward - start[:, 0], axis=1) <= BACKWARD_PX
+        kept &= (forward >= BORDER_PX).all(axis=1)
+        kept &= (forward[:, 0] < width - BORDER_PX) & (forward[:, 1] < height - BORDER_PX)
         lost: NDArray[np.int64] = self.ids[~kept]
-        self.raw = there.astype(np.float64)
+        self.raw = forward.astype(np.float64)
         self.keep(kept)
         self.ages = self.ages + 1
         if s.anchored:

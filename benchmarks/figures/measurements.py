@@ -26,6 +26,7 @@ MEASUREMENTS: dict[str, str] = {
     "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",
     "rules_corridors": "python -m benchmarks.rules --trials twin-corridor --runs 3 --seed 724 --json",
     "rules_places": "python -m benchmarks.rules --places 1000 --seed 708 --json",
-    "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room --seed 723 --json",
+    "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
+    "--seed 723 --json",
     "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
 }

@@ -198,9 +198,9 @@ def _in_turn(looks: list[Pose2]) -> list[Pose2]:
     return [look for stop in tour for look in stop]
 
 
-def _alike(points: Array, one: Array, other: Array) -> NDArray[np.bool_]:
+def _alike(points: Array, a: Array, b: Array) -> NDArray[np.bool_]:
     """(N,) which points two eyes see alike, all (., 2) m."""
-    rays = points - one, points - other
+    rays = points - a, points - b
     far = [np.linalg.norm(ray, axis=1) for ray in rays]
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.maximum(*far) / np.minimum(*far)

@@ -137,6 +137,6 @@ def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> Differe
     return Differences(np.concatenate(found), np.concatenate(whole))
 
 
-def _alike(one: Place, other: Place) -> bool:
-    between = one.world_from_node.inverse() @ other.world_from_node
+def _alike(a: Place, b: Place) -> bool:
+    between = a.world_from_node.inverse() @ b.world_from_node
     return abs(between.heading) < 0.5 and abs(between.x) < 1.0 and abs(between.y) < 1.0

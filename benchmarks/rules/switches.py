@@ -49,7 +49,7 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "chance support": ((Sorted, "beyond_chance", _as_it_is),),
     "dominance": ((pairwise_consistency, "_rival", _nothing),),
     "refused links heard again": (
-        (agglomerative_joining, "_heard_again", lambda _solver, kept, *_: list(kept)),
+        (agglomerative_joining, "_update_chance_support", lambda _solver, kept, *_: list(kept)),
     ),
     "readmission": ((merging, "readmitted", _nothing),),
 }

@@ -1,4 +1,4 @@
-"""What comes with a POST: an image as the body itself, or in a form beside what is known of its camera."""
+"""The content of a POST: an image as the body itself, or in a form with values of its camera."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def read_photo(content_type: str, body: bytes, query: dict[str, str]) -> Photo:
     """Take a POST apart.
 
     Args:
-        content_type: as the header says it. Anything but a form is the image itself.
+        content_type: of the header. Anything but a form is the image itself.
         body: all of it.
         query: camera values behind the `?`; they come before those in the form.
 
     Returns:
-        The image and what was said about its camera. In a form, the image is the part named `image`, `camera`
+        The image and the values of its camera. In a form, the image is the part named `image`, `camera`
         may be a camera.toml or the same as JSON, and any other part is a value of the camera.
 
     Raises:
@@ -55,7 +55,7 @@ def read_photo(content_type: str, body: bytes, query: dict[str, str]) -> Photo:
 
 
 def camera_values(data: bytes) -> dict[str, Any]:
-    """What a camera.toml, or the same as JSON, says of a camera. Both are flat: a name and a value a line.
+    """The values of a camera.toml, or of the same as JSON. Both are flat: a name and a value a line.
 
     Raises:
         InvalidValue: it is too long, or neither.

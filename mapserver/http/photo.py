@@ -20,9 +20,9 @@ from mapweave.vision.sift import Sift
 LONG_SIDE = 1024
 """Larger images are made so small, px: a robot's image shows things no larger than that."""
 LONG_SIDE_FOV = math.radians(69.4)
-"""Angle of view along the longer side if nothing is said: a 26 mm lens on 36 mm film, as most phones have."""
+"""Angle of view along the longer side by default: a 26 mm lens on 36 mm film, as most phones have."""
 MOUNT_HEIGHT = 1.4
-"""Height of the lens above the floor if nothing is said, m: a phone held level before the chest."""
+"""Height of the lens above the floor by default, m: a phone held level before the chest."""
 
 NAMES = ("width", "height", "fx", "fy", "cx", "cy", "hfov", "height_m", "forward_m", "distortion")
 ALIASES = {"mount_height": "height_m", "mount_forward": "forward_m"}
@@ -34,7 +34,7 @@ class Photo:
 
     Attributes:
         data: a JPEG or PNG file.
-        optics: what is known of its camera, by the names of camera.toml (px, m), or `hfov`, the horizontal
+        optics: values of its camera, by the names of camera.toml (px, m), or `hfov`, the horizontal
             angle of view in degrees, instead of focal lengths. Numbers may be text.
     """
 
@@ -42,7 +42,7 @@ class Photo:
     optics: Mapping[str, Any]
 
     def check(self) -> None:
-        """Look at what can be told without decoding.
+        """Check what can be checked without decoding.
 
         Raises:
             InvalidValue: it is neither JPEG nor PNG, or too large.

@@ -1,8 +1,9 @@
 """Whether a request comes from this server's own pages or from no page at all.
 
 A page of another site can make a browser on the robots' network send requests here. Two headers that a page
-cannot choose tell: `Origin` names the page's site, `Host` the name under which this server was looked up. A
-name that an attacker points at this machine (DNS rebinding) is none of ours; an address is always its own.
+cannot choose prevent this: `Origin` names the page's site, `Host` the name under which this server was looked
+up. A name that an attacker points at this machine (DNS rebinding) is not in the list; an address is always
+its own.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class SameSite:
     """An application that refuses what pages of other sites ask."""
 
     def __init__(self, app: ASGIApp, listens_at: str) -> None:
-        """Stand before an application.
+        """Wrap an application.
 
         Args:
             app: answers everything else.
@@ -45,7 +46,7 @@ class SameSite:
 
 
 def own_names(listens_at: str) -> frozenset[str]:
-    """Names of this machine, besides its addresses.
+    """Names of this machine, in addition to its addresses.
 
     Args:
         listens_at: host at which the server listens.

@@ -38,7 +38,7 @@ class AgentLog:
         log_id: which, see mapweave.wire.log_messages.Mark.
         settings: when to pull.
         watermark: every change up to this one is settled.
-        newest: the highest sequence number that was heard of.
+        newest: the highest known sequence number.
         ahead: changes that came and are not settled, by sequence number.
         refusals: the newest that were refused.
         damaged: parts of the settled changes that were found damaged on the disk.

@@ -1,4 +1,4 @@
-"""What goes into the store, and what the store says of it: plain values."""
+"""Entries of the store, and its results: plain values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Entry:
     Attributes:
         sequence: its place in the log.
         message: the encoded change.
-        change: what it says, or the reason why it cannot be taken.
+        change: the decoded change, or the reason why it is refused.
     """
 
     sequence: int

@@ -1,11 +1,11 @@
-"""Takes in what agents send: every change of every log exactly once and in order, whatever gets lost.
+"""Takes in what agents send: every change of every log exactly once and in order, despite losses.
 
     change -------> in order? -> store (commit) -> acknowledge -> on_change
     beacon -------> gap? ------> ask the agent's log for it, in chunks -> store ...
 
 A change that does not decode when it is published is treated as lost and pulled: it may have been damaged
-on the way. If it does not decode when it is pulled either, the agent's log holds it like that, and it is
-refused: kept aside with the reason, which goes back with the acknowledgement, and the log goes on behind it.
+on the way. If it does not decode when it is pulled either, the agent's log itself has it like that, and it is
+refused: kept aside with the reason, which is sent with the acknowledgement, and the log goes on after it.
 """
 
 from __future__ import annotations
@@ -149,21 +149,24 @@ class Ingest:
 
     def _run(self) -> None:
         while not self._stopping:
-            due = min((one.pull_at for one in self._logs.values() if not one.pulling), default=NEVER)
+            due = min(
+                (agent_log.pull_at for agent_log in self._logs.values() if not agent_log.pulling),
+                default=NEVER,
+            )
             touched: dict[MapId, AgentLog] = {}
             for item in self._drain(due):
-                one = self._take(item)
-                if one is not None:
-                    touched[one.map] = one
+                agent_log = self._take(item)
+                if agent_log is not None:
+                    touched[agent_log.map] = agent_log
             now = time.monotonic()
-            for one in self._logs.values():
-                if one.map in touched:
-                    self._apply(one, one.next_run(), None)
-                if one.map in touched or one.pull_at <= now:
-                    asked = one.missing(now)
+            for agent_log in self._logs.values():
+                if agent_log.map in touched:
+                    self._apply(agent_log, agent_log.next_run(), None)
+                if agent_log.map in touched or agent_log.pull_at <= now:
+                    asked = agent_log.missing(now)
                     if asked is not None:
                         self._count(pulls=1)
-                        self._pullers.submit(self._pull, one.map, asked)
+                        self._pullers.submit(self._pull, agent_log.map, asked)
 
     def _drain(self, due: float) -> list[Sample | _Pulled]:
         """Wait for something to come until a pull is due; take what waits, for one transaction a log."""
@@ -180,7 +183,7 @@ class Ingest:
         return items
 
     def _take(self, item: Sample | _Pulled) -> AgentLog | None:
-        """Look at one thing that came. Returns the log that may go on now."""
+        """Process one item of the inbox. Returns the log that may go on now."""
         try:
             if isinstance(item, _Pulled):
                 return self._take_pulled(item)
@@ -196,118 +199,124 @@ class Ingest:
         self._count(messages=1, message_bytes=len(sample.payload))
         map_id = self._keys.parse_change(sample.key)
         mark = Mark.decode(sample.attachment)
-        one = self._log(map_id, mark.log_id)
-        if one is None:
+        agent_log = self._log(map_id, mark.log_id)
+        if agent_log is None:
             return None
-        one.newest = max(one.newest, mark.sequence)
-        if mark.sequence <= one.watermark or mark.sequence in one.ahead:
+        agent_log.newest = max(agent_log.newest, mark.sequence)
+        if mark.sequence <= agent_log.watermark or mark.sequence in agent_log.ahead:
             self._count(doubled=1)
-            return one
+            return agent_log
         fits = len(sample.payload) <= MAX_CHANGE_BYTES
         entry = Entry.read(map_id, mark.sequence, sample.payload if fits else b"")
         if isinstance(entry.change, str):
             self._count(damaged=1)
             log.info("%s %d came damaged (%s), pulling it", map_id, mark.sequence, entry.change)
         else:
-            one.offer(entry)
-        return one
+            agent_log.offer(entry)
+        return agent_log
 
     def _take_head(self, sample: Sample) -> AgentLog | None:
         map_id = self._keys.parse_head(sample.key)
         head = Head.decode(sample.payload)
-        one = self._log(map_id, head.log_id)
-        if one is None:
+        agent_log = self._log(map_id, head.log_id)
+        if agent_log is None:
             return None
-        one.newest = max(one.newest, head.newest)
-        one.heard(time.monotonic())
+        agent_log.newest = max(agent_log.newest, head.newest)
+        agent_log.heard(time.monotonic())
         # More than there is: it was another store that had it.
-        if head.acknowledged.get(self._name, 0) != one.watermark:
-            self._acknowledge(one)
-        return one
+        if head.acknowledged.get(self._name, 0) != agent_log.watermark:
+            self._acknowledge(agent_log)
+        return agent_log
 
     def _take_pulled(self, pulled: _Pulled) -> AgentLog | None:
-        one = self._logs[pulled.map]
-        entries, covered = self._read_answer(one, pulled)
+        agent_log = self._logs[pulled.map]
+        entries, covered = self._read_answer(agent_log, pulled)
         self._count(pulled=len(entries))
         first = pulled.asked.first
-        damaged = one.was_damaged(first)
-        gained = covered >= first if damaged else covered > one.watermark
-        one.pulled(time.monotonic(), gained=gained)
+        damaged = agent_log.was_damaged(first)
+        gained = covered >= first if damaged else covered > agent_log.watermark
+        agent_log.pulled(time.monotonic(), gained=gained)
         if gained and damaged:
-            self._restore(one, first, covered, entries)
+            self._restore(agent_log, first, covered, entries)
         elif gained:
-            self._apply(one, entries, covered)
-        return one
+            self._apply(agent_log, entries, covered)
+        return agent_log
 
-    def _restore(self, one: AgentLog, first: int, covered: int, entries: list[Entry]) -> None:
+    def _restore(self, agent_log: AgentLog, first: int, covered: int, entries: list[Entry]) -> None:
         """Put damaged changes in their places again and pass them on."""
         try:
-            changes = self._store.restore(one.map, first, covered, entries)
+            changes = self._store.restore(agent_log.map, first, covered, entries)
         except InvalidFile as error:
-            self._commit_failed(one, error)
+            self._commit_failed(agent_log, error)
             return
         self._failure = ""
-        one.damaged = self._store.damaged(one.map)
-        log.warning("changes %d to %d of %s are whole again", first, covered, one.map)
+        agent_log.damaged = self._store.damaged(agent_log.map)
+        log.warning("changes %d to %d of %s are whole again", first, covered, agent_log.map)
         self._count(restored=len(entries))
         self._pass_on(changes)
 
-    def _read_answer(self, one: AgentLog, pulled: _Pulled) -> tuple[list[Entry], int]:
+    def _read_answer(self, agent_log: AgentLog, pulled: _Pulled) -> tuple[list[Entry], int]:
         """The changes that were pulled and how far they reach; (nothing, 0) if no answer is of use."""
         asked = pulled.asked
         for reply in pulled.replies:
             if reply.error:
-                log.info("%s does not give %s from %d: %s", one.map.agent, one.map, asked.first, reply.error)
+                log.info(
+                    "%s does not give %s from %d: %s",
+                    agent_log.map.agent,
+                    agent_log.map,
+                    asked.first,
+                    reply.error,
+                )
                 continue
             try:
                 answer = LogAnswer.decode(reply.payload)
             except InvalidMessage as error:
                 self._count(damaged=1)
-                log.warning("%s from %d: %s", one.map, asked.first, error)
+                log.warning("%s from %d: %s", agent_log.map, asked.first, error)
                 if asked.first == asked.last:
                     # It was asked for alone and cannot even be carried.
                     return [Entry(asked.first, b"", str(error))], asked.first
-                one.chunk = max(1, (asked.last - asked.first + 1) // 4)
+                agent_log.chunk = max(1, (asked.last - asked.first + 1) // 4)
                 continue
-            if answer.log_id == one.log_id and answer.first == asked.first:
-                entries = [Entry.read(one.map, *change) for change in answer.changes]
+            if answer.log_id == agent_log.log_id and answer.first == asked.first:
+                entries = [Entry.read(agent_log.map, *change) for change in answer.changes]
                 entries = [entry for entry in entries if entry.sequence <= asked.last]
                 return entries, min(answer.covered, asked.last)
         return [], 0
 
     def _log(self, map_id: MapId, log_id: int) -> AgentLog | None:
-        """The log of this name, or None after telling the agent that it is another's."""
-        one = self._logs.get(map_id)
-        if one is None or (one.log_id != log_id and one.watermark == 0):
-            one = self._logs[map_id] = AgentLog(map_id, log_id, self._settings.pull)
-        if one.log_id == log_id:
-            return one
+        """The log of this name, or None after notifying the agent that it is another's."""
+        agent_log = self._logs.get(map_id)
+        if agent_log is None or (agent_log.log_id != log_id and agent_log.watermark == 0):
+            agent_log = self._logs[map_id] = AgentLog(map_id, log_id, self._settings.pull)
+        if agent_log.log_id == log_id:
+            return agent_log
         reason = f"another log goes by the name {map_id} here: begin a fresh map"
         ack = Ack(map_id, log_id, 0, (Refusal(0, reason),), self._store.id)
         self._bus.publish(self._keys.ack(self._name, map_id.agent), ack.encode())
         return None
 
-    def _apply(self, one: AgentLog, entries: list[Entry], covered: int | None) -> None:
+    def _apply(self, agent_log: AgentLog, entries: list[Entry], covered: int | None) -> None:
         """Commit, pass on, acknowledge: in this order."""
         if not entries and covered is None:
             return
         try:
-            applied = self._store.apply(one.map, one.log_id, entries, covered)
+            applied = self._store.apply(agent_log.map, agent_log.log_id, entries, covered)
         except (InvalidFile, InvalidValue) as error:
             # Nothing is lost: it is not acknowledged, so the agent keeps it and it is pulled later.
-            self._commit_failed(one, error)
+            self._commit_failed(agent_log, error)
             return
         self._failure = ""
-        one.settled(applied)
+        agent_log.settled(applied)
         for refusal in applied.refusals:
-            log.warning("refused %s %d: %s", one.map, refusal.sequence, refusal.reason)
+            log.warning("refused %s %d: %s", agent_log.map, refusal.sequence, refusal.reason)
         self._count(applied=len(applied.changes), refused=len(applied.refusals))
         self._pass_on(applied.changes)
         # Last: a robot whose changes are acknowledged may ask at once what has become of them.
-        self._acknowledge(one)
+        self._acknowledge(agent_log)
 
-    def _commit_failed(self, one: AgentLog, error: MapweaveError) -> None:
-        one.commit_failed(time.monotonic(), self._settings.retry_interval)
+    def _commit_failed(self, agent_log: AgentLog, error: MapweaveError) -> None:
+        agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
         self._count(failures=1)
         if str(error) != self._failure:
             log.error("%s", error)
@@ -318,12 +327,13 @@ class Ingest:
             try:
                 self._on_change(change)
             except Exception:
-                # The change is safe on the disk; whoever choked on it must not stop the other robots' logs.
+                # The change is safe on the disk; an error in its processing must not stop the other robots'
+                # logs.
                 log.exception("passing on %s %d failed", change.map, change.sequence)
 
-    def _acknowledge(self, one: AgentLog) -> None:
-        ack = Ack(one.map, one.log_id, one.watermark, one.refusals, self._store.id)
-        self._bus.publish(self._keys.ack(self._name, one.map.agent), ack.encode())
+    def _acknowledge(self, agent_log: AgentLog) -> None:
+        ack = Ack(agent_log.map, agent_log.log_id, agent_log.watermark, agent_log.refusals, self._store.id)
+        self._bus.publish(self._keys.ack(self._name, agent_log.map.agent), ack.encode())
 
     def _tell_newest(self, request: Request) -> None:
         """Which numbers an agent must not give to a new map: it may have lost its disk."""

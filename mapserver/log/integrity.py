@@ -1,8 +1,8 @@
 """Rows of the store that are not what was written are found by their checksums and taken out.
 
-A flipped bit costs the row that it hits, not the store: the good rows are copied into a fresh table, and of a
-change that is lost it is noted which part of which log has to be pulled from its robot again. A key that is
-damaged says nothing, so the rows before and behind it tell what is missing.
+A flipped bit costs the row that it hits, not the store: the good rows are copied into a fresh table, and for
+each lost change the part of its log that must be pulled from its robot again is recorded. A damaged key is
+useless, so the rows before and after it show what is missing.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Gap(NamedTuple):
 
 
 def checksum(values: Sequence[object]) -> int:
-    """Of the columns of a row, whatever they are by now."""
+    """Of the columns of a row."""
     *head, last = values
     crc = zlib.crc32("\0".join(map(str, head)).encode("utf-8", "replace"))
     return zlib.crc32(last if isinstance(last, bytes) else str(last).encode("utf-8", "replace"), crc)
@@ -123,7 +123,7 @@ def _rebuild(connection: sqlite3.Connection, table: str) -> None:
 def _gaps(connection: sqlite3.Connection) -> list[Gap]:
     """What the damaged changes may have been, by the good ones before and behind them."""
     logs = [row for row in good_rows(connection, "log") if row is not None]
-    found: list[Gap] = []
+    gaps: list[Gap] = []
     before: tuple[Any, ...] | None = None
     damaged = False
     for row in chain(good_rows(connection, "change"), [()]):
@@ -131,9 +131,9 @@ def _gaps(connection: sqlite3.Connection) -> list[Gap]:
             damaged = True
             continue
         if damaged:
-            found += _between(logs, before, row[:3] or None)
+            gaps += _between(logs, before, row[:3] or None)
         before, damaged = row[:3], False
-    return found
+    return gaps
 
 
 def _between(
@@ -141,12 +141,12 @@ def _between(
 ) -> Iterator[Gap]:
     """The settled changes of all logs between two keys."""
     for agent, epoch, _, watermark in logs:
-        one = (agent, epoch)
-        if (before is None or before[:2] <= one) and (behind is None or one <= behind[:2]):
-            first = before[2] + 1 if before is not None and before[:2] == one else 1
-            last = behind[2] - 1 if behind is not None and behind[:2] == one else watermark
+        map_id = (agent, epoch)
+        if (before is None or before[:2] <= map_id) and (behind is None or map_id <= behind[:2]):
+            first = before[2] + 1 if before is not None and before[:2] == map_id else 1
+            last = behind[2] - 1 if behind is not None and behind[:2] == map_id else watermark
             if first <= min(last, watermark):
-                yield Gap(MapId(*one), first, min(last, watermark))
+                yield Gap(MapId(*map_id), first, min(last, watermark))
 
 
 def _restart_logs(connection: sqlite3.Connection) -> None:

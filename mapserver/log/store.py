@@ -52,13 +52,13 @@ class Store:
         self._database = Database(path, "map store", APPLICATION_ID, VERSION, SCHEMA, repair, ADVICE)
         for gap in self.damaged():
             log.error("%s: %s", path, _words(gap))
-        known = self.result(ID)
-        self.id = int.from_bytes(known, "big") if known else secrets.randbits(62) + 1
-        if not known:
+        store_id = self.result(ID)
+        self.id = int.from_bytes(store_id, "big") if store_id else secrets.randbits(62) + 1
+        if not store_id:
             try:
                 self.put_result(ID, self.id.to_bytes(8, "big"))
             except InvalidFile as error:
-                # Such a store takes nothing in either, and can still be read.
+                # Such a store cannot be written either, but can be read.
                 log.warning("%s", error)
 
     def maps(self) -> list[MapId]:
@@ -71,7 +71,7 @@ class Store:
         return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in rows}
 
     def present(self) -> set[NodeId]:
-        """All nodes that are not retired, without a look at what is in them."""
+        """All nodes that are not retired, without reading their contents."""
         query = (
             "SELECT agent, epoch, number, kind FROM change WHERE kind IN (?, ?) "
             "ORDER BY agent, epoch, sequence"
@@ -83,20 +83,20 @@ class Store:
 
     def watermark(self, map_id: MapId) -> int:
         """Up to which change the log is settled, 0 if nothing is known."""
-        found = self._read("SELECT watermark FROM log WHERE agent = ? AND epoch = ?", map_id)
-        return int(found[0][0]) if found else 0
+        rows = self._read("SELECT watermark FROM log WHERE agent = ? AND epoch = ?", map_id)
+        return int(rows[0][0]) if rows else 0
 
     def log_id(self, map_id: MapId) -> int | None:
         """Which log goes by this name, None if nothing is known."""
-        found = self._read("SELECT log_id FROM log WHERE agent = ? AND epoch = ?", map_id)
-        return int(found[0][0]) if found else None
+        rows = self._read("SELECT log_id FROM log WHERE agent = ? AND epoch = ?", map_id)
+        return int(rows[0][0]) if rows else None
 
     def apply(
         self, map_id: MapId, log_id: int, entries: Sequence[Entry], covered: int | None = None
     ) -> Applied:
         """Take the next changes of a log, in one transaction with its watermark.
 
-        Doubles are left out. A change that cannot be taken is kept aside with its reason and the log goes on
+        Duplicates are left out. A refused change is kept aside with its reason and the log goes on
         behind it: one bad change must not hold up a map for ever.
 
         Args:
@@ -115,8 +115,8 @@ class Store:
         changes: list[Change] = []
         refusals: list[Refusal] = []
         with self._lock, self._database.transaction() as rows:
-            known = self.log_id(map_id)
-            if known is not None and known != log_id and self.watermark(map_id) > 0:
+            stored_id = self.log_id(map_id)
+            if stored_id is not None and stored_id != log_id and self.watermark(map_id) > 0:
                 raise InvalidValue(f"another log goes by the name {map_id}: begin a fresh map")
             watermark = self.watermark(map_id)
             for entry in entries:
@@ -139,8 +139,8 @@ class Store:
             "SELECT sequence, stamp_ns, body FROM change "
             "WHERE agent = ? AND epoch = ? AND sequence > ? ORDER BY sequence LIMIT ?"
         )
-        while found := self._read(query, (*map_id, last, READ_AT_ONCE)):
-            for last, stamp_ns, body in found:
+        while rows := self._read(query, (*map_id, last, READ_AT_ONCE)):
+            for last, stamp_ns, body in rows:
                 try:
                     yield Change(map_id, last, stamp_ns, decode_body(body))
                 except InvalidMessage as error:
@@ -219,11 +219,11 @@ class Store:
         return Traffic(nodes, node_puts, node_bytes, edge_puts, edge_bytes)
 
     def rulings(self) -> list[bytes]:
-        """What people have ruled, in order."""
+        """The manual constraints, in order."""
         return [bytes(body) for (body,) in self._read("SELECT body FROM ruling ORDER BY number")]
 
     def add_ruling(self, body: bytes) -> None:
-        """Keep one more ruling.
+        """Add a manual constraint.
 
         Raises:
             InvalidValue: there are too many.
@@ -232,7 +232,7 @@ class Store:
         with self._lock, self._database.transaction() as rows:
             count, newest = rows.execute("SELECT count(*), coalesce(max(number), 0) FROM ruling").fetchone()
             if count >= MAX_RULINGS:
-                raise InvalidValue(f"the record of rulings is full: {MAX_RULINGS}")
+                raise InvalidValue(f"the record of manual constraints is full: {MAX_RULINGS}")
             insert(rows, "ruling", (newest + 1, body))
 
     def put_result(self, name: str, value: bytes) -> None:
@@ -246,8 +246,8 @@ class Store:
 
     def result(self, name: str) -> bytes | None:
         """What was kept under this name."""
-        found = self._read("SELECT value FROM result WHERE name = ?", (name,))
-        return bytes(found[0][0]) if found else None
+        rows = self._read("SELECT value FROM result WHERE name = ?", (name,))
+        return bytes(rows[0][0]) if rows else None
 
     def close(self) -> None:
         """Let go of the file. Twice is no error."""
@@ -257,7 +257,7 @@ class Store:
     def _take(
         self, rows: Any, map_id: MapId, entry: Entry, changes: list[Change], refusals: list[Refusal]
     ) -> None:
-        """Keep a change, or keep it aside with the reason."""
+        """Store a change, or store it aside with the reason."""
         reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
         if isinstance(entry.change, str) or reason:
             refusals.append(Refusal(entry.sequence, reason))
@@ -304,8 +304,8 @@ class Store:
 
     def _landmarks(self, node: NodeId) -> int | None:
         query = "SELECT landmarks FROM node WHERE agent = ? AND epoch = ? AND number = ?"
-        found = self._read(query, node)
-        return int(found[0][0]) if found else None
+        rows = self._read(query, node)
+        return int(rows[0][0]) if rows else None
 
     def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
         with self._lock, self._database.guard():

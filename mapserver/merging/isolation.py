@@ -42,32 +42,32 @@ class Isolation:
     @property
     def reasons(self) -> Mapping[MapId, str]:
         """Maps that are set apart, and why."""
-        return {one: self._failures[one].reason for one in sorted(self._apart)}
+        return {map_id: self._failures[map_id].reason for map_id in sorted(self._apart)}
 
-    def __contains__(self, one: MapId) -> bool:
+    def __contains__(self, map_id: MapId) -> bool:
         """Whether a map is set apart."""
-        return one in self._apart
+        return map_id in self._apart
 
-    def add(self, one: MapId, reason: str) -> None:
+    def add(self, map_id: MapId, reason: str) -> None:
         """Set a map apart."""
-        count = self._failures[one].count + 1 if one in self._failures else 1
-        self._failures[one] = _Failure(reason, count, 2 ** (count - 1))
-        self._apart.add(one)
+        count = self._failures[map_id].count + 1 if map_id in self._failures else 1
+        self._failures[map_id] = _Failure(reason, count, 2 ** (count - 1))
+        self._apart.add(map_id)
 
     def changed(self, maps: Iterable[MapId]) -> None:
         """Take in again, of maps that have changed, those that are to be tried again."""
-        for one in self._apart & set(maps):
-            self._failures[one].wait -= 1
-            if self._failures[one].wait <= 0:
-                self._apart.discard(one)
+        for map_id in self._apart & set(maps):
+            self._failures[map_id].wait -= 1
+            if self._failures[map_id].wait <= 0:
+                self._apart.discard(map_id)
 
     def release(self, maps: Iterable[MapId]) -> None:
         """Take these in again at once."""
         self._apart -= set(maps)
 
-    def suspicion(self, one: MapId) -> int:
+    def suspicion(self, map_id: MapId) -> int:
         """How often the merge has failed with a map."""
-        return self._failures[one].count if one in self._failures else 0
+        return self._failures[map_id].count if map_id in self._failures else 0
 
 
 def leave_out(
@@ -90,20 +90,20 @@ def leave_out(
     """
     kept: list[MapId] = []
     left_out: dict[MapId, Exception] = {}
-    found: list[T] = []
+    excluded: list[T] = []
     waiting = [list(maps)]
     while waiting:
         block = waiting.pop()
         try:
-            found = [attempt([*kept, *block])]
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is one map's and goes to whoever asked
+            excluded = [attempt([*kept, *block])]
+        except Exception as error:  # noqa: BLE001 - any error is one map's and is reported for it
             if len(block) > 1:
                 waiting += [block[len(block) // 2 :], block[: len(block) // 2]]
             elif block:
                 left_out[block[0]] = error
         else:
             kept += block
-    return found[0] if found else attempt(kept), left_out
+    return excluded[0] if excluded else attempt(kept), left_out
 
 
 def reason_of(error: Exception) -> str:

@@ -216,14 +216,14 @@ class Merger:
         for pair, link in (links or {}).items():
             self._judge(pair, link)
 
-    def rule(self, rulings: ManualConstraints) -> None:
+    def rule(self, constraints: ManualConstraints) -> None:
         """Heed these rulings of people from now on, and no others."""
-        ruled = {*rulings.in_force} ^ {*self._rulings.in_force}
+        ruled = {*constraints.in_force} ^ {*self._rulings.in_force}
         # A map that is retired harms nobody, and is no longer set apart.
         self._isolation.release(one.retires for one in ruled if one.retires is not None)
-        if self._rulings.retired.keys() - rulings.retired.keys():
+        if self._rulings.retired.keys() - constraints.retired.keys():
             self.alike.forget()
-        self._rulings = rulings
+        self._rulings = constraints
         self._stale |= self._verdicts.at(self.maps.keys())
         self._dirty = True
 
@@ -240,7 +240,7 @@ class Merger:
             use: what is made of a merged map that is new; a map with which that fails is set apart as well.
         """
         if self._dirty:
-            self.look_around()
+            self.search_pairs()
             self._take_over()
             changed = self._pairs.changed()
             self._verify(pair for pair in changed if pair in self._pairs)
@@ -339,7 +339,7 @@ class Merger:
     def _suspicion(self, one: MapId) -> int:
         return self._isolation.suspicion(one) + (one in self._suspects)
 
-    def look_around(self, most: int | None = None) -> None:
+    def search_pairs(self, most: int | None = None) -> None:
         """Look for what is like the nodes that were read, or like so many of them."""
         for node_id in list(islice(self._uncompared, most)):
             del self._uncompared[node_id]

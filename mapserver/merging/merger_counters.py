@@ -13,7 +13,7 @@ class MergerCounters:
         changes: taken in.
         verified: pairs of nodes that were compared.
         recognised: of these, pairs whose landmarks agreed.
-        merges: times the merged map was made anew.
+        merges: number of merges.
     """
 
     changes: int = 0

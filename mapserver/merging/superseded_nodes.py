@@ -1,7 +1,7 @@
 """Succession: superseded nodes leave the place index, so that a new node costs the same on every drive.
 
 A robot's nodes of today stay in it for the time being, superseded or not: while maps are being made, links
-between all of them tell true merges from false ones.
+between all of them distinguish true merges from false ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class SupersededNodes:
         """Begin with nothing superseded.
 
         Args:
-            index: of places that are looked for.
+            index: of places that are searched.
             pairs: that are compared; revived nodes are put into it.
             node_of: gives a node by its id.
         """
@@ -42,20 +42,20 @@ class SupersededNodes:
             before: pairs that it was in, if it was known already.
         """
         found, _s = self._index.overlaps(node, self._node_of), self._index.settings.candidates
-        for other_id in {one for pair in before for one in pair} & self._left_out:
-            other = self._node_of(other_id)
-            if other is not None and other_id != node.id:
-                codes, others = (bounded(one).landmarks.codes for one in (node, other))
-                value = voting.pair_overlap(codes, others, ALIKE)
+        for candidate_id in {node_id for pair in before for node_id in pair} & self._left_out:
+            candidate = self._node_of(candidate_id)
+            if candidate is not None and candidate_id != node.id:
+                codes, candidate_codes = (bounded(node_id).landmarks.codes for node_id in (node, candidate))
+                value = voting.pair_overlap(codes, candidate_codes, ALIKE)
                 if value >= LEAST_OVERLAP:
-                    found[other_id] = value
+                    found[candidate_id] = value
         return found
 
     def put(self, node: Node) -> None:
-        """A node has come, or has been put anew, and into the index."""
+        """A node was added to the index, or written again."""
         self._left_out.discard(node.id)
-        told = node.id.epoch, node.stamp_ns
-        self._newest[node.id.agent] = max(told, self._newest.get(node.id.agent, told))
+        key = node.id.epoch, node.stamp_ns
+        self._newest[node.id.agent] = max(key, self._newest.get(node.id.agent, key))
 
     def drop(self, node_id: NodeId) -> None:
         """A node has gone."""

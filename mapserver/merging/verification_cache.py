@@ -1,7 +1,7 @@
-"""What comparing nodes has found: how alike they look, and the verdicts on pairs of them.
+"""Results of comparing nodes: their overlaps, and the verdicts on pairs.
 
-All of it depends on two nodes alone. So it outlives the process that found it, as long as both nodes are
-just so; which they are is told by prints of all that a comparison looks at.
+All of it depends on two nodes alone. So it outlives its process, as long as both nodes are unchanged; that is
+tested by fingerprints of all that a comparison uses.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class VerificationCache:
 
 
 class CachedVerifications:
-    """Findings of another process, as far as the nodes are still what they were."""
+    """Results of another process, for nodes that are unchanged."""
 
     def __init__(self, findings: VerificationCache) -> None:
         """Take them."""
@@ -50,19 +50,19 @@ class CachedVerifications:
 
     def knows(self, node: Node) -> bool:
         """Whether this very node was compared."""
-        known = self._checked.get(node.id)
-        if known is None or known[0] is not node:
+        entry = self._checked.get(node.id)
+        if entry is None or entry[0] is not node:
             before = self._findings.prints.get(node.id)
-            known = self._checked[node.id] = node, before is not None and before == fingerprint_of(node)
-        return known[1]
+            entry = self._checked[node.id] = node, before is not None and before == fingerprint_of(node)
+        return entry[1]
 
     def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
         """Of a node that it knows, with others that it knows."""
         out = {}
-        for other_id, value in self._overlaps.get(node.id, {}).items():
-            other = node_of(other_id)
-            if other is not None and self.knows(other):
-                out[other_id] = value
+        for candidate_id, value in self._overlaps.get(node.id, {}).items():
+            candidate = node_of(candidate_id)
+            if candidate is not None and self.knows(candidate):
+                out[candidate_id] = value
         return out
 
     def verdicts(self, node_of: Callable[[NodeId], Node | None]) -> Iterable[tuple[Pair, Verdict]]:
@@ -74,9 +74,9 @@ class CachedVerifications:
 
 
 def fingerprint_of(node: Node) -> bytes:
-    """A number by which all that a comparison looks at is known again."""
-    seen = node.landmarks
+    """A checksum of all that a comparison uses."""
+    landmarks = node.landmarks
     digest = hashlib.blake2b(f"{node.id} {node.camera}".encode(), digest_size=PRINT_BYTES)
-    for column in (seen.pixels, seen.codes, seen.depths, seen.depth_sigmas):
+    for column in (landmarks.pixels, landmarks.codes, landmarks.depths, landmarks.depth_sigmas):
         digest.update(column.tobytes())
     return digest.digest()

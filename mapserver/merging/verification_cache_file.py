@@ -48,7 +48,7 @@ def load(path: Path, made_by: str) -> VerificationCache:
 
     Args:
         path: of the file.
-        made_by: as it was saved; what others have found is not believed.
+        made_by: as it was saved; results of other versions are not used.
 
     Raises:
         InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
@@ -75,10 +75,10 @@ def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
     yield _text(agents)
     yield np.array([(number[n.agent], n.epoch, n.number) for n in nodes], np.int64).reshape(-1, 3)
     yield np.frombuffer(b"".join(findings.prints[n] for n in nodes), np.uint8).reshape(-1, PRINT_BYTES)
-    overlaps = _known(findings.overlaps.items(), row)
+    overlaps = _with_rows(findings.overlaps.items(), row)
     yield _rows([pair for pair, _ in overlaps], row)
     yield np.array([value for _, value in overlaps], np.float64)
-    verdicts = _known(findings.verdicts.items(), row)
+    verdicts = _with_rows(findings.verdicts.items(), row)
     refused = [(pair, v.reason) for pair, v in verdicts if isinstance(v, RefusedLink)]
     links = [(pair, v) for pair, v in verdicts if isinstance(v, Link)]
     reasons = {reason: k for k, reason in enumerate(sorted({reason for _, reason in refused}))}
@@ -100,7 +100,7 @@ def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
 def _read(parts: Iterator[NDArray[Any]]) -> VerificationCache:
     agents = _words(next(parts))
     nodes = [NodeId(agents[a], epoch, number) for a, epoch, number in next(parts).tolist()]
-    prints = {node: one.tobytes() for node, one in zip(nodes, next(parts), strict=True)}
+    prints = {node: checksum.tobytes() for node, checksum in zip(nodes, next(parts), strict=True)}
     overlaps = dict(zip(_pairs(next(parts), nodes), next(parts).tolist(), strict=True))
     reasons = _words(next(parts))
     refused = zip(_pairs(next(parts), nodes), next(parts).tolist(), strict=True)
@@ -113,15 +113,15 @@ def _read(parts: Iterator[NDArray[Any]]) -> VerificationCache:
     for k, (pair, (i, j), (m, n)) in enumerate(
         zip(pairs, pairwise(shared_at), pairwise(evidence_at), strict=True)
     ):
-        told = dict(zip(kinds[kind[k]], evidence[m:n], strict=True))
+        numbers = dict(zip(kinds[kind[k]], evidence[m:n], strict=True))
         pose = PoseGaussian(Pose2(*means[k]), covariances[k])
-        verdicts[pair] = Link(*pair, pose, shared[i:j], told)
+        verdicts[pair] = Link(*pair, pose, shared[i:j], numbers)
     return VerificationCache(prints, overlaps, verdicts)
 
 
-def _known(found: Iterable[tuple[Pair, Any]], row: dict[NodeId, int]) -> list[tuple[Pair, Any]]:
+def _with_rows(results: Iterable[tuple[Pair, Any]], row: dict[NodeId, int]) -> list[tuple[Pair, Any]]:
     """Of pairs of which both nodes are among those that are kept, in the order of ids."""
-    return sorted(((p, v) for p, v in found if p[0] in row and p[1] in row), key=lambda item: item[0])
+    return sorted(((p, v) for p, v in results if p[0] in row and p[1] in row), key=lambda item: item[0])
 
 
 def _rows(pairs: Sequence[Pair], row: dict[NodeId, int]) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""Keeps what comparing nodes has found on the disk beside the store."""
+"""Keeps the results of comparing nodes on the disk next to the store."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class VerificationCacheKeeper:
         """Take note of where they lie.
 
         Args:
-            path: of the store's file; they lie beside it.
-            fresh: the store is new: nobody need be told that nothing is known of its nodes.
-            clock: tells the time, s.
+            path: of the store's file; the cache is next to it.
+            fresh: the store is new: a missing cache is not reported.
+            clock: the time, s.
         """
         self._clock = clock
         self._path = path.with_name(path.name + SUFFIX)
@@ -41,13 +41,13 @@ class VerificationCacheKeeper:
         self._rest_until = 0.0
 
     def restore(self, merger: Merger) -> None:
-        """Let a merger that begins have what is known, if the file is there and sound."""
+        """Load the results for a new merger, if the file is there and valid."""
         began = self._clock()
         try:
             findings = load(self._path, _made_by(merger))
         except InvalidFile as error:
             if self._path.exists() or not self._fresh:
-                log.info("nodes are compared anew: %s", error)
+                log.info("nodes are compared again: %s", error)
             findings = VerificationCache()
         else:
             log.info(
@@ -62,12 +62,12 @@ class VerificationCacheKeeper:
 
         Args:
             merger: has compared nodes.
-            last: nobody asks again: whatever is new is worth it.
+            last: there is no later call: save anything new.
         """
         if merger.recollecting:
             return  # The file knows more than this process yet.
         now, least = merger.compared, 0.0 if last else WORTHWHILE
-        new = max(abs(one - before) for one, before in zip(now, self._saved, strict=True))
+        new = max(abs(count - before) for count, before in zip(now, self._saved, strict=True))
         if not new or new < least * max(now) or (self._clock() < self._rest_until and not last):
             return
         began = self._clock()

@@ -35,7 +35,7 @@ from mapweave.mapserver.relocalization.verdict import (
 )
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import match
-from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
 
 RELOCALIZATION_CANDIDATES = 16
@@ -187,7 +187,7 @@ class Relocalizer:
         """A sighting with the pose that the pixels give at the noise that they have."""
         if (node := self._node_of(one.node)) is None:
             return one
-        closer = look_closer(node, view, one.recognition, self._settings.recognition.pose)
+        closer = refine_pose(node, view, one.recognition, self._settings.recognition.pose)
         return replace(one, recognition=replace(one.recognition, node_from_robot=closer))
 
     def doubled(self, view: View, best: NodeMatch, ranked: Sequence[tuple[NodeId, float]]) -> list[NodeMatch]:

@@ -14,7 +14,7 @@ from mapweave.commands.network import (
     network_of,
     settings_of,
     stop_on_signals,
-    tell_if_alone,
+    warn_without_router,
 )
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     bus, keys = connect(network)
     body = bus
     try:
-        tell_if_alone(bus, name)
+        warn_without_router(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
         robot, synchronization = _body(arguments, body, network.fleet, name)

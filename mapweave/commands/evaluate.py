@@ -23,10 +23,10 @@ def add_to(commands: Any) -> None:
         help="map from one pass of a recording, ask from the others",
         description="Map from one pass of a recording, ask where each image of the others was taken, and "
         "print recall and error. A drive with odometry.csv and splits.toml: the first robot maps as if "
-        "carried along, the others ask; truth.csv tells what is right. Photographs with lap_truth.csv: the "
+        "carried along, the others ask; truth.csv has the true poses. Photographs with lap_truth.csv: the "
         "images that are no query are the map, by appearance alone.",
     )
-    relocalize.add_argument("folder", type=Path, help="recording: images/ and what it has besides")
+    relocalize.add_argument("folder", type=Path, help="recording: images/ and its other files")
     relocalize.add_argument(
         "--camera", type=Path, metavar="FILE", help="camera.toml for photographs (default: the folder's)"
     )
@@ -44,7 +44,7 @@ def add_to(commands: Any) -> None:
         help="cut a recording into robots, map, and merge",
         description="Cut a recording into robots, let each map its piece as if carried along, merge the maps "
         "as the server does, and print links, components and error. Without --robots it is cut as its "
-        "splits.toml says. truth.csv tells what is right; without it nothing is scored.",
+        "splits.toml defines. truth.csv has the true poses; without it nothing is scored.",
     )
     merge.add_argument(
         "folder", type=Path, help="recording: images/, camera.toml, odometry.csv; times.txt, truth.csv"
@@ -87,11 +87,13 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(report))
         return 0
     flat = {name: value for name, value in report.items() if not isinstance(value, dict)}
-    others = {name: value for name, value in report.items() if isinstance(value, dict)}
-    table = Table("", str(report["verified"]), *others, title=f"{arguments.folder}")
+    selections = {name: value for name, value in report.items() if isinstance(value, dict)}
+    table = Table("", str(report["verified"]), *selections, title=f"{arguments.folder}")
     for name, value in flat.items():
         if name != "verified":
-            table.add_row(name, _shown(value), *(_shown(other.get(name, "")) for other in others.values()))
+            table.add_row(
+                name, _shown(value), *(_shown(selection.get(name, "")) for selection in selections.values())
+            )
     Console(file=sys.stdout).print(table)
     return 0
 
@@ -125,7 +127,7 @@ def run_merge(arguments: argparse.Namespace) -> int:
     table = Table("", "", title=f"{arguments.folder}")
     for name, value in report.items():
         inner = value.items() if isinstance(value, dict) else ()
-        words = ", ".join(f"{key} {_shown(one)}" for key, one in inner)
+        words = ", ".join(f"{key} {_shown(number)}" for key, number in inner)
         table.add_row(name, words or _shown(value))
     Console(file=sys.stdout).print(table)
     return 0

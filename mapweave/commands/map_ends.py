@@ -27,7 +27,7 @@ def ends_of(words: list[str]) -> Ends:
 
 
 def _patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply]:
-    """Ask, and ask again those who are busy when they say, until the time is over."""
+    """Ask, and ask busy servers again at their time, until the patience is over."""
     end = time.monotonic() + timeout
     while True:
         replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
@@ -43,10 +43,10 @@ def map_of(word: str) -> MapId:
     Raises:
         InvalidValue: it is none.
     """
-    found = read_end(word)
-    if isinstance(found, NodeId):
-        raise InvalidValue(f"{word} is a node: give its map, {found.map}")
-    return found
+    end = read_end(word)
+    if isinstance(end, NodeId):
+        raise InvalidValue(f"{word} is a node: give its map, {end.map}")
+    return end
 
 
 def node_of(word: str) -> NodeId:
@@ -55,10 +55,10 @@ def node_of(word: str) -> NodeId:
     Raises:
         InvalidValue: it is none.
     """
-    found = read_end(word)
-    if isinstance(found, MapId):
+    end = read_end(word)
+    if isinstance(end, MapId):
         raise InvalidValue(f"{word} is a map: give one of its nodes, {word}.1 for example")
-    return found
+    return end
 
 
 def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: bytes) -> list[Reply]:
@@ -73,7 +73,7 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
         Answers, at least one; none of them an error.
 
     Raises:
-        NotConnected: nobody is there, or the servers refuse.
+        NotConnected: no server answers, or all refuse.
     """
     network = network_of(arguments, settings_of(arguments))
     bus, keys = connect(network)

@@ -33,7 +33,7 @@ def add_to(actions: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write, and say what and what not."""
+    """Write, and print what was written and what was left out."""
     from mapweave.formats.export import FORMATS as WRITERS
     from mapweave.formats.map_part import MapPart
     from mapweave.mapserver.map_files import merged_of

@@ -27,28 +27,32 @@ def add_to(actions: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write them, and say which; 1 if something of a map could not be read."""
+    """Write them, and print which; 1 if a part of a map could not be read."""
     from mapweave.map_extraction import extract_maps
 
     maps, lost = extract_maps(arguments.source, arguments.out)
     if arguments.json:
         rows = [
             {
-                "map": str(one.map), "path": str(one.path) if one.path else None, "nodes": one.nodes,
-                "edges": one.edges, "complaint": one.complaint,
+                "map": str(extracted.map), "path": str(extracted.path) if extracted.path else None,
+                "nodes": extracted.nodes, "edges": extracted.edges, "complaint": extracted.complaint,
             }
-            for one in maps
+            for extracted in maps
         ]  # fmt: skip
         print(json.dumps({"maps": rows, "lost": lost}))
     else:
-        for one in maps:
-            content = f"{one.nodes} nodes, {one.edges} edges" if one.path else "empty, not written"
-            print(f"{one.path or one.map}: {content}")
+        for extracted in maps:
+            content = (
+                f"{extracted.nodes} nodes, {extracted.edges} edges"
+                if extracted.path
+                else "empty, not written"
+            )
+            print(f"{extracted.path or extracted.map}: {content}")
         if not maps:
             print(f"{arguments.source}: holds no map")
-    for one in maps:
-        if one.complaint:
-            print(f"mapweave: {one.complaint}", file=sys.stderr)
+    for extracted in maps:
+        if extracted.complaint:
+            print(f"mapweave: {extracted.complaint}", file=sys.stderr)
     if lost:
         print(f"mapweave: {lost}", file=sys.stderr)
-    return int(bool(lost) or any(one.complaint for one in maps))
+    return int(bool(lost) or any(extracted.complaint for extracted in maps))

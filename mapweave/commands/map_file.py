@@ -1,4 +1,4 @@
-"""`mapweave map ACTION`: look into maps, ask why they are one, merge and export them."""
+"""`mapweave map ACTION`: show, explain, merge and export maps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mapweave.commands import (
 def add_to(commands: Any) -> None:
     """Declare the command and its actions."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        "map", help="look into maps, ask why they are one, merge, export, extract"
+        "map", help="show, explain, merge, export and extract maps"
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (

@@ -26,7 +26,7 @@ def add_to(actions: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, optimise, write, say how much better it is."""
+    """Read, optimise, write, print the improvement."""
     from dataclasses import replace
 
     from mapweave.formats.g2o import read_g2o, write_g2o

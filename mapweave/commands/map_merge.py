@@ -21,20 +21,20 @@ def add_to(actions: Any) -> None:
         "merge",
         help="merge map files without a server",
         description="Merge map files as the map server does: robots' own maps, or merged ones, which are "
-        "taken apart and merged anew. Of an older and a newer file of one map the newer counts. What people "
-        "have ruled in any of them holds. The result does not depend on the order of the files.",
+        "taken apart and merged again. Of an older and a newer file of one map the newer counts. Manual "
+        "constraints in any of them hold. The result does not depend on the order of the files.",
     )
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="a .mapweave file")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the merged map's file")
     parser.add_argument("--json", action="store_true", help="print the outcome as one JSON object")
     parser.add_argument(
-        "--settings", type=Path, metavar="FILE", help="TOML; [merge] says which links are believed"
+        "--settings", type=Path, metavar="FILE", help="TOML; [merge] says which links are accepted"
     )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Merge, write, say what has become of it."""
+    """Merge, write, print the outcome."""
     from mapweave.commands.network import settings_of
     from mapweave.mapserver.map_files import map_file_of
     from mapweave.merge.explanation.component_changes import joinings
@@ -50,12 +50,12 @@ def run(arguments: argparse.Namespace) -> int:
     merged = merged_with_progress(parts.maps, parts.rulings, settings)
     write_map_file(arguments.out, map_file_of(merged, parts.history))
     joined = joinings((), merged)
-    apart = [one.reason for one in explain_fleet(merged, 20) if not one.joined]
+    apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
     if arguments.json:
         outcome = {
             "out": str(arguments.out),
             "nodes": len(merged.poses),
-            "maps": [str(one) for one in merged.maps],
+            "maps": [str(explanation) for explanation in merged.maps],
             "components": len(merged.components),
             "links": sum(not link.within for link in merged.links),
             "loops": sum(link.within for link in merged.links),
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def merged_with_progress(
-    maps: dict[MapId, HybridMap], rulings: ManualConstraints, settings: MergeSettings | None = None
+    maps: dict[MapId, HybridMap], constraints: ManualConstraints, settings: MergeSettings | None = None
 ) -> MergedMap:
     """Merge, with a bar on stderr for people."""
     from rich.console import Console
@@ -85,8 +85,8 @@ def merged_with_progress(
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("reading nodes")
 
-        def told(done: int, of: int) -> None:
+        def report(done: int, of: int) -> None:
             words = "reading nodes" if done < of else "comparing and joining"
             bar.update(task, description=words, completed=done, total=of if done < of else None)
 
-        return merge_parts(maps, rulings, told, settings)
+        return merge_parts(maps, constraints, report, settings)

@@ -18,7 +18,7 @@ def add_to(actions: Any) -> None:
         help="make a map of photographs of a stretch",
         description="Make a map of photographs that were taken one after the other along a stretch, by a "
         "calibrated camera held about level. Each becomes a node that robots can be sent to. With --send the "
-        "map is handed over to a running server, through a journal beside OUT as a robot does.",
+        "map is handed over to a running server, through a journal next to OUT as a robot does.",
     )
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="images, in the order of their numbers")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="the .mapweave file")
@@ -39,7 +39,8 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, write, hand over."""
-    from mapweave.agent.drivers.replay import images_in, read_camera
+    from mapweave.agent.recordings.camera_file import read_camera
+    from mapweave.agent.recordings.image_folder import images_in
     from mapweave.hybridmap.change import NodePut
     from mapweave.hybridmap.errors import NotConnected
     from mapweave.hybridmap.node import MapId, check_name

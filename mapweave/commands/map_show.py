@@ -14,10 +14,10 @@ def add_to(actions: Any) -> None:
     show: argparse.ArgumentParser = actions.add_parser(
         "show",
         help="summary and picture of a map file",
-        description="Check a map file, print a summary and draw a picture of it beside it.",
+        description="Check a map file, print a summary and draw a picture of it next to it.",
     )
     show.add_argument("file", type=Path, help="a .mapweave file")
-    show.add_argument("--out", type=Path, metavar="PNG", help="picture (default: beside the file, as .png)")
+    show.add_argument("--out", type=Path, metavar="PNG", help="picture (default: next to the file, as .png)")
     show.add_argument(
         "--component", type=int, default=0, metavar="N",
         help="which part that is one is drawn (default: 0, the largest)",
@@ -59,11 +59,11 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         sizes = {k: len(nodes) for k, nodes in enumerate(hybrid.components())}
         poses = {n.id: n.map_from_robot.mean for n in hybrid.nodes.values()}
-        # A robot's own map has one frame, whatever hangs together in it.
+        # A robot's own map has one frame, even if it is not connected.
         arguments.component = 0
     if arguments.component not in sizes and sizes:
-        there = "one, 0" if len(sizes) == 1 else f"0 to {len(sizes) - 1}"
-        raise InvalidValue(f"the map has no component {arguments.component}; it has {there}")
+        choices = "one, 0" if len(sizes) == 1 else f"0 to {len(sizes) - 1}"
+        raise InvalidValue(f"the map has no component {arguments.component}; it has {choices}")
     landmarks = [len(n.landmarks) for n in hybrid.nodes.values()]
     kinds: dict[str, int] = {}
     for edge in hybrid.edges.values():
@@ -85,12 +85,12 @@ def run(arguments: argparse.Namespace) -> int:
     }
     if not arguments.no_picture and poses:
         out = arguments.out or arguments.file.with_suffix(".png")
-        seen = [
+        components = [
             poses[n.id].apply(n.points_in_robot[n.landmarks.has_depth, :2])
             for n in hybrid.nodes.values()
             if n.id in poses
         ]
-        points = np.concatenate(seen) if seen else np.zeros((0, 2))
+        points = np.concatenate(components) if components else np.zeros((0, 2))
         title = content.title
         if len(poses) < len(hybrid.nodes):
             which = f"component {arguments.component}" if len(sizes) > 1 else "what is in use"

@@ -15,7 +15,7 @@ def add_to(actions: Any) -> None:
         help="undo a link, or all links between two maps",
         description="Undo the link between two nodes (r0.1.17 r1.1.5), or all links between two maps "
         "(r0.1 r1.1), those to come included. It stays undone, also when robots map on and the server starts "
-        "again, until it is taken back with --undo. Who did so, when and why is kept and told by "
+        "again, until it is withdrawn with --undo. Who did so, when and why is kept and shown by "
         "`mapweave map explain`.",
     )
     parser.add_argument("ends", nargs="+", metavar="NODE|MAP", help="the link: two nodes, or two maps")
@@ -24,7 +24,7 @@ def add_to(actions: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Rule, and say what has come of it."""
+    """Set the constraint, and print its effect."""
     from mapweave.commands.map_ends import ends_of
     from mapweave.commands.map_explain import explained_maps
     from mapweave.hybridmap.errors import InvalidValue
@@ -36,6 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidValue(f"{ends[0]} twice: give two different nodes or two different maps")
     rule(arguments, ends)
     if first != second:
-        for one in explained_maps(arguments, (first, second)):
-            print(one.reason)
+        for explanation in explained_maps(arguments, (first, second)):
+            print(explanation.reason)
     return 0

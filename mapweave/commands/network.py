@@ -61,15 +61,15 @@ def connect(network: NetworkSettings) -> tuple[ZenohBus, Keys]:
     return ZenohBus(BusSettings(mode="client", endpoints=network.endpoints)), Keys(network.fleet)
 
 
-def tell_if_alone(bus: ZenohBus, who: str) -> None:
-    """Say so on stderr if there is no router to be reached soon; nobody waits for that."""
+def warn_without_router(bus: ZenohBus, name: str) -> None:
+    """Warn on stderr if no router is reached soon; does not wait."""
     began = time.monotonic()
 
     def look() -> None:
-        # Who leaves before the time is over has not looked for long enough.
+        # A process that ends earlier has not waited long enough to know.
         if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
             advice = "start `mapweave server` or give --connect"
-            print(f"{who} finds no router: {advice}; it goes on looking", file=sys.stderr, flush=True)
+            print(f"{name} finds no router: {advice}; it goes on looking", file=sys.stderr, flush=True)
 
     threading.Thread(target=look, name="router", daemon=True).start()
 

@@ -45,7 +45,7 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapweave.agent.drivers.replay import read_camera
+    from mapweave.agent.recordings.camera_file import read_camera
     from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.errors import DeviceError
     from mapweave.hybridmap.query import Certainty

@@ -11,7 +11,7 @@ from typing import Any
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
 LARGE = 20_000_000
-"""Bytes of a store that takes long enough to read to say so."""
+"""Bytes of a store whose reading is announced, since it takes long."""
 
 
 def add_to(commands: Any) -> None:
@@ -19,7 +19,7 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "server",
         help="run the map server and the router",
-        description="Keep every robot's map, merge them, tell lost robots where they are and give routes. "
+        description="Keep every robot's map, merge them, localize lost robots and give routes. "
         "The Zenoh router that robots connect to runs inside. With --http it also tells people where a "
         "photograph was taken, and why maps are one or are not: POST /relocalize, GET /explain, GET /status, "
         "and pages for phones at / and /why.",
@@ -31,7 +31,7 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument(
         "--http", metavar="[HOST:]PORT",
-        help="answer people over HTTP as well, on this machine alone unless HOST says otherwise, "
+        help="answer people over HTTP as well, on this machine alone unless HOST is given, "
         "for example 8080 or 0.0.0.0:8080 (default: off)",
     )  # fmt: skip
     add_network(parser, listens=True)
@@ -39,7 +39,7 @@ def add_to(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until told to stop."""
+    """Serve until stopped."""
     from mapweave.hybridmap.node import check_name
     from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
     from mapweave.mapserver.server import MapServer, ServerSettings
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
-    # Who looks in the morning wants to know when two maps came apart.
+    # Lines have dates, so that a log shows when two maps came apart.
     logging.basicConfig(format="%(asctime)s %(message)s", datefmt="%Y-%m-%d %H:%M:%S")
     logging.getLogger("mapweave.mapserver").setLevel(logging.INFO)
     settings = settings_of(arguments)
@@ -76,12 +76,12 @@ def run(arguments: argparse.Namespace) -> int:
             if address is not None:
                 stack.enter_context(Web(address, server))
                 print(f"for people: http://{':'.join(map(str, address))}/", flush=True)
-            said = ""
+            last_line = ""
             while not stop.wait(1.0):
                 now = server.summary()
-                if now != said:
+                if now != last_line:
                     print(now, flush=True)
-                    said = now
+                    last_line = now
     finally:
         bus.close()
     return 0

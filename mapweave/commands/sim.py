@@ -8,7 +8,13 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals, tell_if_alone
+from mapweave.commands.network import (
+    add_network,
+    network_of,
+    settings_of,
+    stop_on_signals,
+    warn_without_router,
+)
 
 
 def add_to(commands: Any) -> None:
@@ -202,7 +208,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
         bus = ZenohBus(BusSettings(mode="router", listen=(arguments.listen,)))
     else:
         bus = ZenohBus(BusSettings(mode="client", endpoints=network.endpoints))
-        tell_if_alone(bus, "the simulator")
+        warn_without_router(bus, "the simulator")
     try:
         run_sim(bus, network.fleet, scenario, seed, stop, arguments.held)
     finally:

@@ -15,7 +15,7 @@ class Relocalization:
     """How the lost robot was found.
 
     Attributes:
-        found: whether anybody could tell where it is.
+        found: whether it was localized.
         error_m: position error in the frame of the node that was named.
         error_deg: heading error likewise.
         seconds: simulated, from the kidnapping to the answer.
@@ -34,8 +34,8 @@ class Goal:
     """How the lost robot arrived.
 
     Attributes:
-        reached: whether it says that it is parked, and truth agrees to 5 cm and 3 degrees.
-        error_m: distance between where it stands and where the goal's image was taken.
+        reached: whether it reports that it is parked, and the truth agrees to 5 cm and 3 degrees.
+        error_m: distance from the pose where the goal's image was taken.
         error_deg: heading error likewise.
         mapped_by: whose node the goal is.
         edges: of the route.
@@ -120,14 +120,23 @@ class Report:
 
     def lines(self) -> list[tuple[str, str]]:
         """Name and text of each line of the summary."""
-        found, goal = self.relocalization, self.goal
+        relocalization, goal = self.relocalization, self.goal
         where = f"{self.lost_robot} was put down in {self.put_down_in}: " if self.lost_robot else ""
         lines = [
             ("nodes", ", ".join(f"{name} {count}" for name, count in self.nodes.items())),
             ("bytes a node", f"{self.bytes_per_node:.0f} on the wire, edges included"),
             ("merged map", f"{self.components} component(s), {self.links} links, {self.false_links} false"),
             ("merged ATE", _metres(self.merged_ate_m)),
-            ("relocalization", where + _outcome(found.found, found.error_m, found.error_deg, found.seconds)),
+            (
+                "relocalization",
+                where
+                + _outcome(
+                    relocalization.found,
+                    relocalization.error_m,
+                    relocalization.error_deg,
+                    relocalization.seconds,
+                ),
+            ),
             (
                 "goal",
                 f"node {goal.node} over {goal.edges} edges: "

@@ -16,7 +16,7 @@ def run_demo(options: DemoOptions) -> Report:
     """Run everything; leave report, picture, film and maps in the output folder.
 
     Returns:
-        The report, also when the robot did not arrive: `notes` says what was missed.
+        The report, also when the robot did not arrive: `notes` lists what was missed.
 
     Raises:
         MapweaveError: something could not be started, or ended.

@@ -49,7 +49,7 @@ class Outline:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A drive of a robot that was put down somewhere, to draw over a map.
+    """A drive of a robot, to draw over a map.
 
     Attributes:
         positions: (N, 2) m.
@@ -80,7 +80,7 @@ class MapPicture:
         drives: of lost robots.
         landmarks: (N, 2) m, points that nodes see.
         starts: where each robot began.
-        false: links that are known to be false; they stand out.
+        false: links that are known to be false; they are highlighted.
     """
 
     title: str
@@ -106,7 +106,7 @@ def draw_map(picture: MapPicture, path: Path) -> None:
         picture: what to draw.
         path: where; its folder is made if need be.
     """
-    # Matplotlib takes half a second to import and is an extra: only who draws pays for it.
+    # Matplotlib takes half a second to import and is an extra: so it is imported here.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -127,7 +127,7 @@ def draw_map(picture: MapPicture, path: Path) -> None:
     axes.set_ylabel("y, m")
     axes.set_title(picture.title)
     if axes.get_legend_handles_labels()[0]:
-        # Below the plan, wherever that ends: the layout makes room for what the figure owns.
+        # Below the plan, wherever that ends: the layout makes room for it.
         figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     image = io.BytesIO()

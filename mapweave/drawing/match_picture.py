@@ -1,4 +1,4 @@
-"""A picture of a relocalization: what the node knows beside the image that was asked about.
+"""A picture of a relocalization: the node's landmarks next to the query image.
 
 A node keeps no image, only landmarks. They are drawn where its camera saw them, coloured by depth, and joined
 to the features of the image that match them: green where the pose that was answered puts them within a few
@@ -76,7 +76,7 @@ def draw_matches(
     scale = max(LEAST_HEIGHT / min(image.shape[0], node.camera.height), 1.0)
     size = round(scale * node.camera.width), round(scale * node.camera.height)
     photo = cv2.resize(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), None, fx=scale, fy=scale)
-    # Wide images stand one above the other.
+    # Wide images are stacked.
     apart = np.array([0, size[1] + BAND] if size[0] > WIDE * size[1] else [size[0] + GAP, 0])
     below = np.array([0, BAND])
     corner = apart + below
@@ -84,17 +84,17 @@ def draw_matches(
     picture = np.full((ends[1], ends[0], 3), PAPER, np.uint8)
     picture[corner[1] : corner[1] + photo.shape[0], corner[0] : corner[0] + photo.shape[1]] = photo
     cv2.rectangle(picture, (0, BAND), (size[0] - 1, BAND + size[1] - 1), CROSS, 1)
-    known = scale * (node.landmarks.pixels + 0.5) + below
-    seen = scale * (lens.distort(view.pixels) + 0.5) + corner
+    node_pixels = scale * (node.landmarks.pixels + 0.5) + below
+    view_pixels = scale * (lens.distort(view.pixels) + 0.5) + corner
     inside = view.camera.contains(overlay.predicted)
     for x, y in scale * (lens.distort(overlay.predicted[inside]) + 0.5) + corner:
         cv2.drawMarker(picture, _at(x, y), CROSS, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
     for good in (False, True):
         for a, b in overlay.pairs[overlay.agreeing == good]:
             colour = GREEN if good else RED
-            cv2.line(picture, _at(*known[a]), _at(*seen[b]), colour, 1, cv2.LINE_AA)
-            cv2.circle(picture, _at(*seen[b]), 4, colour, 1, cv2.LINE_AA)
-    for (x, y), colour in zip(known, _by_depth(node.landmarks.depths), strict=True):
+            cv2.line(picture, _at(*node_pixels[a]), _at(*view_pixels[b]), colour, 1, cv2.LINE_AA)
+            cv2.circle(picture, _at(*view_pixels[b]), 4, colour, 1, cv2.LINE_AA)
+    for (x, y), colour in zip(node_pixels, _by_depth(node.landmarks.depths), strict=True):
         cv2.circle(picture, _at(x, y), 4, colour, -1, cv2.LINE_AA)
     agreeing, matched = int(overlay.agreeing.sum()), len(overlay.pairs)
     _write(picture, (0, 0), f"node {node.id}: {len(node.landmarks)} landmarks, near yellow, far violet")
@@ -108,13 +108,13 @@ def draw_matches(
 
 def _by_depth(depths: NDArray[np.float32]) -> list[tuple[int, int, int]]:
     """Colours, by the logarithm of depth; grey where it is unknown."""
-    known = np.isfinite(depths)
+    has_depth = np.isfinite(depths)
     colours = np.full((len(depths), 3), 150, np.uint8)
-    if known.any():
-        logs = np.log(depths[known])
+    if has_depth.any():
+        logs = np.log(depths[has_depth])
         share = (logs - logs.min()) / max(float(np.ptp(logs)), 1e-6)
         levels = np.rint(255.0 * (1.0 - 0.75 * share)).astype(np.uint8)
-        colours[known] = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_PLASMA)[:, 0]
+        colours[has_depth] = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_PLASMA)[:, 0]
     return [(int(b), int(g), int(r)) for b, g, r in colours]
 
 

@@ -29,7 +29,7 @@ from mapweave.vision.sift import Sift
 REACH = 1.5
 """A place counts as mapped if the mapping robot has been this near to it, m,"""
 TURN = math.radians(20.0)
-"""and looked into that direction, within this, rad."""
+"""and had that heading, within this, rad."""
 NEAR = (LEVELS[-1][0], math.degrees(TURN))
 """A node is the right place if it is that near, m and degrees."""
 
@@ -107,9 +107,9 @@ class DriveMap:
             assert observation is not None, "the recording ends the loop"
             if (pose := truth.at(observation.stamp_ns)) is not None:
                 self.covered.append(pose)
-            for body in pipeline.step(observation, ()).changes:
+            for change in pipeline.step(observation, ()).changes:
                 sequence += 1
-                merger.on_change(Change(map_id, sequence, observation.stamp_ns, body))
+                merger.on_change(Change(map_id, sequence, observation.stamp_ns, change))
         merged = merger.merged()
         self.nodes = len(merged.poses)
         self._truth = truth
@@ -136,7 +136,7 @@ class DriveMap:
                 best = answer.candidates[0]
                 place = str(best.node)
                 error_m, error_deg = self._error(best.node, Pose2(), true)
-            known = math.isfinite(error_m)
+            has_truth = math.isfinite(error_m)
             coarse = (
                 LEVELS[-1] if answer.certainty is Certainty.FOUND else (LEVELS[-1][0], math.degrees(TURN))
             )
@@ -145,7 +145,7 @@ class DriveMap:
                 expected=None if true is None else self._covers(true),
                 certainty=answer.certainty,
                 place=place,
-                right=error_m <= coarse[0] and error_deg <= coarse[1] if known else None,
+                right=error_m <= coarse[0] and error_deg <= coarse[1] if has_truth else None,
                 error_m=error_m,
                 error_deg=error_deg,
                 extract_ms=1e3 * (extracted - began),
@@ -164,5 +164,5 @@ class DriveMap:
         at_node = None if node is None else self._truth.at(node.stamp_ns)
         if true is None or at_node is None:
             return math.nan, math.nan
-        told = at_node @ node_from_robot
-        return told.distance(true), math.degrees(abs(wrap_angle(told.heading - true.heading)))
+        answered = at_node @ node_from_robot
+        return answered.distance(true), math.degrees(abs(wrap_angle(answered.heading - true.heading)))

@@ -21,7 +21,7 @@ FALSE_LINK = 0.5
 FALSE_LINK_TURN = math.radians(15.0)
 """rad; likewise."""
 SAME_PLACE = 1.0
-"""m; images that were taken closer to each other show the same place, if they look the same way."""
+"""m; images that were taken closer to each other show the same place, if their headings agree."""
 SAME_PLACE_TURN = math.radians(30.0)
 """rad; likewise: half of what an ordinary camera sees."""
 
@@ -107,7 +107,7 @@ def link_recall(
     """The share of the shared places that are linked.
 
     Two nodes show *the same place* if their images were truly taken within 1 m and 30 degrees of each other
-    and no wall stands between the two positions. A node has a *chance* for each other map that holds a node
+    and no wall is between the two positions. A node has a *chance* for each other map that holds a node
     of the same place. The chance is *taken* if a true link (see `is_false`) joins that other map to the node
     itself or to a node of its own map that shows the same place. Recall is the share of the chances that are
     taken. So a place that two maps share needs one link, not one for each pair of images, and neither a link
@@ -131,13 +131,13 @@ def link_recall(
             linked.setdefault(link.a, set()).add(link.b.map)
             linked.setdefault(link.b, set()).add(link.a.map)
     chances = taken = 0
-    for here, members in nodes.items():
-        neighbours = same_place(poses[here], poses[here], walls)
-        for there in nodes:
-            if there == here:
+    for map_id, members in nodes.items():
+        neighbours = same_place(poses[map_id], poses[map_id], walls)
+        for other_id in nodes:
+            if other_id == map_id:
                 continue
-            has_chance = same_place(poses[here], poses[there], walls).any(axis=1)
-            has_link = np.array([there in linked.get(n, ()) for n in members])
+            has_chance = same_place(poses[map_id], poses[other_id], walls).any(axis=1)
+            has_link = np.array([other_id in linked.get(n, ()) for n in members])
             chances += int(has_chance.sum())
             taken += int((has_chance & (neighbours & has_link).any(axis=1)).sum())
     return taken / chances if chances else None
@@ -154,9 +154,9 @@ def same_place(a: Array, b: Array, walls: Sequence[Rectangle]) -> NDArray[np.boo
     Returns:
         (N, M).
     """
-    far = np.hypot(*(a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1))
+    distances = np.hypot(*(a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1))
     turn = np.abs((a[:, None, 2] - b[None, :, 2] + math.pi) % math.tau - math.pi)
-    same: NDArray[np.bool_] = (far <= SAME_PLACE) & (turn <= SAME_PLACE_TURN)
+    same: NDArray[np.bool_] = (distances <= SAME_PLACE) & (turn <= SAME_PLACE_TURN)
     i, j = np.nonzero(same)
     same[i, j] = ~crossed(a[i, :2], b[j, :2], walls)
     return same

@@ -62,7 +62,7 @@ class MergeEvaluation:
     def false(self, link: Link) -> bool | None:
         """Whether a link is off by more than 0.5 m and a tenth of its landmarks' distance, or 15 degrees.
 
-        None if nobody knows.
+        None if unknown.
         """
         if link.a not in self.truth or link.b not in self.truth:
             return None
@@ -71,35 +71,35 @@ class MergeEvaluation:
         return metres > least or turn > FALSE_LINK_TURN
 
     def report(self) -> dict[str, Any]:
-        """Figures by name, for JSON; None where the recording does not tell."""
+        """Figures by name, for JSON; None without truth in the recording."""
         verdicts = [self.false(link) for link in self.links]
-        told = [verdict for verdict in verdicts if verdict is not None]
+        judged = [verdict for verdict in verdicts if verdict is not None]
         joined = {n: (c, p.mean) for n, (c, p) in self.merged.poses.items()}
         edges = [link.edge() for link in self.links]
-        known = bool(self.truth)
+        has_truth = bool(self.truth)
         score = score_map(joined, edges, self.truth)
         return {
             "recording": self.name,
             "robots": dict(self.robots),
-            "truth": known,
+            "truth": has_truth,
             "nodes": len(self.merged.poses),
             "components": len(self.merged.components),
             "links": len(verdicts),
-            "false_links": sum(told) if known else None,
-            "link_precision": round(1.0 - sum(told) / len(told), 4) if told else None,
-            "link_recall": _rounded(link_recall(edges, self.truth, ())) if known else None,
+            "false_links": sum(judged) if has_truth else None,
+            "link_precision": round(1.0 - sum(judged) / len(judged), 4) if judged else None,
+            "link_recall": _rounded(link_recall(edges, self.truth, ())) if has_truth else None,
             "loops": sum(link.within for link in self.merged.links),
             "refused": sum(r.link is not None for r in self.merged.refused),
-            "merged_ate_m": _rounded(score.ate) if known else None,
-            "alone_ate_m": self._alone() if known else None,
+            "merged_ate_m": _rounded(score.ate) if has_truth else None,
+            "alone_ate_m": self._alone() if has_truth else None,
             "merge_s": round(self.took_s, 2),
         }
 
     def _alone(self) -> dict[str, float | None]:
         """Error of each robot's own maps, as they came from it, after one rigid alignment a map, m."""
         own: dict[str, dict[NodeId, tuple[int, Pose2]]] = {}
-        for map_id, one in self.merged.maps.items():
-            placed = {n.id: (map_id.epoch, n.map_from_robot.mean) for n in one.nodes.values()}
+        for map_id, hybrid_map in self.merged.maps.items():
+            placed = {n.id: (map_id.epoch, n.map_from_robot.mean) for n in hybrid_map.nodes.values()}
             own.setdefault(map_id.agent, {}).update(placed)
         return {agent: _rounded(score_map(placed, [], self.truth).ate) for agent, placed in own.items()}
 
@@ -159,9 +159,9 @@ def changes(name: str, robot: Replay, settings: PipelineSettings) -> Iterator[li
             pipeline = Pipeline(map_id, robot.describe(), settings)
             pipeline.set_mission(Carried())
         made = []
-        for body in pipeline.step(observation, ()).changes:
+        for change in pipeline.step(observation, ()).changes:
             sequence += 1
-            made.append(Change(map_id, sequence, observation.stamp_ns, body))
+            made.append(Change(map_id, sequence, observation.stamp_ns, change))
         yield made
 
 
@@ -187,8 +187,8 @@ def evaluate_merging(
     for name, robot in cut.items():
         images[name] = len(robot)
         for change in track(changes(name, robot, settings), f"{name} maps", len(robot), console=console):
-            for one in change:
-                merger.on_change(one)
+            for part in change:
+                merger.on_change(part)
     console.print("merging")
     began = time.perf_counter()
     merged = merger.merged()
@@ -197,9 +197,9 @@ def evaluate_merging(
         raise DeviceError(
             f"{folder}: no robot has mapped anything; are there features, and does odometry.csv move?"
         )
-    stamps = {n.id: n.stamp_ns for one in merged.maps.values() for n in one.nodes.values()}
-    known = {node: pose for node, stamp in stamps.items() if (pose := truth.at(stamp)) is not None}
-    return MergeEvaluation(folder.resolve().name, images, merged, known, took)
+    stamps = {n.id: n.stamp_ns for part in merged.maps.values() for n in part.nodes.values()}
+    true_poses = {node: pose for node, stamp in stamps.items() if (pose := truth.at(stamp)) is not None}
+    return MergeEvaluation(folder.resolve().name, images, merged, true_poses, took)
 
 
 def _rounded(value: float | None) -> float | None:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.drivers.replay import images_of
+from mapweave.agent.recordings.image_folder import images_of
 from mapweave.evaluation.verdict import Verdict
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
@@ -99,18 +99,18 @@ def agreeing(node: Node, view: View) -> NDArray[np.int64] | None:
     pairs = match(node.landmarks.codes, view.codes)
     if len(pairs) < LEAST_INLIERS:
         return None
-    here, there = node.landmarks.pixels[pairs[:, 0]], view.pixels[pairs[:, 1]]
-    _, mask = cv2.findFundamentalMat(here, there, cv2.FM_RANSAC, GATE_PX, 0.999, 2000)
+    node_pixels, view_pixels = node.landmarks.pixels[pairs[:, 0]], view.pixels[pairs[:, 1]]
+    _, mask = cv2.findFundamentalMat(node_pixels, view_pixels, cv2.FM_RANSAC, GATE_PX, 0.999, 2000)
     inside = np.zeros(len(pairs), bool) if mask is None else mask[:, 0].astype(bool)
     count = int(inside.sum())
     if count < max(LEAST_INLIERS, LEAST_SHARE * len(pairs)):
         return None
     if evidence(count, len(pairs), GATE_PX, view.camera.height) < LEAST_EVIDENCE:
         return None
-    if min(cells(here[inside], node.camera), cells(there[inside], view.camera)) < LEAST_CELLS:
+    if min(cells(node_pixels[inside], node.camera), cells(view_pixels[inside], view.camera)) < LEAST_CELLS:
         return None
-    found: NDArray[np.int64] = pairs[inside]
-    return found
+    inlying_pairs: NDArray[np.int64] = pairs[inside]
+    return inlying_pairs
 
 
 def evidence(
@@ -129,16 +129,16 @@ def evidence(
 def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], comparable: float) -> list[int]:
     """The place with most inliers, and one node each of others that come into question as well."""
     order = sorted(inliers, key=lambda name: -inliers[name])
-    found = order[:1]
+    kept = order[:1]
     for name in order[1:]:
         enough = inliers[name] >= comparable * inliers[order[0]]
-        if enough and not any(together(name, other) for other in found):
-            found.append(name)
-    return found
+        if enough and not any(together(name, earlier) for earlier in kept):
+            kept.append(name)
+    return kept
 
 
 class AppearanceMap:
-    """Places by their looks alone."""
+    """Places by their appearance alone."""
 
     def __init__(
         self, camera: Camera, distortion: tuple[float, ...], settings: PhotographSettings | None = None
@@ -180,11 +180,11 @@ class AppearanceMap:
 
     def _judge(self, ranked: list[int], view: View) -> tuple[Certainty, int | None]:
         pairs = {number: agreeing(self._nodes[number], view) for number in ranked}
-        seen = {number: len(found) for number, found in pairs.items() if found is not None}
-        if not seen:
+        counts = {number: len(inliers) for number, inliers in pairs.items() if inliers is not None}
+        if not counts:
             return Certainty.UNKNOWN, None
-        best, *others = rivals(seen, lambda one, other: abs(one - other) <= APART, COMPARABLE)
-        return (Certainty.AMBIGUOUS if others else Certainty.FOUND), best
+        best, *runners_up = rivals(counts, lambda a, b: abs(a - b) <= APART, COMPARABLE)
+        return (Certainty.AMBIGUOUS if runners_up else Certainty.FOUND), best
 
     def _view(self, path: Path) -> View:
         return self._sift.extract(read_grey(path, self._camera)).view(self._camera)
@@ -207,8 +207,8 @@ def _read_references(path: Path) -> dict[int, Reference | None]:
         with path.open(newline="") as file:
             for row in csv.DictReader(file):
                 best, low, high = (row[name] for name in ("ref_best", "ref_lo", "ref_hi"))
-                known = Reference(int(best), int(low), int(high)) if best else None
-                references[int(row["query"])] = known
+                reference = Reference(int(best), int(low), int(high)) if best else None
+                references[int(row["query"])] = reference
     except KeyError as missing:
         raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
     except (OSError, ValueError, TypeError, csv.Error) as error:

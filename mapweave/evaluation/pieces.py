@@ -1,4 +1,4 @@
-"""Cutting a recording into robots: as its splits.toml says, or into so many pieces that overlap."""
+"""Cutting a recording into robots: by its splits.toml, or into overlapping pieces."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from mapweave.agent.drivers.replay import Replay, images_of
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.recordings.image_folder import images_of
 from mapweave.evaluation.splits import robots_of
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.node import check_name
@@ -23,8 +24,8 @@ def pieces(folder: Path, robots: int | None) -> dict[str, Replay]:
 
     Args:
         folder: the recording.
-        robots: cut it into so many consecutive pieces; None cuts it as its splits.toml says. Neighbouring
-            pieces share 30 % of their way, where the one takes the even images and the other the odd ones, so
+        robots: cut it into so many consecutive pieces; None cuts it by its splits.toml. Neighbouring
+            pieces share 30 % of their way, where one takes the even images and the next the odd ones, so
             that no image is in two of them.
 
     Raises:
@@ -35,7 +36,7 @@ def pieces(folder: Path, robots: int | None) -> dict[str, Replay]:
     if robots is None:
         file = folder / "splits.toml"
         if not file.exists():
-            raise DeviceError(f"{folder}: no splits.toml tells how to cut it; give --robots 2 or 3")
+            raise DeviceError(f"{folder}: no splits.toml to cut it by; give --robots 2 or 3")
         given = robots_of(file)
         if len(given) < 2:
             raise DeviceError(f"{file}: merging needs two robots or more; there is only {len(given)}")
@@ -81,5 +82,5 @@ def _names(given: Iterable[str], file: Path) -> list[str]:
     except InvalidValue as error:
         raise DeviceError(f"{file}: {error}") from None
     if len(set(names)) < len(names):
-        raise DeviceError(f"{file}: two robots are called alike: {', '.join(given)}")
+        raise DeviceError(f"{file}: two robots have the same name: {', '.join(given)}")
     return names

@@ -11,8 +11,10 @@ from typing import Any
 from rich.console import Console
 from rich.progress import track
 
-from mapweave.agent.drivers.replay import Replay, images_of, read_camera
+from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.pipeline import PipelineSettings
+from mapweave.agent.recordings.camera_file import read_camera
+from mapweave.agent.recordings.image_folder import images_of
 from mapweave.evaluation.drive import DriveMap, Truth
 from mapweave.evaluation.photographs import AppearanceMap, Photographs
 from mapweave.evaluation.splits import robots_of
@@ -40,8 +42,8 @@ class RelocalizationEvaluation:
     def report(self) -> dict[str, Any]:
         """For `json.dumps`: figures of the first way at the top, those of the others under their names."""
         names = list(self.verdicts)
-        others = {name: figures(self.verdicts[name]) for name in names[1:]}
-        return {**self.about, "verified": names[0], **figures(self.verdicts[names[0]]), **others}
+        by_selection = {name: figures(self.verdicts[name]) for name in names[1:]}
+        return {**self.about, "verified": names[0], **figures(self.verdicts[names[0]]), **by_selection}
 
     def write(self, folder: Path) -> list[Path]:
         """One table of verdicts for each way."""

@@ -10,7 +10,7 @@ from mapweave.storage.atomic_file import read_whole
 
 
 def robots_of(path: Path) -> list[str]:
-    """Names of the robots in a splits.toml, as they stand there.
+    """Names of the robots in a splits.toml, in their order.
 
     Raises:
         DeviceError: it cannot be read.

@@ -23,14 +23,14 @@ class Verdict:
 
     Attributes:
         query: its image.
-        expected: whether the map shows the place; None if nobody knows.
+        expected: whether the map shows the place; None if unknown.
         certainty: of the answer.
         place: the node or image that was named; empty if none was.
-        right: whether that is a right one, as the recording has it; None if it does not say.
+        right: whether that is correct by the recording; None if unknown.
         first: the same of the place that was ranked first, before it was verified.
-        error_m: of the position; NaN if nobody knows.
+        error_m: of the position; NaN if unknown.
         error_deg: of the heading.
-        error_frames: how many images the one named is from the best one.
+        error_frames: how many images the answered one is from the best one.
         extract_ms: to find the image's features.
         answer_ms: from features to answer.
     """
@@ -53,43 +53,43 @@ class Verdict:
 
 
 def figures(verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """Figures by name; None where the recording does not tell.
+    """Figures by name; None without truth in the recording.
 
     Returns:
         `recall_at_1`, of the questions whose place is mapped, those answered FOUND and right;
         `retrieved_at_1`, those whose first candidate is right, before it is verified; `precision`, of the
-        answers FOUND, those that are right; `by_looks`, answers PLACE, and how many of them are right;
+        answers FOUND, those that are right; `by_place`, answers PLACE, and how many of them are right;
         `place_at_1`, of the questions whose place is mapped, FOUND or PLACE and right; `unknown_share` and
         `ambiguous_share` of all questions; `false_accept`, of the questions whose place is not mapped, those
         answered FOUND or PLACE and wrongly; errors of the answers FOUND; times.
     """
     expected = [v for v in verdicts if v.expected]
     elsewhere = [v for v in verdicts if v.expected is False]
-    found = [v for v in verdicts if v.certainty is Certainty.FOUND]
-    told = [v for v in found if v.right is not None]
-    by_looks = [v for v in verdicts if v.certainty is Certainty.PLACE]
+    localized = [v for v in verdicts if v.certainty is Certainty.FOUND]
+    judged = [v for v in localized if v.right is not None]
+    by_place = [v for v in verdicts if v.certainty is Certainty.PLACE]
     report: dict[str, Any] = {
         "queries": len(verdicts),
         "expected": len(expected),
-        "found": len(found),
+        "found": len(localized),
         "recall_at_1": _share([v.certainty is Certainty.FOUND and bool(v.right) for v in expected]),
         "retrieved_at_1": _share([bool(v.first) for v in expected if v.first is not None]),
-        "precision": _share([bool(v.right) for v in told]),
-        "by_looks": len(by_looks),
-        "by_looks_precision": _share([bool(v.right) for v in by_looks if v.right is not None]),
+        "precision": _share([bool(v.right) for v in judged]),
+        "by_looks": len(by_place),
+        "by_looks_precision": _share([bool(v.right) for v in by_place if v.right is not None]),
         "place_at_1": _share([v.certainty in SURE and bool(v.right) for v in expected]),
         "unknown_share": _share([v.certainty is Certainty.UNKNOWN for v in verdicts]),
         "ambiguous_share": _share([v.certainty is Certainty.AMBIGUOUS for v in verdicts]),
         "false_accept": _share([v.certainty in SURE and v.right is False for v in elsewhere]),
     }
-    if any(math.isfinite(v.error_m) for v in found):
+    if any(math.isfinite(v.error_m) for v in localized):
         for metres, degrees in LEVELS:
             name = f"recall_{metres:g}m_{degrees:g}deg"
             report[name] = _share(
                 [v.certainty is Certainty.FOUND and v.within(metres, degrees) for v in expected]
             )
     for name in ("error_m", "error_deg", "error_frames"):
-        values = [getattr(v, name) for v in found if math.isfinite(getattr(v, name))]
+        values = [getattr(v, name) for v in localized if math.isfinite(getattr(v, name))]
         if values:
             report[f"{name}_median"] = round(float(np.median(values)), 3)
             report[f"{name}_p95"] = round(float(np.percentile(values, 95)), 3)

@@ -27,7 +27,7 @@ FRAME = "map"
 
 
 def export_g2o(part: MapPart, out: Path) -> list[Path]:
-    """The pose graph whose optimum the map is. Comments tell which vertex is which node."""
+    """The pose graph whose optimum is the map. Comments give the node of each vertex."""
     numbers = part.numbers
     edges = [
         G2oEdge.measured(numbers[m.a], numbers[m.b], m.a_from_b.mean, m.covariance) for m in part.measurements
@@ -83,7 +83,7 @@ def export_geojson(part: MapPart, out: Path) -> list[Path]:
     """A route graph as Nav2's route server loads it: points, and a line for each direction of an edge.
 
     Ids are unique over nodes and edges, as Nav2 wants them. The edges are those of our own routes, at
-    the same cost: what only ties poses is no way, and nodes that stand in one place are joined.
+    the same cost: edges that only constrain poses are left out, and nodes at one place are joined.
     """
     settings = RouterSettings()
     roads = Roadmap(part.merged, NEAR, ReachabilityCache())
@@ -130,10 +130,10 @@ FORMATS: dict[str, Callable[[MapPart, Path], list[Path]]] = {
 
 
 def _link_numbers(part: MapPart, edge: Edge) -> dict[str, float]:
-    known = {name: float(edge.evidence[name]) for name in ("inliers",) if name in edge.evidence}
+    numbers = {name: float(edge.evidence[name]) for name in ("inliers",) if name in edge.evidence}
     if edge.id in part.links:
-        known["probability"] = part.probabilities[min(edge.a, edge.b), max(edge.a, edge.b)]
-    return known
+        numbers["probability"] = part.probabilities[min(edge.a, edge.b), max(edge.a, edge.b)]
+    return numbers
 
 
 def _point(pose: Pose2) -> list[float]:

@@ -23,7 +23,7 @@ from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.storage.atomic_file import read_whole, write_whole
 
 UPPER = np.triu_indices(3)
-KNOWN = {"VERTEX_SE2": 5, "EDGE_SE2": 12, "FIX": 2}
+FIELDS = {"VERTEX_SE2": 5, "EDGE_SE2": 12, "FIX": 2}
 """Words on a line, by its first."""
 
 
@@ -126,13 +126,13 @@ def read_g2o(path: Path) -> G2oGraph:
         if not words or words[0].startswith("#"):
             continue
         where = f"{path}: line {number}"
-        if words[0] not in KNOWN:
+        if words[0] not in FIELDS:
             raise InvalidFile(
-                f"{where}: {words[0][:40]!r} is none of {', '.join(KNOWN)}: only planar graphs are read"
+                f"{where}: {words[0][:40]!r} is none of {', '.join(FIELDS)}: only planar graphs are read"
             )
-        if len(words) != KNOWN[words[0]]:
+        if len(words) != FIELDS[words[0]]:
             raise InvalidFile(
-                f"{where}: {words[0]} needs {KNOWN[words[0]] - 1} numbers, not {len(words) - 1}"
+                f"{where}: {words[0]} needs {FIELDS[words[0]] - 1} numbers, not {len(words) - 1}"
             )
         ends = 2 if words[0] == "EDGE_SE2" else 1
         try:
@@ -152,7 +152,7 @@ def read_g2o(path: Path) -> G2oGraph:
     _fill(poses, edges)
     absent = sorted(({end for edge in edges for end in (edge.i, edge.j)} | set(fixed)) - poses.keys())
     if absent:
-        raise InvalidFile(f"{path}: no vertex and no way along edges says where {absent[0]} is")
+        raise InvalidFile(f"{path}: neither a vertex nor a chain of edges gives the pose of {absent[0]}")
     return G2oGraph(poses, edges, tuple(fixed))
 
 
@@ -166,11 +166,11 @@ def _fill(poses: dict[int, Pose2], edges: Sequence[G2oEdge]) -> None:
         steps.setdefault(edge.j, []).append((edge.i, edge.i_from_j.inverse()))
     queue = deque(poses)
     while queue:
-        here = queue.popleft()
-        for there, step in steps.get(here, ()):
-            if there not in poses:
-                poses[there] = poses[here] @ step
-                queue.append(there)
+        vertex = queue.popleft()
+        for neighbour, step in steps.get(vertex, ()):
+            if neighbour not in poses:
+                poses[neighbour] = poses[vertex] @ step
+                queue.append(neighbour)
 
 
 def _logarithm(pose: Pose2) -> Array:

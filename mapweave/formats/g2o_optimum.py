@@ -13,7 +13,7 @@ from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
 
 OTHERS = "g2o"
-"""Stands for the agent in the ids of others' vertices."""
+"""Takes the agent's place in the ids of foreign vertices."""
 
 
 def optimum_of(graph: G2oGraph) -> dict[int, Pose2]:

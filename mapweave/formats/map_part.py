@@ -32,8 +32,8 @@ class MapPart:
         """Refuse a component that is not there (InvalidValue)."""
         count = len(self.merged.components)
         if not 0 <= self.component < count:
-            known = {0: "no nodes", 1: "one, 0"}.get(count, f"0 to {count - 1}")
-            raise InvalidValue(f"the map has no component {self.component}; it has {known}")
+            choices = {0: "no nodes", 1: "one, 0"}.get(count, f"0 to {count - 1}")
+            raise InvalidValue(f"the map has no component {self.component}; it has {choices}")
 
     @cached_property
     def nodes(self) -> tuple[NodeId, ...]:

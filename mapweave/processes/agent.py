@@ -1,4 +1,4 @@
-"""One robot as a process: body, mind, disk and link put together."""
+"""One robot as a process: driver, pipeline, disk and link put together."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FIRST_PATIENCE = 3.0
 """How long a robot that remembers no map asks the server for the number of its next one, s."""
 
 SILENCE = 2.0
-"""s; who waits longer for its body says so."""
+"""s; a longer wait for the robot is reported."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class AgentOptions:
 
 
 class Agent:
-    """Mind, disk and link of one robot; whoever has its body calls `tick` and `exchange`.
+    """Pipeline, disk and link of one robot; the owner of its driver calls `tick` and `exchange`.
 
     It takes up the newest map of its journal. When the pipeline cannot find itself on that map, a fresh map
     begins in a new epoch; the old one stays. Each map has a file of its own, written when another map begins
@@ -86,28 +86,28 @@ class Agent:
         settings: PipelineSettings,
         options: AgentOptions,
         on_step: Callable[[Step], None] = lambda step: None,
-        say: Callable[[str], None] = lambda line: None,
+        print_line: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Open the journal and join the fleet.
 
         Args:
-            describe: asks the body what it is, once the disk has turned out to be good.
+            describe: asks the robot for its description, once the disk is known to be usable.
             bus: to the fleet; stays the caller's.
             keys: of the fleet.
             settings: of the pipeline.
             options: how.
             on_step: called after each tick.
-            say: takes lines for people.
+            print_line: prints lines for people.
 
         Raises:
-            MapweaveError: the journal cannot be used; one line says why.
+            MapweaveError: the journal cannot be used; one line gives the reason.
         """
         self._bus = TrafficMeter(bus)
         self._keys = keys
         self._settings = replace(settings, seed=options.seed)
         self._options = options
         self._on_step = on_step
-        self._say = say
+        self._print = print_line
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
         try:
@@ -127,7 +127,7 @@ class Agent:
     def _begin(self) -> None:
         """A fresh map, whose number no map of this robot has had."""
         options = self._options
-        taken = [one.epoch for one in self.journal.maps()]
+        taken = [known_map.epoch for known_map in self.journal.maps()]
         taken += epochs_of_files(options.data, options.name)
         if options.epoch is not None:
             epoch = max([options.epoch, *(used + 1 for used in taken)])
@@ -146,9 +146,9 @@ class Agent:
         pipeline = Pipeline(map_id, self._description, self._settings, kept.contents, kept.next_number)
         self.journal.open_map(map_id.epoch)
         nodes = len(pipeline.map.nodes)
-        self._say(f"{self._options.name}: takes up map {map_id} with {nodes} nodes")
+        self._print(f"{self._options.name}: takes up map {map_id} with {nodes} nodes")
         if kept.complaint:
-            self._say(f"{self._options.name}: {kept.complaint}")
+            self._print(f"{self._options.name}: {kept.complaint}")
             self._set_aside(map_id)
         self._start(map_id, pipeline)
 
@@ -179,7 +179,7 @@ class Agent:
         """The map that it makes."""
         return self.replicator.map_id
 
-    def begin_anew(self) -> None:
+    def begin_new_map(self) -> None:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
         mission, old = self.pipeline.mission, self.map_id
         self._leave()
@@ -187,10 +187,10 @@ class Agent:
             self.write_map()
         except InvalidFile as error:
             # The journal has it all.
-            self._say(f"{self._options.name}: {error}")
+            self._print(f"{self._options.name}: {error}")
         self._begin()
         self.pipeline.set_mission(mission)
-        self._say(
+        self._print(
             f"{self._options.name}: cannot find itself on map {old}; it begins map {self.map_id}, "
             "and the old one stays"
         )
@@ -199,16 +199,16 @@ class Agent:
         """One tick; see Runner.tick. Begins a fresh map where that is needed."""
         step = self.runner.tick(observation)
         if self.pipeline.lost:
-            self.begin_anew()
+            self.begin_new_map()
         return step
 
     def run(self, robot: Robot, stop: threading.Event) -> None:
-        """Loop until the body has no more observations or `stop` is set."""
+        """Loop until the driver has no more observations or `stop` is set."""
         while True:
             self.runner.run(robot, stop)
             if stop.is_set() or not self.pipeline.lost:
                 return
-            self.begin_anew()
+            self.begin_new_map()
 
     def write_map(self) -> Path:
         """Write the map that it makes to its map file; returns where."""
@@ -229,7 +229,7 @@ class Agent:
         aside = path.with_name(f"{map_id}.before-damage{path.suffix}")
         if path.exists() and not aside.exists():
             path.rename(aside)
-            self._say(f"{self._options.name}: the map file written before is kept as {aside}")
+            self._print(f"{self._options.name}: the map file written before is kept as {aside}")
 
     def _placed(self) -> int:
         return self.merged_poses.count(self.map_id)
@@ -265,10 +265,10 @@ def run_agent(
     options: AgentOptions,
     stop: threading.Event,
 ) -> None:
-    """Run a robot until its body ends or `stop` is set, then write its map file.
+    """Run a robot until its driver ends or `stop` is set, then write its map file.
 
     Raises:
-        MapweaveError: the body cannot be read, or the disk cannot be written; one line says which.
+        MapweaveError: the driver cannot be read, or the disk cannot be written; one line gives the reason.
     """
     # One core a robot: OpenCV's own threads would only fight over it.
     cv2.setNumThreads(1)
@@ -289,9 +289,9 @@ def run_agent(
             agent.close()
 
 
-def _describe(robot: Robot, say: Callable[[str], None], name: str) -> RobotDescription:
-    """What the body says of itself; whoever has to wait for that is told what for."""
-    patience = threading.Timer(SILENCE, say, [f"{name}: waits for its body"])
+def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> RobotDescription:
+    """Description of the robot; a long wait for it is reported."""
+    patience = threading.Timer(SILENCE, print_line, [f"{name}: waits for its robot"])
     patience.daemon = True
     patience.start()
     try:
@@ -309,7 +309,7 @@ def _hand_over(console: Console, replicator: Replicator, bus: ZenohBus, options:
         console.print(f"server {options.server} has it all")
     else:
         console.print(
-            f"server {options.server} has not said that it has it all: the rest stays in the journal"
+            f"server {options.server} has not acknowledged everything: the rest stays in the journal"
         )
 
 
@@ -320,7 +320,7 @@ class _progress:
         self._console = console
         self._options = options
         self._bar: Progress | None = None
-        self._said = ""
+        self._last_line = ""
 
     def __enter__(self) -> _progress:
         if self._options.total is not None:
@@ -340,8 +340,8 @@ class _progress:
         status = step.status
         if self._bar is not None:
             self._bar.update(self._task, advance=1, detail=f"{status.nodes} nodes, {status.detail}")
-        elif status.doing != self._said:
-            self._said = status.doing
+        elif status.doing != self._last_line:
+            self._last_line = status.doing
             self._console.print(
                 f"{self._options.name}: {status.doing} ({status.nodes} nodes) {status.detail}"
             )

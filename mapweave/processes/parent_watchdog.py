@@ -11,7 +11,7 @@ import threading
 from collections.abc import Mapping
 
 NAME = "MAPWEAVE_LIFELINE"
-"""Set in the environment of who has such a stdin; the stdin of all others means nothing."""
+"""Set in the environment of a process with such a stdin; other processes ignore their stdin."""
 
 
 def environment() -> Mapping[str, str]:
@@ -20,7 +20,7 @@ def environment() -> Mapping[str, str]:
 
 
 def hold(stop: threading.Event) -> None:
-    """Set `stop` when the parent is gone; does nothing in a process that was not started as such a child."""
+    """Set `stop` when the parent has ended; does nothing in a process not started as such a child."""
     if os.environ.get(NAME):
         threading.Thread(target=_wait, args=(stop,), name="lifeline", daemon=True).start()
 

@@ -1,6 +1,4 @@
-"""What a scenario does to a fleet beside what it does to the world; see `mapweave.sim.events` for the
-rest.
-"""
+"""Actions of a scenario on the fleet; those on the world are in `mapweave.sim.events`."""
 
 from __future__ import annotations
 
@@ -79,7 +77,7 @@ class Photograph:
         robot: name.
         count: of photographs.
         spacing: m between two of them, about.
-        said_spacing: what the photographer says of it, m; the truth by default.
+        said_spacing: as the photographer states it, m; the truth by default.
         camera: that is carried, by its name.
         name: of the map.
     """
@@ -125,7 +123,7 @@ class StartServer:
 
 @dataclass(frozen=True)
 class Cut:
-    """A robot's network is gone; its body is not concerned."""
+    """A robot's network is cut; its wheels and sensors work on."""
 
     robot: str
 
@@ -193,7 +191,7 @@ KINDS: dict[str, type[Any]] = {
 
 
 def parse_action(do: str, table: Mapping[str, Any], where: str) -> Action:
-    """Make an action of what a scenario's table says beside its time.
+    """Make an action of a scenario's table.
 
     Raises:
         SettingsError: an unknown kind or field, or a value that cannot work.

@@ -65,7 +65,7 @@ def run_batch_of_trials(scenario: Scenario, options: BatchOptions) -> bool:
         for seed in range(options.first, options.first + options.seeds):
             progress.update(task, detail=f"seed {seed}")
             attempts.append(_attempt(scenario, options, seed))
-            failed = [one for one in attempts if not one.passed]
+            failed = [failed_attempt for failed_attempt in attempts if not failed_attempt.passed]
             if attempts[-1] in failed:
                 for line in attempts[-1].complaints:
                     console.print(f"seed {seed}: {line}", highlight=False)

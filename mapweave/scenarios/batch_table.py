@@ -124,14 +124,14 @@ def batch_table(attempts: Sequence[Attempt], title: str = "") -> Group:
     for heading in ("figure", "median", "worst", "of seed", "range", "trials"):
         figures.add_column(heading, justify="left" if heading == "figure" else "right")
     judged = {v.name: v.wanted for a in attempts for v in a.verdicts}
-    for one in summarise(attempts):
+    for row in summarise(attempts):
         figures.add_row(
-            Text(one.name, "bold" if one.name in judged else ""),
-            _shown(one.name, one.median),
-            _shown(one.name, one.worst),
-            as_text(one.worst_seed),
-            f"{_shown(one.name, one.least)} .. {_shown(one.name, one.most)}",
-            f"{one.measured} of {len(attempts)}",
+            Text(row.name, "bold" if row.name in judged else ""),
+            _shown(row.name, row.median),
+            _shown(row.name, row.worst),
+            as_text(row.worst_seed),
+            f"{_shown(row.name, row.least)} .. {_shown(row.name, row.most)}",
+            f"{row.measured} of {len(attempts)}",
         )
     failed = [a for a in attempts if not a.passed]
     lines = [Text(f"{len(attempts) - len(failed)} of {len(attempts)} passed", "bold")]

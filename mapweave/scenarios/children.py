@@ -18,7 +18,7 @@ class ChildFailed(MapweaveError):
 
 
 def free_port() -> int:
-    """A TCP port on loopback that nobody uses now."""
+    """A free TCP port on loopback."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -63,11 +63,11 @@ class Children:
         return self._running[name].pid
 
     def check(self) -> None:
-        """Raise ChildFailed if one has ended, with the last line that it said."""
+        """Raise ChildFailed if one has ended, with its last line of output."""
         for name, process in self._running.items():
             if process.poll() is not None:
-                said = self._log(name).read_text(errors="replace").strip().splitlines()
-                last = said[-1] if said else "it said nothing"
+                output = self._log(name).read_text(errors="replace").strip().splitlines()
+                last = output[-1] if output else "it printed nothing"
                 raise ChildFailed(
                     f"{name} ended with status {process.returncode}: {last} ({self._log(name)})"
                 )

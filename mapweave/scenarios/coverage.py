@@ -15,9 +15,9 @@ from mapweave.sim.floorplan import FloorPlan
 REACH = 1.5
 """A place is explored if a node was made this near to it, with no wall between, m."""
 CLEARANCE = 0.2
-"""A place is one where a robot can stand with this much room around its middle, m."""
+"""A place is a point with this much room around it for a robot, m."""
 SPACING = 0.2
-"""Places are looked at this far apart, m."""
+"""Distance between places, m."""
 NEAREST = 4
 """So many of the nearest nodes are tried before a place counts as unexplored."""
 
@@ -30,26 +30,26 @@ def explored_share(plan: FloorPlan, places: Array) -> float | None:
         places: (N, 2) m, true positions of the nodes, in world.
 
     Returns:
-        None where there is no floor to stand on.
+        None without free floor.
     """
     regions = plan.free_regions(CLEARANCE)
     entered = [region for region in regions if _holds(region, places)] or regions
     if not entered:
         return None
     points = np.concatenate(entered)
-    # One point for each square, whatever grid the plan has.
+    # One point for each square, for any grid of the plan.
     _, first = np.unique(np.floor(points / SPACING).astype(np.int64), axis=0, return_index=True)
     points = points[first]
-    near = np.zeros(len(points), bool)
+    near_node = np.zeros(len(points), bool)
     if len(places):
         distances = np.linalg.norm(points[:, None] - places[None], axis=2)
         order = np.argsort(distances, axis=1, kind="stable")[:, :NEAREST]
         for rank in range(order.shape[1]):
             node = order[:, rank]
             within = distances[np.arange(len(points)), node] <= REACH
-            tried = np.flatnonzero(within & ~near)
-            near[tried] = ~crossed(points[tried], places[node[tried]], plan.walls)
-    return float(near.mean())
+            tried = np.flatnonzero(within & ~near_node)
+            near_node[tried] = ~crossed(points[tried], places[node[tried]], plan.walls)
+    return float(near_node.mean())
 
 
 def _holds(region: Array, places: Array) -> bool:

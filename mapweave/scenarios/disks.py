@@ -31,7 +31,7 @@ class DiskRecord:
 
 
 def read_disks(agents: Path, store: Path, robots: Iterable[str]) -> dict[str, DiskRecord]:
-    """Read journals and store; nobody may have them open.
+    """Read journals and store; no process may have them open.
 
     Args:
         agents: folder of the journals.
@@ -49,11 +49,11 @@ def read_disks(agents: Path, store: Path, robots: Iterable[str]) -> dict[str, Di
 
 
 def map_hash(contents: Iterable[tuple[MapId, Iterable[ChangeBody]]]) -> str:
-    """SHA-256 over maps, whatever the order in which their parts were put."""
+    """SHA-256 over maps, independent of the order of their changes."""
     digest = hashlib.sha256()
-    for map_id, bodies in sorted(contents, key=lambda one: str(one[0])):
+    for map_id, changes in sorted(contents, key=lambda item: str(item[0])):
         digest.update(str(map_id).encode())
-        for encoded in sorted(map(encode_body, bodies)):
+        for encoded in sorted(map(encode_body, changes)):
             digest.update(len(encoded).to_bytes(4, "little") + encoded)
     return digest.hexdigest()
 
@@ -62,13 +62,13 @@ def _compare(journal: Journal, store: Store) -> DiskRecord:
     size, unsaved, maps = 0, 0, []
     try:
         stored = set(store.maps())
-        for one in journal.maps():
-            mine = list(HybridMap(journal.replay(one)).contents())
-            bodies = (change.body for change in store.replay(one)) if one in stored else ()
-            theirs = set(map(encode_body, HybridMap(bodies).contents()))
-            unsaved += sum(encode_body(body) not in theirs for body in mine)
-            size += sum(len(change) for _, change in journal.rows(one, 1, journal.head(one)))
-            maps.append((one, mine))
+        for map_id in journal.maps():
+            own_changes = list(HybridMap(journal.replay(map_id)).contents())
+            stored_contents = (change.body for change in store.replay(map_id)) if map_id in stored else ()
+            stored_changes = set(map(encode_body, HybridMap(stored_contents).contents()))
+            unsaved += sum(encode_body(body) not in stored_changes for body in own_changes)
+            size += sum(len(change) for _, change in journal.rows(map_id, 1, journal.head(map_id)))
+            maps.append((map_id, own_changes))
         return DiskRecord(size, unsaved, map_hash(maps))
     finally:
         journal.close()

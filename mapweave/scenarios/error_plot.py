@@ -23,7 +23,7 @@ DASHES = ("-", "--", ":", "-.")
 def draw_errors(
     scores: Mapping[MapId, TrajectoryScore], moments: Sequence[Moment], lost: Sequence[Lost], path: Path
 ) -> None:
-    """Write a PNG: position error after the alignment of each map, with what happened meanwhile.
+    """Write a PNG: position error after the alignment of each map, with the events.
 
     Args:
         scores: of each map's trajectory.
@@ -31,7 +31,7 @@ def draw_errors(
         lost: robots that were carried away.
         path: where.
     """
-    # Only who draws pays for matplotlib.
+    # matplotlib is imported only for drawing.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -45,9 +45,11 @@ def draw_errors(
             numbers, (when, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
             ha="center", fontsize=7, color="#888888",
         )  # fmt: skip
-    for k, one in enumerate(lost):
+    for k, fall in enumerate(lost):
         label = "carried away" if k == 0 else None
-        axes.axvline(one.stamp_ns / 1e9, color="#c0392b", linewidth=1.2, linestyle=":", zorder=2, label=label)
+        axes.axvline(
+            fall.stamp_ns / 1e9, color="#c0392b", linewidth=1.2, linestyle=":", zorder=2, label=label
+        )
     epochs: dict[str, int] = {}
     for map_id, score in sorted(scores.items()):
         number = epochs[map_id.agent] = epochs.get(map_id.agent, -1) + 1

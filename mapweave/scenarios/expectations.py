@@ -84,14 +84,14 @@ def parse_expectations(table: Mapping[str, Any], where: str = "expect") -> tuple
     Raises:
         SettingsError: an unknown figure, a value of the wrong kind, or bounds that nothing can meet.
     """
-    known = kinds()
+    figure_kinds = kinds()
     expectations = []
     for name, value in table.items():
-        if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+        if name not in figure_kinds:
+            close = difflib.get_close_matches(name, figure_kinds, 1)
+            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(figure_kinds)}"
             raise SettingsError(f"{where}: no figure {name!r}; {hint}")
-        expectations.append(_parse(name, known[name], value, f"{where}: {name}"))
+        expectations.append(_parse(name, figure_kinds[name], value, f"{where}: {name}"))
     return tuple(expectations)
 
 

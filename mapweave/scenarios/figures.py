@@ -50,12 +50,12 @@ class RobotFigures:
 class Figures:
     """Everything that a trial measured; None where a figure does not apply. Never "not a number".
 
-    The *worst* of several lost robots is None as soon as one of them has no such figure: what did not happen
-    at all is no good result. A robot that never mapped does not count for the worst trajectory.
+    The *worst* of several lost robots is None as soon as one of them has no such figure: a missing result
+    is no good result. A robot that never mapped does not count for the worst trajectory.
 
     Attributes:
         components: connected components of the merged map that hold nodes.
-        maps: with nodes in the merged map (a robot that had to begin anew has several).
+        maps: with nodes in the merged map (a robot that had to begin a new map has several).
         nodes: of the merged map.
         edges: within one map.
         false_edges: of these, off by more than 0.5 m or 15 degrees.
@@ -63,8 +63,7 @@ class Figures:
         false_loops: of the loops, off by more than 0.5 m or 15 degrees.
         longest_loop_m: the longest way that a robot drove before one of its true loops was closed, m; None
             without loops.
-        explored_share: of the floor where a robot can stand, what is within 1.5 m of a node with no wall
-            between.
+        explored_share: share of the robot-accessible floor within 1.5 m of a node with no wall between.
         links: between maps.
         false_links: of these, off by more than 0.5 m or 15 degrees.
         link_precision: share of the links that is not false; None without links.
@@ -73,16 +72,16 @@ class Figures:
         merged_ate_m: root mean square position error of the merged map's nodes after one planar alignment a
             component, m.
         trajectory_ate_m: absolute trajectory error by evo (APE, translation, RMSE) of what the robots
-            believed while mapping, after one planar alignment a map without scale; the worst map of all, m.
+            estimated while mapping, after one planar alignment a map without scale; the worst map of all, m.
         rpe_m: relative pose error by evo (RPE, translation, RMSE) over 1 m of the true path; the worst, m.
         rpe_deg: likewise, rotation, degrees.
         collisions: of all robots.
-        found: whether every lost robot was told, or found out, where it is: its first answer was right to
-            0.25 m and 5 degrees. None if nobody was lost.
+        found: whether every lost robot was localized, by itself or the fleet: its first answer was right to
+            0.25 m and 5 degrees. None if no robot was lost.
         found_error_m: of the worst first answer, m.
         found_error_deg: likewise, degrees.
         found_s: from the kidnapping to the first answer, the worst, simulated s.
-        reached: whether every lost robot with a goal said that it is there, and stood within 0.05 m and 3
+        reached: whether every lost robot with a goal reported that it is there, and was within 0.05 m and 3
             degrees of where the goal's image was taken. None without goals.
         goal_error_m: of the worst such robot, where it arrived or was given up, m.
         goal_error_deg: likewise, degrees.
@@ -157,8 +156,8 @@ class Figures:
         robots = given.pop("robots", {})
         try:
             shares = {
-                name: build(RobotFigures, {k: v for k, v in one.items() if v is not None}, f"robot {name}")
-                for name, one in robots.items()
+                name: build(RobotFigures, {k: v for k, v in values.items() if v is not None}, f"robot {name}")
+                for name, values in robots.items()
             }
             return replace(build(Figures, given, "figures"), robots=shares)
         except (AttributeError, SettingsError) as error:
@@ -168,7 +167,7 @@ class Figures:
 def kinds() -> dict[str, type]:
     """Name and type (int, float, bool or str) of each figure of a whole trial, in the order of the class."""
     hints = typing.get_type_hints(Figures)
-    return {one.name: _kind(hints[one.name]) for one in fields(Figures) if one.name != "robots"}
+    return {item.name: _kind(hints[item.name]) for item in fields(Figures) if item.name != "robots"}
 
 
 def measured(value: float) -> float | None:
@@ -191,5 +190,5 @@ def as_text(value: float | str | None) -> str:
 
 def _kind(hint: Any) -> type:
     """The type behind `float | None`."""
-    known = [kind for kind in (typing.get_args(hint) or (hint,)) if kind is not type(None)]
-    return typing.cast(type, known[0])
+    types = [kind for kind in (typing.get_args(hint) or (hint,)) if kind is not type(None)]
+    return typing.cast(type, types[0])

@@ -20,7 +20,7 @@ from mapweave.scenarios.film_frame import Frame
 WAITING = 16
 """Frames that may wait for the encoder; then the trial waits, so that no film misses a frame."""
 EXPECTED = b"is not supported with codec id"
-"""OpenCV says so of every WebM file and then writes a good one."""
+"""OpenCV prints this for every WebM file and then writes a good one."""
 
 
 class Film:
@@ -36,7 +36,7 @@ class Film:
 
         Args:
             path: ends in `.webm`.
-            frames_per_second: of the film, whatever time passed between the frames.
+            frames_per_second: of the film, independent of the time between the frames.
 
         Raises:
             InvalidFile: another ending.
@@ -102,7 +102,7 @@ class Film:
         self._shape = frame.shape
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            # OpenCV's own words about a place that cannot be written are several, and none says why.
+            # OpenCV prints several lines about a path that cannot be written, and none gives the reason.
             self._beside.touch()
         except OSError as error:
             raise InvalidFile(f"{self.path}: cannot be written ({error.strerror})") from None
@@ -129,18 +129,18 @@ class Film:
 
 @contextmanager
 def _without_expected_words() -> Iterator[None]:
-    """Keep one line of OpenCV's C code off stderr; whatever else is said meanwhile is passed on."""
+    """Keep one line of OpenCV's C code off stderr; other output is passed on."""
     sys.stderr.flush()
     stderr = 2
-    with tempfile.TemporaryFile() as heard:
+    with tempfile.TemporaryFile() as captured:
         kept = os.dup(stderr)
-        os.dup2(heard.fileno(), stderr)
+        os.dup2(captured.fileno(), stderr)
         try:
             yield
         finally:
             os.dup2(kept, stderr)
             os.close(kept)
-            heard.seek(0)
-            for line in heard:
+            captured.seek(0)
+            for line in captured:
                 if EXPECTED not in line:
                     os.write(stderr, line)

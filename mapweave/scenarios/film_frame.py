@@ -1,4 +1,4 @@
-"""A trial as pictures: the building from above beside what the robots' cameras see."""
+"""A trial as pictures: the building from above next to the robots' camera images."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ LARGEST = 300
 """Height of a camera's image at most, px: the simulator's cameras have hardly more."""
 GAP = 6
 """px."""
-TRAIL = 30.0
+TRAJECTORY = 30.0
 """Of each robot's way, this much is shown, simulated s."""
 FASTEST = 1.0
-"""m/s; no robot drives faster: it was carried, and its trail is cut."""
+"""m/s; no robot drives faster: it was carried, and its trajectory is cut."""
 ROBOT_RADIUS = 0.17
 """m."""
 NO_NODES: Array = np.zeros((0, 3))
@@ -103,7 +103,7 @@ def lay_out(size: tuple[int, int], extent: tuple[float, float], robots: int) -> 
 
 
 class FilmFrame:
-    """Draws moments of one trial, in order; remembers only the robots' trails.
+    """Draws moments of one trial, in order; remembers only the robots' trajectories.
 
     Attributes:
         size: width and height of a frame, px.
@@ -139,7 +139,7 @@ class FilmFrame:
         self._furniture: tuple[Rectangle, ...] = ()
         self._nodes: list[Array] = [NO_NODES for _ in robots]
         self._furnished = self._bare
-        self._trails: dict[str, deque[tuple[float, float, float]]] = {name: deque() for name in robots}
+        self._trajectories: dict[str, deque[tuple[float, float, float]]] = {name: deque() for name in robots}
 
     def draw(
         self,
@@ -159,8 +159,8 @@ class FilmFrame:
         frame = self._background(snapshot.furniture, nodes or {}).copy()
         statuses = statuses or {}
         for name, pose in snapshot.robots.items():
-            if name in self._trails:
-                self._draw_trail(frame, name, pose, snapshot.stamp_ns / 1e9)
+            if name in self._trajectories:
+                self._draw_trajectory(frame, name, pose, snapshot.stamp_ns / 1e9)
         self._fill(frame, snapshot.actors, ACTOR)
         for actor in snapshot.actors:
             x, y = self._pixel(actor.x, actor.y)
@@ -188,7 +188,7 @@ class FilmFrame:
         return self._furnished
 
     def _draw_nodes(self, frame: Frame, poses: Array, colour: Colour) -> None:
-        """Dots with a tick where they look, all in two calls."""
+        """Dots with a tick for the heading, all in two calls."""
         if not len(poses):
             return
         reach = 0.16 * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
@@ -197,15 +197,17 @@ class FilmFrame:
         cv2.polylines(frame, list(lines), False, colour, 1, cv2.LINE_AA, SHIFT)
         cv2.polylines(frame, list(dots), False, colour, 4, cv2.LINE_AA, SHIFT)
 
-    def _draw_trail(self, frame: Frame, name: str, pose: Pose2, now: float) -> None:
-        trail = self._trails[name]
-        if trail and math.dist((pose.x, pose.y), trail[-1][1:]) > FASTEST * max(now - trail[-1][0], 0.0):
-            trail.clear()
-        trail.append((now, pose.x, pose.y))
-        while trail[0][0] < now - TRAIL:
-            trail.popleft()
-        if len(trail) > 1:
-            line = self._subpixels(np.array(trail)[:, 1:])
+    def _draw_trajectory(self, frame: Frame, name: str, pose: Pose2, now: float) -> None:
+        trajectory = self._trajectories[name]
+        if trajectory and math.dist((pose.x, pose.y), trajectory[-1][1:]) > FASTEST * max(
+            now - trajectory[-1][0], 0.0
+        ):
+            trajectory.clear()
+        trajectory.append((now, pose.x, pose.y))
+        while trajectory[0][0] < now - TRAJECTORY:
+            trajectory.popleft()
+        if len(trajectory) > 1:
+            line = self._subpixels(np.array(trajectory)[:, 1:])
             cv2.polylines(frame, [line], False, _mixed(self._colours[name], 0.4), 1, cv2.LINE_AA, SHIFT)
 
     def _draw_robot(self, frame: Frame, name: str, pose: Pose2) -> None:
@@ -275,7 +277,7 @@ def _width(text: str, scale: float, weight: int = 1) -> int:
 
 
 def _shortened(text: str, room: int, scale: float) -> str:
-    """As much of a text as there is room for, px; dots stand for what is left out."""
+    """As much of a text as there is room for, px; an ellipsis marks the rest."""
     if _width(text, scale) <= room:
         return text
     shorter = text[: int(len(text) * room / _width(text, scale))] if room > 0 else ""

@@ -1,4 +1,4 @@
-"""Film and live view of a trial: a frame whenever time stands still for long enough."""
+"""Film and live view of a trial: a frame whenever simulated time stops for long enough."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FilmingOptions:
 def filming(
     stage: Stage, options: FilmingOptions, fleet: Fleet, out: Path
 ) -> Iterator[Callable[[ScenarioRunner], None]]:
-    """Gives what is to be called whenever time stands still.
+    """The function to call whenever simulated time stops.
 
     Raises:
         SettingsError: the port of the live view cannot be used.
@@ -65,9 +65,9 @@ def filming(
                 return
             due = conductor.now + options.every
             shot = fleet.control.snapshot()
-            said = {}
+            captions = {}
             for robot, report in conductor.agents.items():
-                said[robot] = f"{report.status.nodes} nodes, {report.status.doing}"
+                captions[robot] = f"{report.status.nodes} nodes, {report.status.doing}"
                 # A node is made about where the robot is: good enough for a dot in a film.
                 while len(places[robot]) < report.status.nodes:
                     pose = shot.robots[robot]
@@ -75,7 +75,7 @@ def filming(
             nodes: dict[str, Array] = {
                 robot: np.array(poses).reshape(-1, 3) for robot, poses in places.items() if poses
             }
-            drawn = scene.draw(shot, nodes, said, conductor.doing)
+            drawn = scene.draw(shot, nodes, captions, conductor.doing)
             if film is not None:
                 film.add(drawn)
             if live is not None:

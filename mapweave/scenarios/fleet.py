@@ -25,7 +25,7 @@ class Stage:
     Attributes:
         scenario: what is tried.
         seed: of everything.
-        out: folder: `agents/` holds journals and map files, `server/` the store, `logs/` what was said.
+        out: folder: `agents/` holds journals and map files, `server/` the store, `logs/` the output.
         settings: of every robot's pipeline.
         settings_file: where they came from, if from a file.
     """
@@ -82,12 +82,12 @@ class Fleet(Protocol):
         """Let time pass until a tick is over and every agent has finished with it.
 
         Raises:
-            MapweaveError: somebody died who should not have.
+            MapweaveError: a process died unexpectedly.
         """
         ...
 
     def kill_agent(self, robot: str) -> None:
-        """End an agent at once; its robot stands still."""
+        """End an agent at once; its robot stops."""
         ...
 
     def start_agent(self, robot: str) -> None:
@@ -119,5 +119,5 @@ class Fleet(Protocol):
         ...
 
     def wall(self) -> dict[str, float]:
-        """Wall time by part, s, as far as it is known."""
+        """Wall time by part, s, where it is known."""
         ...

@@ -16,7 +16,7 @@ from mapweave.scenarios.recording import Fix, Lost
 from mapweave.storage.map_file import MapFile, unpack_map_file
 
 Note = Callable[[str, bool], None]
-"""Takes a line, and whether it tells of trouble."""
+"""Takes a line, and whether it reports trouble."""
 
 
 class KidnapEvents:
@@ -24,13 +24,13 @@ class KidnapEvents:
 
     Attributes:
         lost: in order.
-        sent: the one that was sent last.
+        sent: the robot that was sent last.
     """
 
     def __init__(
         self, stage: Stage, fleet: Fleet, command: Callable[[str, Mission], None], note: Note
     ) -> None:
-        """Nobody is lost.
+        """Start with no robot lost.
 
         Args:
             stage: what is tried.
@@ -88,7 +88,7 @@ class KidnapEvents:
                 self._truth_of(HybridMap(merged.changes)),
                 self._fleet.control.plan(),
                 (robot,) if robot else self._stage.robots,
-                {name: one.world_from_robot for name, one in status.robots.items()},
+                {name: robot_status.world_from_robot for name, robot_status in status.robots.items()},
                 self._stage.seed,
             )
         except NothingToShow as reason:
@@ -107,13 +107,13 @@ class KidnapEvents:
         self.lost.append(Lost(robot, room, status.stamp_ns, pose))
 
     def send(self, robot: str, goal: str) -> None:
-        """Send a robot, or the one that was lost last, to a goal; see `actions.Send`."""
-        lost = next((one for one in reversed(self.lost) if robot in ("", one.robot)), None)
+        """Send a robot, or the last lost one, to a goal; see `actions.Send`."""
+        lost = next((record for record in reversed(self.lost) if robot in ("", record.robot)), None)
         if lost is None:
             if not robot:
-                self._note("nobody is sent: no robot was lost", True)
+                self._note("no robot is sent: none was lost", True)
                 return
-            # A robot that nobody carried away is sent from where it knows itself to be.
+            # A robot that was not kidnapped is sent from where it is localized.
             self.mark(robot)
             lost = self.lost[-1]
         try:

@@ -1,4 +1,4 @@
-"""Whom to kidnap, where to put it down, where it shall go. Truth sets the stage; it does not help."""
+"""Plans a kidnapping: which robot, where to put it down, where to send it. Uses the ground truth."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ NEAR = 0.6
 """m from some node that the room's own robot has made: the place is mapped."""
 FAR = 2.0
 """m; a goal is worth a drive."""
-BODY = 0.16
-"""Half the width of a robot that stands in the way, m."""
+HALF_WIDTH = 0.16
+"""Half the width of a robot that is in the way, m."""
 ROOM = 0.26
 """Half the width of what a robot drives through, m."""
 STEPS = 12
-"""Points on the line between two nodes at which it is looked for robots."""
+"""Points on the line between two nodes that are tested for robots."""
 NEARBY = 0.25
-"""A robot may stand or park this near to where it can drive, m."""
+"""A robot may stop or park this near to drivable floor, m."""
 LEAST_LANDMARKS = 30
 """A goal is a place with a view."""
 
@@ -67,7 +67,7 @@ def plan_kidnapping(
 ) -> Kidnapping:
     """Choose a robot, a room that only another robot has mapped, a place in it, and a third robot's node.
 
-    The others stand where they stand: a goal to which they leave no way is none, as for any driver.
+    The others do not move: a goal to which they leave no way is not used.
 
     Args:
         merged: all nodes.
@@ -75,7 +75,7 @@ def plan_kidnapping(
         truth: where each node really is.
         plan: of the world.
         robots: all names.
-        standing: where the robots are now; nobody is put on top of another.
+        standing: poses of the robots now; a robot is not put on top of another.
         seed: of the choice.
 
     Raises:
@@ -105,42 +105,42 @@ def plan_kidnapping(
         place = _place(rng, plan, [truth[n] for n in rooms[room][host]], list(standing.values()))
         if place is None:
             continue
-        others = [pose for name, pose in standing.items() if name != robot]
-        way, mapped = _way(plan, others, place), _open_ways(merged, truth, others)
+        other_poses = [pose for name, pose in standing.items() if name != robot]
+        way, mapped = _way(plan, other_poses, place), _open_ways(merged, truth, other_poses)
         start = min(rooms[room][host], key=lambda node: (truth[node].distance(place), node))
-        known = nx.node_connected_component(mapped, start)
-        reached = [goal for goal in goals if goal in known and way(truth[goal])]
+        reachable = nx.node_connected_component(mapped, start)
+        reached = [goal for goal in goals if goal in reachable and way(truth[goal])]
         if reached:
             return Kidnapping(robot, room, host, place, reached[int(rng.integers(len(reached)))])
     raise NothingToShow("no free place near the nodes of such a room, from which the others leave a way")
 
 
-def _way(plan: FloorPlan, others: Sequence[Pose2], start: Pose2) -> Callable[[Pose2], bool]:
-    """Tells whether a robot can get from a place to another around robots that stand still."""
-    bodies = tuple(Rectangle(o.x, o.y, 2 * BODY, 2 * BODY, o.heading) for o in others)
-    regions = FloorPlan(plan.rooms, plan.walls, (*plan.furniture, *bodies)).free_regions(ROOM)
+def _way(plan: FloorPlan, other_poses: Sequence[Pose2], start: Pose2) -> Callable[[Pose2], bool]:
+    """Tests whether a robot can get from one place to another around standing robots."""
+    footprints = tuple(Rectangle(o.x, o.y, 2 * HALF_WIDTH, 2 * HALF_WIDTH, o.heading) for o in other_poses)
+    regions = FloorPlan(plan.rooms, plan.walls, (*plan.furniture, *footprints)).free_regions(ROOM)
 
     def region(pose: Pose2) -> int | None:
         gaps = [float(np.hypot(*(points - [pose.x, pose.y]).T).min()) for points in regions]
         nearest = int(np.argmin(gaps)) if gaps else None
         return nearest if nearest is not None and gaps[nearest] < NEARBY else None
 
-    here = region(start)
-    return lambda goal: here is not None and region(goal) == here
+    start_region = region(start)
+    return lambda goal: start_region is not None and region(goal) == start_region
 
 
-def _open_ways(merged: HybridMap, truth: Mapping[NodeId, Pose2], others: Sequence[Pose2]) -> nx.Graph:
-    """The nodes, and those edges that pass no robot that stands still too closely."""
+def _open_ways(merged: HybridMap, truth: Mapping[NodeId, Pose2], other_poses: Sequence[Pose2]) -> nx.Graph:
+    """The nodes, and those edges that pass no standing robot too closely."""
     graph: nx.Graph = nx.Graph()
     graph.add_nodes_from(truth)
-    bodies = np.array([[other.x, other.y] for other in others]).reshape(-1, 2)
+    positions = np.array([[pose.x, pose.y] for pose in other_poses]).reshape(-1, 2)
     for edge in merged.edges.values():
         if edge.a not in truth or edge.b not in truth:
             continue
         start, end = (np.array([truth[node].x, truth[node].y]) for node in (edge.a, edge.b))
         way = np.linspace(start, end, STEPS)
-        gaps = np.linalg.norm(way[:, None] - bodies[None], axis=2)
-        if gaps.min(initial=np.inf) > BODY + ROOM:
+        gaps = np.linalg.norm(way[:, None] - positions[None], axis=2)
+        if gaps.min(initial=np.inf) > HALF_WIDTH + ROOM:
             graph.add_edge(edge.a, edge.b)
     return graph
 
@@ -179,8 +179,8 @@ def choose_goal(
         and truth[n].distance(world_from_robot) >= FAR
     ]
     if not goals:
-        whose = "another robot's" if foreign else "its own"
-        raise NothingToShow(f"no node of {whose} map is {FAR:g} m away with a view, and joined to here")
+        owner = "another robot's" if foreign else "its own"
+        raise NothingToShow(f"no node of {owner} map is {FAR:g} m away with a view, and joined to here")
     return goals[int(np.random.default_rng([seed, 0x60A1]).integers(len(goals)))]
 
 
@@ -196,15 +196,15 @@ def _goals(
 ) -> list[NodeId]:
     """Nodes of a third robot (of two: of either) in another room, or else anywhere outside this one."""
     third = [n for n in sorted(truth) if n.agent not in (robot, host)] or sorted(truth)
-    here = {n for nodes in rooms[room].values() for n in nodes}
+    in_room = {n for nodes in rooms[room].values() for n in nodes}
     good = [
         n
         for n in third
-        if n not in here
+        if n not in in_room
         and len(merged.nodes[n].landmarks) >= LEAST_LANDMARKS
         and components[n] == components[start]
     ]
-    in_a_room = {n for other, by in rooms.items() if other != room for nodes in by.values() for n in nodes}
+    in_a_room = {n for name, by in rooms.items() if name != room for nodes in by.values() for n in nodes}
     return [n for n in good if n in in_a_room] or good
 
 
@@ -212,14 +212,14 @@ def _place(
     rng: np.random.Generator, plan: FloorPlan, nodes: list[Pose2], occupied: list[Pose2]
 ) -> Pose2 | None:
     for _ in range(500):
-        near = nodes[int(rng.integers(len(nodes)))]
+        node = nodes[int(rng.integers(len(nodes)))]
         angle, distance = float(rng.uniform(0, math.tau)), NEAR * math.sqrt(float(rng.random()))
         place = Pose2(
-            near.x + distance * math.cos(angle),
-            near.y + distance * math.sin(angle),
+            node.x + distance * math.cos(angle),
+            node.y + distance * math.sin(angle),
             float(rng.uniform(-math.pi, math.pi)),
         )
-        apart = min((place.distance(other) for other in occupied), default=math.inf)
+        apart = min((place.distance(pose) for pose in occupied), default=math.inf)
         if plan.is_free(place.x, place.y, CLEARANCE) and apart > 0.6:
             return place
     return None

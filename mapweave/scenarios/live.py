@@ -96,11 +96,11 @@ class Live:
                 self._jpeg = (number, encoded.tobytes())
             return self._jpeg
 
-    async def next_frame(self, seen: int, patience: float | None = None) -> tuple[int, bytes] | None:
+    async def next_frame(self, last: int, patience: float | None = None) -> tuple[int, bytes] | None:
         """The latest frame, if it is another than one that was seen.
 
         Args:
-            seen: its number; 0 before the first.
+            last: its number; 0 before the first.
             patience: s to wait for another, None for ever.
 
         Returns:
@@ -109,7 +109,7 @@ class Live:
         try:
             async with asyncio.timeout(patience):
                 while not self._closed:
-                    if self._latest is not None and self._latest[0] > seen:
+                    if self._latest is not None and self._latest[0] > last:
                         return await asyncio.to_thread(self.latest)
                     await asyncio.sleep(1.0 / MOST_RATE)
         except TimeoutError:
@@ -131,15 +131,15 @@ def _application(live: Live, title: str) -> ASGIApp:
         return JSONResponse({"title": title})
 
     async def frame(_: Request) -> Response:
-        found = await live.next_frame(0, STUCK)
-        if found is None:
+        frame_ = await live.next_frame(0, STUCK)
+        if frame_ is None:
             return PlainTextResponse("no frame yet", 503)
-        return Response(found[1], media_type="image/jpeg")
+        return Response(frame_[1], media_type="image/jpeg")
 
     async def frames() -> AsyncIterator[bytes]:
-        seen = 0
-        while (found := await live.next_frame(seen)) is not None:
-            seen, jpeg = found
+        last = 0
+        while (latest := await live.next_frame(last)) is not None:
+            last, jpeg = latest
             head = b"--%s\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % (BOUNDARY, len(jpeg))
             yield head + jpeg + b"\r\n"
             await asyncio.sleep(1.0 / MOST_RATE)

@@ -58,12 +58,12 @@ class LocalFleet:
         self._simulation = simulation = Simulation(world, stage.scenario.robots, stage.seed)
         sim_bus = MemoryBus(self._hub)
         self._buses["sim"] = sim_bus
-        # The desk answers in the bus's thread while this one waits: never during a tick.
-        desk = GroundTruthService(simulation, lambda: set(self._agents), {}, lambda: None)
+        # The service answers in the bus's thread while this one waits: never during a tick.
+        ground_truth = GroundTruthService(simulation, lambda: set(self._agents), {}, lambda: None)
 
         def answer(request: Request) -> None:
             try:
-                request.reply(desk.answer(request.payload))
+                request.reply(ground_truth.answer(request.payload))
             except MapweaveError as error:
                 request.refuse(str(error))
 
@@ -115,7 +115,7 @@ class LocalFleet:
         )
         self._agents[robot] = Agent(
             lambda: simulation.describe(robot), bus, self.keys, stage.settings, options,
-            say=self._log.append,
+            print_line=self._log.append,
         )  # fmt: skip
 
     def kill_server(self) -> None:
@@ -150,7 +150,7 @@ class LocalFleet:
         self._hub.calm(self._buses[robot])
 
     def end(self) -> None:
-        """Close everything, the server last; what was said is written down."""
+        """Close everything, the server last; the output is written."""
         for robot in list(self._agents):
             agent = self._agents[robot]
             agent.write_map()

@@ -118,7 +118,7 @@ class NetworkEmulator:
 
 
 def _break(end: socket.socket) -> None:
-    # Whoever waits in recv or accept is woken by shutdown, not by close.
+    # Threads in recv or accept are woken by shutdown, not by close.
     with contextlib.suppress(OSError):
         end.shutdown(socket.SHUT_RDWR)
     end.close()

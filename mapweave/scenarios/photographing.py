@@ -1,4 +1,4 @@
-"""Somebody maps a stretch by photographs alone, before a robot shall drive along it."""
+"""A person maps a stretch by photographs alone, before a robot drives along it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mapweave.sim.robots import camera_from_table
 PATIENCE = 60.0
 """Wall time that the server may take to acknowledge the map, s."""
 OFF = (0.15, 0.08, 0.15)
-"""Standard deviations by which a robot is put beside the first photograph, m, m and rad."""
+"""Standard deviations of a robot's start pose around the first photograph, m, m and rad."""
 
 
 def photograph(stage: Stage, fleet: Fleet, action: Photograph) -> dict[NodeId, Pose2]:

@@ -16,27 +16,28 @@ from mapweave.wire.zenoh_bus import ZenohBus
 
 PATIENCE = 60.0
 """How long a process may take to come up, s."""
-LOOK_EVERY = 2.0
-"""How often it is looked whether everybody is alive while time passes, s."""
+CHECK_EVERY = 2.0
+"""How often the processes are checked while time passes, s."""
 
 
 class ProcessFleet:
     """Server, simulator and agents as processes on this machine.
 
-    Robots reach their bodies over the simulator's own endpoint and the fleet over the server's, as a robot's
-    wheels do not hang on its Wi-Fi. Robots whose network the scenario touches reach the server over a cable.
+    Robots reach their bases over the simulator's own endpoint and the fleet over the server's, since a
+    robot's wheels do not depend on its Wi-Fi. Robots whose network the scenario touches reach the server over
+    a cable.
     """
 
     def __init__(self, stage: Stage) -> None:
         """Nothing runs yet."""
         self._stage = stage
         self.keys = Keys(FLEET)
-        self._fleet_port, self._body_port = free_port(), free_port()
+        self._fleet_port, self._simulator_port = free_port(), free_port()
         self._children = Children(stage.out / "logs")
         self._cables: dict[str, NetworkEmulator] = {}
         self._started = False
         self.bus = _client(self._fleet_port)
-        self._sim_bus = _client(self._body_port)
+        self._sim_bus = _client(self._simulator_port)
         self.control = SimControl(self._sim_bus, FLEET, timeout=60.0)
 
     def start(self) -> None:
@@ -44,12 +45,12 @@ class ProcessFleet:
         stage, scenario = self._stage, self._stage.scenario
         touched = {e.table["robot"] for e in scenario.events if e.table["do"] in ("cut", "worsen", "restore")}
         self._cables = {robot: NetworkEmulator(self._fleet_port, stage.seed) for robot in sorted(touched)}
-        overrides = [part for one in scenario.overrides for part in ("--set", one)]
+        overrides = [part for override in scenario.overrides for part in ("--set", override)]
         self.start_server()
         self._children.start(
             "sim",
             ["sim", "serve", str(scenario.path), "--seed", str(stage.seed), *overrides, "--held",
-             "--listen", _endpoint(self._body_port), "--fleet", FLEET],
+             "--listen", _endpoint(self._simulator_port), "--fleet", FLEET],
         )  # fmt: skip
         self._until(self._simulating, "the simulator does not come up")
         for robot in stage.robots:
@@ -57,8 +58,8 @@ class ProcessFleet:
         self._until(lambda: self._active() == set(stage.robots), "an agent does not come up")
 
     def advance(self, tick: int) -> None:
-        """Let the simulator go on, and look now and then whether everybody is alive."""
-        while not self.control.advance(tick, LOOK_EVERY):
+        """Let the simulator go on, and check the processes now and then."""
+        while not self.control.advance(tick, CHECK_EVERY):
             self._children.check()
 
     def kill_agent(self, robot: str) -> None:
@@ -69,7 +70,7 @@ class ProcessFleet:
         )
 
     def start_agent(self, robot: str) -> None:
-        """Start it anew; returns when it has asked for a step."""
+        """Start it again; returns when it has asked for a step."""
         self._start_agent(robot)
         self._until(lambda: robot in self._active(), f"agent {robot} does not come up")
 
@@ -80,7 +81,7 @@ class ProcessFleet:
             "agent", robot, "--data", str(stage.agents), "--epoch", str(FIRST_EPOCH),
             "--seed", str(stage.agent_seed(robot)), "--lockstep", "--fleet", FLEET,
             "--mission", stage.scenario.missions[robot],
-            "--connect", _endpoint(port), "--body", _endpoint(self._body_port),
+            "--connect", _endpoint(port), "--body", _endpoint(self._simulator_port),
         ]  # fmt: skip
         self._children.start(robot, [*arguments, *self._settings()])
 

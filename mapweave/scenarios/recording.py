@@ -1,4 +1,4 @@
-"""What a trial leaves behind for scoring: truth beside what robots and server said. No judgement yet."""
+"""Recording of a trial for scoring: ground truth and the messages of robots and server."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Fix:
-    """What a lost robot was told, or found out.
+    """How a lost robot was localized.
 
     Attributes:
         stamp_ns: when.
@@ -53,7 +53,7 @@ class Lost:
         world_from_robot: where exactly (truth).
         goal: node to which it shall go, if any.
         fix: the first after the kidnapping.
-        arrived_ns: when it said that it had arrived.
+        arrived_ns: when it reported that it had arrived.
         gave_up_ns: when the scenario stopped waiting.
         legs: nodes of its route.
     """
@@ -75,8 +75,8 @@ class RobotRecord:
 
     Attributes:
         truth: `world_from_robot` at every tick.
-        estimates: while mapping, `map_from_robot` of each of its maps (an agent that had to begin anew has
-            several), but for the time in which it said that it did not know where it was.
+        estimates: while mapping, `map_from_robot` of each of its maps (an agent that had to begin a new map
+            has several), without the time in which it reported that it was lost.
         collisions: how often it ran into something.
         map_bytes: of changes as they went over the wire.
         wire_bytes: of everything that the agent sent or received over the fleet's network.
@@ -123,7 +123,7 @@ class Recording:
         recoveries_s: wall seconds from the return of a network, server or agent until all was well again.
         sim_s: simulated time.
         wall_s: how long that took.
-        wall: s by part, as far as known.
+        wall: s by part, where known.
         photographed: where photographs that are nodes were really taken: `world_from_robot`.
     """
 

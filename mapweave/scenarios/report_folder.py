@@ -46,7 +46,7 @@ def write_folder(
     | `scenario.toml` | the scenario, to run it again |
     | `merged.mapweave` | the merged map |
     | `r0.truth.tum` | the robot's true trajectory, in world |
-    | `r0.map-1.tum` | what it believed in its map of epoch 1, in that map's frame |
+    | `r0.map-1.tum` | its estimate in its map of epoch 1, in that map's frame |
     | `r0.nodes.tum` | its places in the merged map, each component aligned with the world |
 
     Args:
@@ -123,7 +123,7 @@ def _map_picture(
         for name, r in recording.robots.items()
         if len(r.truth.poses)
     }
-    known = [e for e in whole.edges.values() if e.a in truth and e.b in truth]
+    with_truth = [e for e in whole.edges.values() if e.a in truth and e.b in truth]
     return MapPicture(
         title=title,
         poses=places,
@@ -131,7 +131,7 @@ def _map_picture(
         outline=outline_of(recording.plan),
         drives=[_drive(lost, recording.robots[lost.robot].truth, truth) for lost in recording.lost],
         starts=starts,
-        false=frozenset(e.id for e in known if is_false(e, truth)),
+        false=frozenset(e.id for e in with_truth if is_false(e, truth)),
     )
 
 

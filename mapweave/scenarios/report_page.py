@@ -43,7 +43,7 @@ def report_page(
         figures: what it measured.
         verdicts: what came of the expectations.
         files: names of the truth's and the estimate's trajectory file of each map that was driven.
-        film: whether a film lies beside it.
+        film: whether there is a film next to it.
     """
     passed = all(v.good for v in verdicts)
     lines = [f"# {recording.scenario}, seed {recording.seed}: {'passed' if passed else 'FAILED'}", ""]
@@ -59,7 +59,7 @@ def report_page(
     ]
     lines += ["![Position error over time](errors.png)", ""]
     if film:
-        lines += ["[Film](film.webm): from above, beside the cameras.", ""]
+        lines += ["[Film](film.webm): from above, next to the cameras.", ""]
     lines += [
         "## Figures",
         "",

@@ -1,4 +1,4 @@
-"""What agents and server say of themselves during a trial: asked between ticks, and heard meanwhile."""
+"""Status of agents and server during a trial: asked between ticks, and received as messages."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ServerReport:
 
 
 class Reports:
-    """Asks for the present, and keeps what each robot believed of its pose while it mapped."""
+    """Asks for the present status, and keeps each robot's pose estimates while it mapped."""
 
     def __init__(self, bus: Bus, keys: Keys) -> None:
         """Begin to listen."""
@@ -67,7 +67,7 @@ class Reports:
         self._closing = bus.subscribe(keys.agent_statuses(), self._hear)
 
     def agent(self, robot: str) -> AgentStatus | None:
-        """What an agent says of its last tick; None if it cannot be reached."""
+        """An agent's status at its last tick; None if it cannot be reached."""
         for reply in self._bus.ask(self._keys.agent_status(robot), b"", 5.0):
             if not reply.error:
                 report = decode_agent_status(reply.payload)
@@ -77,11 +77,11 @@ class Reports:
 
     def agents(self, robots: Iterable[str]) -> dict[str, AgentStatus]:
         """Of those that can be reached."""
-        found = ((robot, self.agent(robot)) for robot in robots)
-        return {robot: report for robot, report in found if report is not None}
+        statuses = ((robot, self.agent(robot)) for robot in robots)
+        return {robot: report for robot, report in statuses if report is not None}
 
     def server(self, name: str) -> ServerReport:
-        """What the server says when it has merged all that has come.
+        """The server's status when it has merged everything.
 
         Raises:
             NotConnected: it does not answer, or cannot.
@@ -95,14 +95,16 @@ class Reports:
     def estimates(self, robot: str) -> dict[MapId, Trajectory]:
         """`map_from_robot` over time, of each map that the robot made."""
         with self._lock:
-            mine = {one: dict(sorted(p.items())) for one, p in self._poses.items() if one.agent == robot}
+            by_map = {
+                map_id: dict(sorted(p.items())) for map_id, p in self._poses.items() if map_id.agent == robot
+            }
         return {
-            one: Trajectory(np.array(list(p), dtype=np.int64), np.array(list(p.values())).reshape(-1, 3))
-            for one, p in mine.items()
+            map_id: Trajectory(np.array(list(p), dtype=np.int64), np.array(list(p.values())).reshape(-1, 3))
+            for map_id, p in by_map.items()
         }
 
     def traffic(self, robot: str) -> int:
-        """Bytes over the fleet's network, over all lives of the agent, as far as it could say."""
+        """Bytes over the fleet's network, over all processes of the agent, where reported."""
         with self._lock:
             return sum(self._traffic.get(robot, []))
 
@@ -117,11 +119,11 @@ class Reports:
         status = report.status
         with self._lock:
             lives = self._traffic.setdefault(robot, [0])
-            # A counter that has fallen belongs to an agent that was started anew.
+            # A counter that has fallen belongs to an agent that was started again.
             if report.traffic < lives[-1]:
                 lives.append(0)
             lives[-1] = report.traffic
-            # A robot that says that it does not know where it is claims no pose.
+            # A robot that reports that it is lost has no estimate.
             if status.mission in ("explore", "carried") and status.nodes and not status.astray:
                 pose = status.map_from_robot
                 by_stamp = self._poses.setdefault(MapId(robot, report.epoch), {})

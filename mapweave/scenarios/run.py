@@ -84,7 +84,7 @@ def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
     """Run a scenario and leave its report in a folder.
 
     Raises:
-        MapweaveError: something could not be started, or ended; one line says what.
+        MapweaveError: something could not be started, or ended; one line gives the reason.
     """
     from mapweave.scenarios.report_folder import write_folder
 
@@ -171,7 +171,7 @@ def _make_room(out: Path) -> None:
     """Take away what an earlier trial left in the folder, and nothing else.
 
     Raises:
-        SettingsError: folders stand there that no trial has made.
+        SettingsError: there are folders that no trial has made.
     """
     out.mkdir(parents=True, exist_ok=True)
     taken = [name for name in FOLDERS if (out / name).exists()]
@@ -182,4 +182,4 @@ def _make_room(out: Path) -> None:
     for pattern in FILES:
         for old in out.glob(pattern):
             old.unlink()
-    (out / OWN).write_text("A trial made the files beside this one; the next trial takes them away.\n")
+    (out / OWN).write_text("A trial made the files in this folder; the next trial removes them.\n")

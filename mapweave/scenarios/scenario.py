@@ -48,7 +48,7 @@ CONDITIONS = {
     "joined": "the merged map has one component that holds every robot's map",
     "explored": "no robot finds anything new to explore",
     "found": "the robot that was lost last knows where it is",
-    "arrived": "the robot that was sent last says that it has arrived",
+    "arrived": "the robot that was sent last reports that it has arrived",
     "grown": "the agent that was started last has made a new node",
 }
 
@@ -93,7 +93,7 @@ class ScenarioEvent:
     Attributes:
         when: it happens.
         action: what happens.
-        table: the same as it stands in the file, without the time.
+        table: the same as in the file, without the time.
     """
 
     when: When
@@ -114,7 +114,7 @@ class Scenario:
         expectations: what shall come of it.
         world_table: as in the file.
         path: the file; a world's file is found from its folder.
-        overrides: of what the file says.
+        overrides: of the file's values.
         seed: if the command line gives none.
         text: the file as it was read, with overrides noted.
     """
@@ -171,19 +171,19 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     Args:
         path: of the TOML file.
         overrides: `key=value` with dots between the names of nested tables and a TOML value, for example
-            `world.rooms=5`; they replace what the file says.
+            `world.rooms=5`; they replace the file's values.
 
     Raises:
-        SettingsError: one line says what is wrong and where.
+        SettingsError: one line with the reason and the place.
     """
     table = read_toml(path)
     for override in overrides:
         _override(table, override)
     where = str(path)
-    known = ("name", "summary", "seed", "robots", "robot", "world", "events", "expect")
+    keys = ("name", "summary", "seed", "robots", "robot", "world", "events", "expect")
     for name in table:
-        if name not in known:
-            raise SettingsError(f"{where}: no setting {name!r}; known are {', '.join(known)}")
+        if name not in keys:
+            raise SettingsError(f"{where}: no setting {name!r}; known are {', '.join(keys)}")
     seed = table.get("seed", 0)
     if type(seed) is not int or seed < 0:
         raise SettingsError(f"{where}: seed must be a whole number, 0 or more")

@@ -1,5 +1,5 @@
-"""Runs a scenario on a fleet, event by event. Time stands still while it looks or acts: so nothing that it
-decides depends on how quick the machine is.
+"""Runs a scenario on a fleet, event by event. Simulated time stops while the runner checks or acts: so its
+decisions do not depend on the speed of the machine.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from mapweave.scenarios.scenario import CONDITIONS, LONGEST, ScenarioEvent, When
 from mapweave.sim import events
 from mapweave.storage.map_file import MapFile
 
-LOOK_EVERY = {"joined": 10.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "grown": 1.0}
-"""How often it is looked whether something has come true, simulated s."""
+CHECK_EVERY = {"joined": 10.0, "explored": 5.0, "found": 1.0, "arrived": 1.0, "grown": 1.0}
+"""How often a condition is checked, simulated s."""
 STRIDE = 5.0
 """Time is let go on by at most this without showing progress, s."""
 HAPPEN_TRIES = 20
-"""How often an event is tried for which there is no room (nobody can walk through a robot), once a second."""
+"""How often an event without room is tried (a person cannot walk through a robot), once a second."""
 ABDUCT_TRIES, ABDUCT_PAUSE = 8, 10.0
 """How often a kidnapping is tried, and how long the robots explore on in between, simulated s."""
 RECOVERY_PATIENCE = 120.0
@@ -47,7 +47,7 @@ class ScenarioRunner:
         now: simulated time, s.
         done: how many events have happened.
         doing: what is waited for, or done.
-        agents: what those in reach said last.
+        agents: last status of those in reach.
         photographed: where photographs that are nodes were really taken: `world_from_robot`.
     """
 
@@ -63,7 +63,7 @@ class ScenarioRunner:
         Args:
             stage: what is tried, and where.
             fleet: started.
-            on_look: called whenever time stands still: for progress, film and live view.
+            on_look: called whenever simulated time stops: for progress, film and live view.
             stride: how long time goes on between two such calls at most, simulated s.
         """
         self._stage = stage
@@ -87,7 +87,7 @@ class ScenarioRunner:
         """All events, in order.
 
         Raises:
-            MapweaveError: somebody died who should not have, or an event cannot happen.
+            MapweaveError: a process died unexpectedly, or an event cannot happen.
         """
         for event in self._stage.scenario.events:
             self.doing = _in_words(event)
@@ -126,8 +126,8 @@ class ScenarioRunner:
                 if when.after:
                     self.note(f"{CONDITIONS[when.after]}: not within {when.within:.0f} s", True)
                 return
-            look = self.now + (LOOK_EVERY[when.after] if when.after and since is None else STRIDE)
-            self._advance(min(due, end, look))
+            next_check = self.now + (CHECK_EVERY[when.after] if when.after and since is None else STRIDE)
+            self._advance(min(due, end, next_check))
 
     def _advance(self, until: float) -> None:
         while self.now < until - 1e-6:
@@ -225,20 +225,20 @@ class ScenarioRunner:
                 self._happen(event.table)
 
     def _abduct(self, robot: str) -> None:
-        """Kidnap a robot; where those that stand idle are in the way, they first explore on for a while."""
+        """Kidnap a robot; where idle robots are in the way, they first explore on for a while."""
         for _ in range(ABDUCT_TRIES):
             reason = self._losing.abduct(robot)
             if not reason:
                 return
             idle = [name for name, agent in self.agents.items() if agent.status.mission == "idle"]
-            self.note(f"nobody can be kidnapped now, {', '.join(idle) or 'nobody'} explores on: {reason}")
+            self.note(f"no robot can be kidnapped now, {', '.join(idle) or 'none'} explores on: {reason}")
             for name in idle:
                 self._command(name, Explore())
             self._advance(self.now + ABDUCT_PAUSE)
             for name in idle:
                 self._command(name, Idle())
             self._advance(self.now + 1.0)
-        self.note(f"nobody is kidnapped: {reason}", True)
+        self.note(f"no robot is kidnapped: {reason}", True)
 
     def _happen(self, table: Mapping[str, Any]) -> None:
         """Something happens to the world, as soon as there is room for it."""
@@ -252,7 +252,7 @@ class ScenarioRunner:
         self.note(f"event {table['do']} did not happen within {HAPPEN_TRIES} s: {reason}", True)
 
     def _recover(self, began: float) -> None:
-        """Wait, while simulated time stands still, until the server has what every robot has."""
+        """Wait, while simulated time is stopped, until the server has all changes of every robot."""
         end = began + RECOVERY_PATIENCE
         while not self._all_well():
             if time.monotonic() > end:
@@ -263,7 +263,7 @@ class ScenarioRunner:
         self.note(f"all is well again after {self.recoveries_s[-1]:.2f} s of wall time")
 
     def _all_well(self) -> bool:
-        """Whether every agent that should be in reach is, and has told the server everything."""
+        """Whether every agent that should be in reach is, and has sent everything to the server."""
         names = sorted(self._alive - self._cut)
         agents = self.reports.agents(names)
         if len(agents) < len(names) or any(a.unsent or not a.linked for a in agents.values()):
@@ -284,9 +284,9 @@ class ScenarioRunner:
 def _in_words(event: ScenarioEvent) -> str:
     when = event.when
     table = {name: value for name, value in event.table.items() if name != "do"}
-    what = " ".join([str(event.table["do"]).replace("_", " "), *(str(v) for v in table.values())])
+    words_of_event = " ".join([str(event.table["do"]).replace("_", " "), *(str(v) for v in table.values())])
     if when.after:
-        return f"until {when.after} (at most {when.within:.0f} s), then {what}"
+        return f"until {when.after} (at most {when.within:.0f} s), then {words_of_event}"
     if when.at:
-        return f"at {when.at:.0f} s: {what}"
-    return f"{when.plus:.0f} s later: {what}" if when.plus else what
+        return f"at {when.at:.0f} s: {words_of_event}"
+    return f"{when.plus:.0f} s later: {words_of_event}" if when.plus else words_of_event

@@ -22,7 +22,7 @@ from mapweave.scenarios.trajectories import score_trajectory
 FOUND_M, FOUND_DEG = 0.25, 5.0
 """A first answer that is off by more does not count as found."""
 REACHED_M, REACHED_DEG = 0.05, 3.0
-"""A robot that stands farther from its goal has not reached it."""
+"""A robot farther from its goal has not reached it."""
 HALF_TICK_NS = 50_000_000
 
 
@@ -145,13 +145,13 @@ class _Fall:
 
 
 def _score_lost(lost: Lost, truth: Trajectory, nodes: Mapping[NodeId, Pose2]) -> _Fall:
-    found_m = found_deg = found_s = None
+    error_m = error_deg = after_s = None
     if lost.fix is not None:
-        found_s = (lost.fix.stamp_ns - lost.stamp_ns) / 1e9
-        # A node that the merged map does not hold has no truth: such an answer does not count.
+        after_s = (lost.fix.stamp_ns - lost.stamp_ns) / 1e9
+        # A node outside the merged map has no truth: such an answer does not count.
         if lost.fix.node in nodes:
             answered = nodes[lost.fix.node] @ lost.fix.node_from_robot
-            found_m, found_deg = _error(answered, pose_at(truth, lost.fix.stamp_ns))
+            error_m, error_deg = _error(answered, pose_at(truth, lost.fix.stamp_ns))
     goal_m = goal_deg = goal_s = None
     if lost.goal is not None and lost.goal in nodes:
         last_ns = int(truth.stamps_ns[-1])
@@ -160,10 +160,10 @@ def _score_lost(lost: Lost, truth: Trajectory, nodes: Mapping[NodeId, Pose2]) ->
     if lost.arrived_ns is not None:
         goal_s = (lost.arrived_ns - lost.stamp_ns) / 1e9
     return _Fall(
-        found=_within(found_m, found_deg, FOUND_M, FOUND_DEG),
-        found_error_m=found_m,
-        found_error_deg=found_deg,
-        found_s=found_s,
+        found=_within(error_m, error_deg, FOUND_M, FOUND_DEG),
+        found_error_m=error_m,
+        found_error_deg=error_deg,
+        found_s=after_s,
         has_goal=lost.goal is not None,
         reached=goal_s is not None and _within(goal_m, goal_deg, REACHED_M, REACHED_DEG),
         goal_error_m=goal_m,

@@ -24,10 +24,10 @@ def summary_table(scenario: Scenario, seed: int, trial: Trial) -> Table:
     table = Table(title=f"{scenario.name}, seed {seed}: {verdict}", show_header=False)
     table.add_column(justify="right", style="bold")
     table.add_column()
-    judged = {one.name: one for one in trial.verdicts}
-    for one in trial.verdicts:
-        colour = "green" if one.good else "red"
-        table.add_row(one.name, f"[{colour}]{'as wanted' if one.good else 'NOT as wanted'}[/]: {one}")
+    judged = {row.name: row for row in trial.verdicts}
+    for row in trial.verdicts:
+        colour = "green" if row.good else "red"
+        table.add_row(row.name, f"[{colour}]{'as wanted' if row.good else 'NOT as wanted'}[/]: {row}")
     for name in SHOWN:
         value = getattr(trial.figures, name)
         if name not in judged and value is not None:

@@ -24,7 +24,7 @@ class TerminalProgress:
         self._robots: dict[str, TaskID] = {
             robot: self._progress.add_task(robot, total=None, doing="starting") for robot in robots
         }
-        self._said = 0
+        self._printed = 0
 
     def __enter__(self) -> TerminalProgress:
         """Begin to show."""
@@ -42,14 +42,14 @@ class TerminalProgress:
         self._console.print(text)
 
     def stage(self, text: str) -> None:
-        """What is being done beside the scenario."""
+        """Print an activity outside the scenario."""
         self._progress.update(self._whole, doing=text)
 
     def look(self, conductor: ScenarioRunner) -> None:
-        """How far the trial is, and what everybody is doing."""
-        for moment in conductor.moments[self._said :]:
+        """Print the progress of the trial, and the activity of every robot."""
+        for moment in conductor.moments[self._printed :]:
             self._console.print(f"{moment.stamp_ns / 1e9:7.1f} s  {moment.text}", highlight=False)
-        self._said = len(conductor.moments)
+        self._printed = len(conductor.moments)
         doing = f"{conductor.now:6.1f} s  {conductor.doing}"
         self._progress.update(self._whole, completed=float(conductor.done), doing=doing[:110])
         for robot, task in self._robots.items():

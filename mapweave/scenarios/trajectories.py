@@ -48,8 +48,8 @@ def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore
     """Compare one map's trajectory with the truth.
 
     The alignment is the planar one of `mapweave.evaluation.map_score.align`: where evo's own in three
-    dimensions is unique, it is the same, and it also exists for a robot that drove straight ahead or stood
-    still.
+    dimensions is unique, it is the same, and it also exists for a robot that drove straight ahead or did not
+    move.
 
     Args:
         truth: `world_from_robot`.
@@ -61,20 +61,20 @@ def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore
     from evo.core import filters, metrics, sync
 
     try:
-        true, believed = sync.associate_trajectories(
+        true, estimated = sync.associate_trajectories(
             _evo_trajectory(truth), _evo_trajectory(estimate), max_diff=MAX_STAMP_DIFFERENCE
         )
     except sync.SyncException:
         raise InvalidValue("the truth knows no time of this trajectory") from None
-    world_from_map = align(believed.positions_xyz[:, :2], true.positions_xyz[:, :2])
-    believed.transform(_matrices(world_from_map.vector[None])[0])
+    world_from_map = align(estimated.positions_xyz[:, :2], true.positions_xyz[:, :2])
+    estimated.transform(_matrices(world_from_map.vector[None])[0])
     ape = metrics.APE(metrics.PoseRelation.translation_part)
-    ape.process_data((true, believed))
+    ape.process_data((true, estimated))
     rpe: list[float | None] = []
     for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg):
         relative = metrics.RPE(relation, RPE_DELTA, metrics.Unit.meters, pairs_from_reference=True)
         try:
-            relative.process_data((true, believed))
+            relative.process_data((true, estimated))
         except filters.FilterException:
             rpe.append(None)
         else:

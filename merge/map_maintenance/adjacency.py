@@ -28,18 +28,18 @@ class Adjacency:
             Those of pairs that were not linked before.
         """
         now = {id(link): link for link in links}
-        gone = [link for key, link in self._links.items() if key not in now]
+        removed = [link for key, link in self._links.items() if key not in now]
         come = [link for key, link in now.items() if key not in self._links]
         fresh = [link for link in come if self.between(link.a, link.b) is None]
-        self.touched = {node for link in (*gone, *come) for node in link.pair}
-        for link in gone:
-            for one, other in (link.pair, link.pair[::-1]):
-                del self._at[one][other]
-                if not self._at[one]:
-                    del self._at[one]
+        self.touched = {node for link in (*removed, *come) for node in link.pair}
+        for link in removed:
+            for a, b in (link.pair, link.pair[::-1]):
+                del self._at[a][b]
+                if not self._at[a]:
+                    del self._at[a]
         for link in come:
-            for one, other in (link.pair, link.pair[::-1]):
-                self._at.setdefault(one, {})[other] = link
+            for a, b in (link.pair, link.pair[::-1]):
+                self._at.setdefault(a, {})[b] = link
         self._links = now
         return fresh
 
@@ -48,5 +48,5 @@ class Adjacency:
         return self._at.get(node, {}).values()
 
     def between(self, a: NodeId, b: NodeId) -> Link | None:
-        """The link of two nodes, in whichever order they are given."""
+        """The link of two nodes, in either order."""
         return self._at.get(a, {}).get(b)

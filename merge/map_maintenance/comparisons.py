@@ -8,7 +8,7 @@ from mapweave.merge.pose_graph.verification import VerificationSettings, verify
 from mapweave.registration.matching import match
 
 MOST = 200_000
-"""Comparisons that are remembered; then it begins anew."""
+"""Comparisons that are cached; then the cache is emptied."""
 
 
 class Comparisons:
@@ -21,7 +21,7 @@ class Comparisons:
             settings: when two nodes are linked.
         """
         self._settings = settings or VerificationSettings()
-        self._known: dict[tuple[NodeId, NodeId], tuple[Node, Node, Link | None]] = {}
+        self._cache: dict[tuple[NodeId, NodeId], tuple[Node, Node, Link | None]] = {}
 
     def link(self, a: Node, b: Node, least: int) -> Link | None:
         """A verified link; None if the two are not recognised as one place.
@@ -29,15 +29,15 @@ class Comparisons:
         Args:
             a: one node.
             b: another one.
-            least: if fewer landmarks look alike, it is not looked any closer.
+            least: with fewer similar landmarks the nodes are not verified.
         """
         a, b = (a, b) if a.id < b.id else (b, a)
-        known = self._known.get((a.id, b.id))
-        if known is None or known[0] is not a or known[1] is not b:
-            if len(self._known) >= MOST:
-                self._known = {}
-            known = self._known[a.id, b.id] = a, b, self._verified(a, b, least)
-        return known[2]
+        entry = self._cache.get((a.id, b.id))
+        if entry is None or entry[0] is not a or entry[1] is not b:
+            if len(self._cache) >= MOST:
+                self._cache = {}
+            entry = self._cache[a.id, b.id] = a, b, self._verified(a, b, least)
+        return entry[2]
 
     def _verified(self, a: Node, b: Node, least: int) -> Link | None:
         alike = match(a.landmarks.codes, b.landmarks.codes, self._settings.recognition.matching)

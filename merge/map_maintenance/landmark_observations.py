@@ -1,9 +1,8 @@
-"""Looks: what one view of a place tells of the landmarks that a node has of it.
+"""Landmark observations: which landmarks of a node a later view of its place shows.
 
-A view should show a landmark if it projects well into the image, from a distance and direction from which it
-looks alike, and nothing that the view knows the depth of stands before it. It shows it if the two were
-matched when view and node were linked, or if it has a landmark near where this one projects that looks
-like it.
+A view should show a landmark if it projects well into the image, from a similar distance and direction, and
+if no known depth of the view is nearer in that direction. It shows it if the two were matched when view and
+node were linked, or if it has a landmark with a similar descriptor near the projection.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class LandmarkObservationSettings:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkObservations:
-    """What one later view tells of a node's landmarks.
+    """One later view's observation of a node's landmarks.
 
     Attributes:
         node: that has the landmarks.
@@ -54,7 +53,7 @@ class LandmarkObservations:
         between: node_from_view by which it was worked out.
         expected: (N,) which landmarks the view should show.
         found: (N,) which it shows.
-        sure: whether the view stands where it is thought to.
+        sure: whether the view's pose is certain.
     """
 
     node: Node
@@ -69,13 +68,13 @@ class LandmarkObservations:
     def of(
         node: Node, view: Node, link: Link | None, node_from_view: Pose2, s: LandmarkObservationSettings
     ) -> LandmarkObservations:
-        """Look for a node's landmarks in a view.
+        """Search for a node's landmarks in a view.
 
         Args:
             node: that has the landmarks.
             view: of its place.
             link: between the two, if there is one.
-            node_from_view: how they stand.
+            node_from_view: relative pose.
             s: when a landmark should be seen, and when it is.
         """
         shown = expected(node, view, node_from_view, s)
@@ -99,14 +98,16 @@ def expected(old: Node, new: Node, old_from_new: Pose2, s: LandmarkObservationSe
     Args:
         old: the node.
         new: the view.
-        old_from_new: how they stand.
+        old_from_new: relative pose.
         s: when a landmark should be seen.
     """
-    there = ProjectedView.of(old, new, old_from_new, MARGIN_PX, SCALE, ASIDE)
-    shown, candidates = there.fits, np.flatnonzero(there.fits)
+    projection = ProjectedView.of(old, new, old_from_new, MARGIN_PX, SCALE, ASIDE)
+    shown, candidates = projection.fits, np.flatnonzero(projection.fits)
     if len(candidates):
-        known = new.landmarks.take(new.landmarks.has_depth)
-        apart = np.linalg.norm(there.pixels[candidates, None] - known.pixels[None], axis=2)
-        before = (apart < BEFORE_PX) & (known.depths[None] < BEFORE * there.depths[candidates, None])
+        with_depth = new.landmarks.take(new.landmarks.has_depth)
+        apart = np.linalg.norm(projection.pixels[candidates, None] - with_depth.pixels[None], axis=2)
+        before = (apart < BEFORE_PX) & (
+            with_depth.depths[None] < BEFORE * projection.depths[candidates, None]
+        )
         shown[candidates[before.any(axis=1)]] = False
     return shown

@@ -1,20 +1,19 @@
-"""Fading: landmarks that later views should have shown again and again, and did not, are thought to be gone.
+"""Faded landmarks: later views should have shown them repeatedly and did not, so they are probably gone.
 
-A landmark is there or it is not. From one visit of its place to the next it may have gone, or come back. A
-view that should show it finds it with a probability q if it is there, and by mistake with a small one if it
-is not. So what is believed of it is a hidden Markov chain of two states, filtered forward from visit to visit
-(compare the persistence filter of Rosen, Mason and Leonard, ICRA 2016). How often a landmark that is there is
-found again is measured in each view by all that it should show: descriptors fail, and nodes keep only some of
-what they saw.
+A landmark is present or absent. From one visit of its place to the next it may disappear or come back. A view
+that should show it finds it with a probability q if it is present, and by mistake with a small one if it is
+absent. So its presence is a hidden Markov chain of two states, filtered forward from visit to visit (compare
+the persistence filter of Rosen, Mason and Leonard, ICRA 2016). The rate q is measured in each view on all the
+landmarks that it should show: descriptors fail, and nodes keep only some of their features.
 
-That a view misses one landmark says little, for it misses most. But landmarks go together: who moves a
-cupboard moves all of its landmarks. So a landmark that a view does not find is judged with those around it,
-as one thing that is there or is gone. Somebody may stand before it unknown to all, for as long as a visit
-takes; so no single visit is enough.
+One missed landmark is weak evidence, since a view misses most of them. But landmarks belong to things: a
+cupboard that is moved takes all of its landmarks along. So a missed landmark is judged together with those
+around it, as one thing that is present or absent. An unmapped person may occlude it during a whole visit; so
+a single visit is never enough.
 
-The views are all that stand near in the merged map, linked with the node or not: the better a place is known
-to have changed, the fewer are linked with it. A view that is not linked tells only if the merged map is sure
-where it stands.
+The views are all that are near in the merged map, linked with the node or not: the more a place has changed,
+the fewer views are linked with it. A view that is not linked counts only if its pose in the merged map is
+certain.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 RATES = (0.1, 0.9)
 """Within which the share is held that a view finds of what it should show."""
 LEAST_SHOWN = 15
-"""A view that should show fewer landmarks tells nothing."""
+"""A view that should show fewer landmarks is not used."""
 SURE = (0.05, 0.05, 0.03)
 """M, m and rad, nor does one that the merged map does not place within one sigma of this."""
 WEIGHT = 15.0
@@ -52,7 +51,7 @@ WEIGHT = 15.0
 THING = 0.3
 """M, landmarks that are nearer than this to each other go together."""
 HIDDEN = 0.05
-"""Probability that a thing is hidden during a visit by what nobody knows of."""
+"""Probability that a thing is occluded during a visit by something unmapped."""
 MISTAKEN = 0.01
 """Probability that a landmark that is gone is found all the same."""
 GOES = 0.02
@@ -64,11 +63,11 @@ AT_FIRST = 0.95
 FAINT = 0.2
 """A landmark that is there with less than this has faded."""
 NEAR = 2.5
-"""M, views of a place that are not linked with it stand within this."""
+"""M, views of a place that are not linked with it are within this."""
 TURNED = math.radians(45.0)
 """Rad, and are turned by at most this."""
 MOST = 12
-"""So many of them are looked at, the newest."""
+"""So many of them are used, the newest."""
 AGAIN = 120.0
 """S, views of one map that lie nearer in time are of one visit."""
 
@@ -92,7 +91,7 @@ class LandmarkRemovalSettings:
 
 
 class LandmarkRemover:
-    """Goes from merged map to merged map with what later views tell: each is compared once."""
+    """Keeps the landmark observations from merged map to merged map: each view is compared once."""
 
     def __init__(self, settings: LandmarkRemovalSettings | None = None) -> None:
         """Begin with nothing seen again.
@@ -102,15 +101,15 @@ class LandmarkRemover:
         """
         self._settings = settings or LandmarkRemovalSettings()
         s = self._settings
-        self._looks: dict[NodeId, list[LandmarkObservations]] = {}
+        self._observations: dict[NodeId, list[LandmarkObservations]] = {}
         self._faded: dict[NodeId, NDArray[np.bool_]] = {}
         self._graphs: tuple[PoseGraph, ...] = ()
         self._links = Adjacency()
-        # Two nodes have drifted by a part of what matters each, since one of them was looked at and before.
+        # Each of two nodes may move by a part of `moved`, before and after their comparison.
         self._drift = ChangedNodes(s.moved / 8.0, s.moved / (4.0 * NEAR))
 
     def fade(self, merged: MergedMap) -> MergedMap:
-        """The same map with the landmarks that have faded, of nodes that no others stand for.
+        """The same map with the faded landmarks of its active nodes.
 
         Args:
             merged: the next merged map of the same fleet.
@@ -118,14 +117,14 @@ class LandmarkRemover:
         solved = {id(graph) for graph in self._graphs}
         self._graphs = merged.graphs
         self._links.follow(merged.links)
-        for node_id in self._drift.gone(merged.components):
-            self._looks.pop(node_id, None)
+        for node_id in self._drift.removed(merged.components):
+            self._observations.pop(node_id, None)
             self._faded.pop(node_id, None)
         for graph in merged.graphs:
             if id(graph) not in solved:
                 self._fade(merged, graph)
-        living = {one: gone for one, gone in sorted(self._faded.items()) if one not in merged.superseded}
-        return replace(merged, faded=living)
+        active = {node: mask for node, mask in sorted(self._faded.items()) if node not in merged.superseded}
+        return replace(merged, faded=active)
 
     def _fade(self, merged: MergedMap, graph: PoseGraph) -> None:
         nodes = [merged.maps[node.map].nodes[node] for node in graph.nodes]
@@ -133,88 +132,102 @@ class LandmarkRemover:
         for row in self._affected(graph, nodes, tree, merged.superseded):
             node = nodes[row]
             linked = {link.b if link.a == node.id else link.a: link for link in self._links.at(node.id)}
-            near = [nodes[k] for k in self._around(graph, row, tree)]
-            views = self._views(node, near, [nodes[graph.rows[one]] for one in linked])
-            before = self._looks.get(node.id)
-            self._looks[node.id] = looks = self._seen(merged, graph, node, views, linked)
-            if before is not None and list(map(id, before)) == list(map(id, looks)):
+            nearby = [nodes[k] for k in self._around(graph, row, tree)]
+            views = self._views(node, nearby, [nodes[graph.rows[observation]] for observation in linked])
+            before = self._observations.get(node.id)
+            self._observations[node.id] = observations = self._observe(merged, graph, node, views, linked)
+            if before is not None and list(map(id, before)) == list(map(id, observations)):
                 continue
-            gone = presence(things(node, THING), [one for one in looks if tells(one, s)], s) < FAINT
+            faded = (
+                presence(
+                    things(node, THING),
+                    [observation for observation in observations if is_informative(observation, s)],
+                    s,
+                )
+                < FAINT
+            )
             self._faded.pop(node.id, None)
-            if gone.any():
-                self._faded[node.id] = gone
+            if faded.any():
+                self._faded[node.id] = faded
 
     def _affected(
         self, graph: PoseGraph, nodes: Sequence[Node], tree: cKDTree, but: Container[NodeId]
     ) -> list[int]:
-        """Rows of nodes of which the later views may tell something else than they did before."""
-        told = self._drift.told(nodes, graph.means)
+        """Rows of nodes whose observations may have changed."""
+        changed = self._drift.changed(nodes, graph.means)
         touched = [graph.rows[node] for node in self._links.touched if node in graph.rows]
-        seen = np.array([node.id in self._looks for node in nodes], np.bool_)
-        affected = told | ~seen
+        observed = np.array([node.id in self._observations for node in nodes], np.bool_)
+        affected = changed | ~observed
         affected[touched] = True
-        if not told.all():
-            for row in np.flatnonzero(told).tolist():
+        if not changed.all():
+            for row in np.flatnonzero(changed).tolist():
                 affected[self._around(graph, row, tree)] = True
-                views = (one for link in self._links.at(nodes[row].id) for one in link.pair)
-                affected[[graph.rows[one] for one in views]] = True
+                views = (node_id for link in self._links.at(nodes[row].id) for node_id in link.pair)
+                affected[[graph.rows[node_id] for node_id in views]] = True
         rows = np.flatnonzero(affected).tolist()
         for node in (nodes[row].id for row in rows if nodes[row].id in but):
-            # If it comes back to life it is looked at anew.
-            self._looks.pop(node, None)
+            # A node that becomes active again is observed again.
+            self._observations.pop(node, None)
         return [row for row in rows if nodes[row].id not in but]
 
     def _around(self, graph: PoseGraph, row: int, tree: cKDTree) -> list[int]:
-        """Rows of nodes that stand near a node and look about the same way, itself among them."""
-        near = np.sort(tree.query_ball_point(graph.means[row, :2], NEAR))
-        turns = np.cos(graph.means[near, 2] - graph.means[row, 2])
-        out: list[int] = near[turns > math.cos(TURNED)].tolist()
+        """Rows of nodes near a node with a similar heading, itself among them."""
+        nearby = np.sort(tree.query_ball_point(graph.means[row, :2], NEAR))
+        turns = np.cos(graph.means[nearby, 2] - graph.means[row, 2])
+        out: list[int] = nearby[turns > math.cos(TURNED)].tolist()
         return out
 
-    def _views(self, node: Node, near: Sequence[Node], linked: Sequence[Node]) -> list[Node]:
+    def _views(self, node: Node, nearby: Sequence[Node], linked: Sequence[Node]) -> list[Node]:
         """Later views of a node's place, the earliest first."""
-        known = {one.id for one in linked}
-        others = [one for one in near if one.id not in known and is_older(node, one)]
-        others = [
-            one
-            for one in others
-            if one.id.map != node.id.map or one.stamp_ns - node.stamp_ns > AGAIN * SECOND
+        linked_ids = {candidate.id for candidate in linked}
+        unlinked = [
+            candidate for candidate in nearby if candidate.id not in linked_ids and is_older(node, candidate)
         ]
-        newest = sorted(others, key=lambda one: (one.stamp_ns, one.id))[-MOST:]
-        views = [*(one for one in linked if is_older(node, one)), *newest]
-        return sorted(views, key=lambda one: (one.stamp_ns, one.id))
+        unlinked = [
+            candidate
+            for candidate in unlinked
+            if candidate.id.map != node.id.map or candidate.stamp_ns - node.stamp_ns > AGAIN * SECOND
+        ]
+        newest = sorted(unlinked, key=lambda candidate: (candidate.stamp_ns, candidate.id))[-MOST:]
+        views = [*(candidate for candidate in linked if is_older(node, candidate)), *newest]
+        return sorted(views, key=lambda candidate: (candidate.stamp_ns, candidate.id))
 
-    def _seen(
+    def _observe(
         self, merged: MergedMap, graph: PoseGraph, node: Node, views: list[Node], linked: dict[NodeId, Link]
     ) -> list[LandmarkObservations]:
-        """What the views tell; what they told before holds while they stand to the node as they did."""
+        """Observations by the views; earlier ones are kept while the relative poses have not changed."""
         s = self._settings
-        before = {id(look.view): look for look in self._looks.get(node.id, ())}
-        looks: list[LandmarkObservations] = []
-        doubted: list[int] = []
+        before = {id(observation.view): observation for observation in self._observations.get(node.id, ())}
+        observations: list[LandmarkObservations] = []
+        unlinked: list[int] = []
         for view in views:
             between = merged.pose(node.id).inverse() @ merged.pose(view.id)
-            link, look = linked.get(view.id), before.get(id(view))
-            if look is None or look.node is not node or look.link is not link or self._off(look, between):
-                look = LandmarkObservations.of(node, view, link, between, s.looks)
-                if link is None and look.expected.sum() >= LEAST_SHOWN:
-                    doubted.append(len(looks))
-            looks.append(look)
-        if doubted:
-            there = graph.relative([node.id] * len(doubted), [looks[k].view.id for k in doubted])
-            sigmas = np.sqrt(np.diagonal(there.covariances, axis1=1, axis2=2))
-            for k, those in zip(doubted, sigmas, strict=True):
-                looks[k] = replace(looks[k], sure=bool((those <= SURE).all()))
-        return looks
+            link, observation = linked.get(view.id), before.get(id(view))
+            if (
+                observation is None
+                or observation.node is not node
+                or observation.link is not link
+                or self._off(observation, between)
+            ):
+                observation = LandmarkObservations.of(node, view, link, between, s.looks)
+                if link is None and observation.expected.sum() >= LEAST_SHOWN:
+                    unlinked.append(len(observations))
+            observations.append(observation)
+        if unlinked:
+            relative = graph.relative([node.id] * len(unlinked), [observations[k].view.id for k in unlinked])
+            sigmas = np.sqrt(np.diagonal(relative.covariances, axis1=1, axis2=2))
+            for k, sigma in zip(unlinked, sigmas, strict=True):
+                observations[k] = replace(observations[k], sure=bool((sigma <= SURE).all()))
+        return observations
 
-    def _off(self, look: LandmarkObservations, between: Pose2) -> bool:
-        off = look.between.inverse() @ between
+    def _off(self, observation: LandmarkObservations, between: Pose2) -> bool:
+        off = observation.between.inverse() @ between
         return max(off.distance(Pose2()), abs(off.heading)) >= self._settings.moved
 
 
-def tells(look: LandmarkObservations, s: LandmarkRemovalSettings) -> bool:
-    """Whether a view tells anything: it should show enough, and stands where it is thought to."""
-    return int(look.expected.sum()) >= LEAST_SHOWN and look.sure
+def is_informative(observation: LandmarkObservations, s: LandmarkRemovalSettings) -> bool:
+    """Whether a view is informative: it should show enough landmarks, and its pose is certain."""
+    return int(observation.expected.sum()) >= LEAST_SHOWN and observation.sure
 
 
 def things(node: Node, size: float) -> NDArray[np.bool_]:
@@ -225,72 +238,77 @@ def things(node: Node, size: float) -> NDArray[np.bool_]:
         size: m, what is nearer to each other may be.
     """
     points = node.points_in_robot
-    near: NDArray[np.bool_] = (cdist(points, points) < size) | np.eye(len(points), dtype=np.bool_)
-    return near
+    together: NDArray[np.bool_] = (cdist(points, points) < size) | np.eye(len(points), dtype=np.bool_)
+    return together
 
 
 def presence(
-    together: NDArray[np.bool_], looks: Sequence[LandmarkObservations], s: LandmarkRemovalSettings
+    together: NDArray[np.bool_], observations: Sequence[LandmarkObservations], s: LandmarkRemovalSettings
 ) -> Array:
     """(N,) probability that each landmark of a node is still there after some views.
 
     Args:
         together: (N, N) which of them may be of one thing, see `things`.
-        looks: later views of it that tell something, the earliest first.
+        observations: informative later views of it, the earliest first.
         s: how landmarks come and go.
     """
-    there = np.full(len(together), AT_FIRST)
-    for visit in visits(looks, AGAIN):
-        # Of the visit's views together: if it is there and in sight, there and hidden, and gone.
-        in_sight, hidden, gone = np.ones((3, len(together)))
-        told = np.zeros(len(together), np.bool_)
-        for look in visit:
-            again = look.found & look.expected
-            rate = found_again(together, look, s)
-            # One that is found is there, whatever is around it; one that is not is judged with its thing.
-            seen = np.where(look.found, 1, together @ again.astype(np.int64))
-            missed = np.where(look.found, 0, together @ (look.expected & ~look.found).astype(np.int64))
-            tells_of = look.expected | look.found
-            in_sight *= np.where(tells_of, rate**seen * (1.0 - rate) ** missed, 1.0)
-            hidden *= np.where(tells_of, seen == 0, 1.0)
-            gone *= np.where(tells_of, MISTAKEN**seen * (1.0 - MISTAKEN) ** missed, 1.0)
-            told |= tells_of
-        if_there = (1.0 - HIDDEN) * in_sight + HIDDEN * hidden
-        prior = there * (1.0 - GOES) + (1.0 - there) * COMES
-        posterior = prior * if_there / (prior * if_there + (1.0 - prior) * gone)
-        there = np.where(told, posterior, there)
-    return there
+    present = np.full(len(together), AT_FIRST)
+    for visit in visits(observations, AGAIN):
+        # Likelihoods of the visit's views: present and visible, present and occluded, absent.
+        visible, hidden, absent = np.ones((3, len(together)))
+        informed = np.zeros(len(together), np.bool_)
+        for observation in visit:
+            again = observation.found & observation.expected
+            rate = detection_rate(together, observation, s)
+            # A found landmark is present, regardless of its neighbours; a missed one is judged with its
+            # thing.
+            found = np.where(observation.found, 1, together @ again.astype(np.int64))
+            missed = np.where(
+                observation.found, 0, together @ (observation.expected & ~observation.found).astype(np.int64)
+            )
+            informative = observation.expected | observation.found
+            visible *= np.where(informative, rate**found * (1.0 - rate) ** missed, 1.0)
+            hidden *= np.where(informative, found == 0, 1.0)
+            absent *= np.where(informative, MISTAKEN**found * (1.0 - MISTAKEN) ** missed, 1.0)
+            informed |= informative
+        if_present = (1.0 - HIDDEN) * visible + HIDDEN * hidden
+        prior = present * (1.0 - GOES) + (1.0 - present) * COMES
+        posterior = prior * if_present / (prior * if_present + (1.0 - prior) * absent)
+        present = np.where(informed, posterior, present)
+    return present
 
 
-def visits(looks: Sequence[LandmarkObservations], again: float) -> list[list[LandmarkObservations]]:
-    """Looks visit by visit.
+def visits(observations: Sequence[LandmarkObservations], again: float) -> list[list[LandmarkObservations]]:
+    """Observations grouped by visit.
 
     Args:
-        looks: the earliest first.
-        again: s, views of one map that lie nearer to the one before are of one visit.
+        observations: the earliest first.
+        again: s, views of one map with smaller gaps in time are of one visit.
     """
-    found: list[list[LandmarkObservations]] = []
-    for look in looks:
-        view, last = look.view, found[-1][-1].view if found else None
+    grouped: list[list[LandmarkObservations]] = []
+    for observation in observations:
+        view, last = observation.view, grouped[-1][-1].view if grouped else None
         if last is None or last.id.map != view.id.map or view.stamp_ns - last.stamp_ns >= again * SECOND:
-            found.append([])
-        found[-1].append(look)
-    return found
+            grouped.append([])
+        grouped[-1].append(observation)
+    return grouped
 
 
-def found_again(together: NDArray[np.bool_], look: LandmarkObservations, s: LandmarkRemovalSettings) -> float:
+def detection_rate(
+    together: NDArray[np.bool_], observation: LandmarkObservations, s: LandmarkRemovalSettings
+) -> float:
     """How often a view finds a landmark that it should show and that is there.
 
-    That is measured where it finds something else of the same thing, as far as there is enough of it: so what
-    has gone does not count.
+    Measured on landmarks of which another one of the same thing is found, if there are enough: so absent
+    things do not count.
 
     Args:
         together: (N, N) which landmarks may be of one thing.
-        look: what the view shows.
+        observation: of the view.
         s: within which bounds.
     """
-    again = look.found & look.expected
-    others: NDArray[np.int64] = together @ again.astype(np.int64) - again
-    firm = look.expected & (others > 0)
+    again = observation.found & observation.expected
+    others_found: NDArray[np.int64] = together @ again.astype(np.int64) - again
+    firm = observation.expected & (others_found > 0)
     rate = ((again & firm).sum() + s.usual * WEIGHT) / (firm.sum() + WEIGHT)
     return float(np.clip(rate, *RATES))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from mapweave.hybridmap.node import Node
 
 
-def is_older(one: Node, other: Node) -> bool:
+def is_older(a: Node, b: Node) -> bool:
     """Whether a node was taken before another one.
 
-    An agent counts its epochs and its nodes, whatever its clock says. Of two agents the clocks tell; where
-    they cannot be compared the answer is always the same, and means little.
+    An agent counts its epochs and its nodes, so its clock does not matter. Between two agents the clocks
+    decide; without a common clock the answer is arbitrary, but always the same.
     """
-    if one.id.agent == other.id.agent:
-        return one.id < other.id
-    return (one.stamp_ns, one.id) < (other.stamp_ns, other.id)
+    if a.id.agent == b.id.agent:
+        return a.id < b.id
+    return (a.stamp_ns, a.id) < (b.stamp_ns, b.id)

@@ -1,15 +1,15 @@
-"""Renewal: nodes that others of the same place stand for, so that a map does not grow with every drive.
+"""Node superseding: newer nodes of the same place replace older ones, so maps do not grow with every drive.
 
-A node is superseded if a robot that stood there would know itself by another one and could servo to it: the
-two were verified to show the same, enough common landmarks stay in view between them, and they stand within
-the servo's basin. Besides, the other one must know about as many depths; whatever the node stood for itself
-must have somebody else to stand for it; and no way between its neighbours may become much longer without it.
+A node is superseded if a robot at its pose would recognise another node and could servo to it: the two were
+verified, enough common landmarks stay in view between them, and the distance is within the servo's basin. In
+addition, the other node must have about as many depths; the nodes that the first one covers must be covered
+by others; and no way between its neighbours may become much longer without it.
 
-What is left dominates all nodes (each is covered by a living one, directly) and holds none that could be
-spared. To find the fewest is NP-hard; here nodes go one by one, those first that stand for little and of
-which newer views were taken since.
+The active nodes dominate all nodes (each is covered directly by an active one) and none of them can be
+removed. To find the fewest is NP-hard; here nodes are tried one by one, first those that cover few nodes and
+of which newer views exist.
 
-Superseded nodes stay where they are: they tie poses, and come back if what supersedes them does not stand.
+Superseded nodes keep their poses and edges, and become active again if their successor is removed.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ ENOUGH = 60
 AGAIN = 120.0
 """S, that lie between them if both belong to one map: views of one visit complete each other."""
 GATE = 16.3
-"""Chi-square with 3 degrees of freedom within which such a comparison bears out the merged map."""
+"""Chi-square with 3 degrees of freedom within which such a comparison agrees with the merged map."""
 FLOOR = (0.05, 0.05, 0.03)
-"""M, m and rad, error of both that no covariance tells of."""
+"""M, m and rad, error of both beyond the covariances."""
 
 
 SECOND = 1_000_000_000
@@ -54,7 +54,7 @@ class NodeSupersedingSettings:
     """When a node stands for another one.
 
     Attributes:
-        reach: the servo's basin: from the one node's place it brings a robot to the one that stands for it.
+        reach: the servo's basin: from one node it brings a robot to the successor.
         found: landmarks that both show and that stay in view between them.
         detour: m, by which a way between neighbours may become longer.
         near: m, nodes nearer than this to each other stand in one place, as for routes.
@@ -67,7 +67,7 @@ class NodeSupersedingSettings:
 
 
 class NodeSuperseder:
-    """Goes from merged map to merged map with what was superseded: only what is new is looked at."""
+    """Keeps the superseded nodes from merged map to merged map: only changes are evaluated."""
 
     def __init__(
         self,
@@ -80,17 +80,17 @@ class NodeSuperseder:
         Args:
             settings: when a node is.
             verification: as in the merge.
-            reaches: what is known of edges; it is written to.
+            reaches: cache of reachability; it is filled.
         """
         self._settings = settings or NodeSupersedingSettings()
         self._comparisons = Comparisons(verification)
         self._reaches = reaches or ReachabilityCache()
-        self._fates: dict[NodeId, Superseded] = {}
-        self._seen: dict[NodeId, Node] = {}
+        self._superseded: dict[NodeId, Superseded] = {}
+        self._nodes_seen: dict[NodeId, Node] = {}
         self._links = Adjacency()
         self._graphs: tuple[PoseGraph, ...] = ()
         self._foreign = ForeignEdges()
-        self._firm: dict[NodeId, NodeId] = {}
+        self._blocking: dict[NodeId, NodeId] = {}
 
     def renewed(self, merged: MergedMap) -> MergedMap:
         """The same map with the nodes that are superseded.
@@ -99,39 +99,54 @@ class NodeSuperseder:
             merged: the next merged map of the same fleet.
         """
         nodes = self._changed(merged)
-        anew = {node for node, one in nodes.items() if self._seen.get(node) is not one}
-        self._seen |= nodes
+        changed = {node for node, content in nodes.items() if self._nodes_seen.get(node) is not content}
+        self._nodes_seen |= nodes
         fresh = {node for link in self._links.follow(merged.links) for node in link.pair}
-        fresh = anew | fresh & nodes.keys()
-        # One that is known better is judged anew, as are those that it stood for.
-        for node, fate in tuple(self._fates.items()):
-            if node not in self._seen or fate.by not in self._seen or {node, fate.by} & anew:
-                del self._fates[node]
+        fresh = changed | fresh & nodes.keys()
+        # A node that was written again is judged again, with those that it covers.
+        for node, successor in tuple(self._superseded.items()):
+            if (
+                node not in self._nodes_seen
+                or successor.by not in self._nodes_seen
+                or {node, successor.by} & changed
+            ):
+                del self._superseded[node]
                 fresh |= {node} & nodes.keys()
         if nodes:
             s = self._settings
             foreign = self._foreign.of(merged.maps)
-            passages = Traversability(merged, self._links, self._reaches, s.near, foreign, self._fates)
-            this = _Round(merged, nodes, self._links, self._fates, self._firm, passages, self._comparisons, s)
-            this.look_at(fresh | this.revive())
-        return replace(merged, superseded=dict(sorted(self._fates.items())))
+            traversability = Traversability(
+                merged, self._links, self._reaches, s.near, foreign, self._superseded
+            )
+            round_ = _Round(
+                merged,
+                nodes,
+                self._links,
+                self._superseded,
+                self._blocking,
+                traversability,
+                self._comparisons,
+                s,
+            )
+            round_.update(fresh | round_.reinstate())
+        return replace(merged, superseded=dict(sorted(self._superseded.items())))
 
     def _changed(self, merged: MergedMap) -> dict[NodeId, Node]:
-        """Nodes of components that were solved anew; those that are gone are forgotten."""
-        known = {id(graph) for graph in self._graphs}
-        left = {id(graph) for graph in merged.graphs}
+        """Nodes of components that were solved again; removed nodes are forgotten."""
+        solved = {id(graph) for graph in self._graphs}
+        remaining = {id(graph) for graph in merged.graphs}
         for graph in self._graphs:
-            if id(graph) not in left:
+            if id(graph) not in remaining:
                 for node in graph.nodes:
                     # Known still, if it is in another component now.
                     if merged.component_of(node) is None:
-                        self._seen.pop(node, None)
-                        self._firm.pop(node, None)
+                        self._nodes_seen.pop(node, None)
+                        self._blocking.pop(node, None)
         self._graphs = merged.graphs
         return {
             node: merged.maps[node.map].nodes[node]
             for graph in merged.graphs
-            if id(graph) not in known
+            if id(graph) not in solved
             for node in graph.nodes
         }
 
@@ -144,104 +159,109 @@ class _Round:
         merged: MergedMap,
         nodes: dict[NodeId, Node],
         links: Adjacency,
-        fates: dict[NodeId, Superseded],
-        firm: dict[NodeId, NodeId],
-        passages: Traversability,
+        superseded: dict[NodeId, Superseded],
+        blocking: dict[NodeId, NodeId],
+        traversability: Traversability,
         comparisons: Comparisons,
         settings: NodeSupersedingSettings,
     ) -> None:
-        self._merged, self._nodes, self._fates, self._firm = merged, nodes, fates, firm
+        self._merged, self._nodes, self._superseded, self._blocking = merged, nodes, superseded, blocking
         self._settings = settings
         self._comparisons = comparisons
         self._links = links
         self._refused = {refusal.pair for refusal in merged.refused if refusal.edge is None}
-        self._stands_for: dict[NodeId, set[NodeId]] = {}
-        for node, fate in fates.items():
-            self._stands_for.setdefault(fate.by, set()).add(node)
-        self._passages = passages
+        self._covered: dict[NodeId, set[NodeId]] = {}
+        for node, successor in superseded.items():
+            self._covered.setdefault(successor.by, set()).add(node)
+        self._traversability = traversability
         self._basins: dict[NodeId, list[tuple[NodeId, Pose2]]] = {}
 
-    def revive(self) -> set[NodeId]:
+    def reinstate(self) -> set[NodeId]:
         """Give life back to nodes whose successor is too far off now, or shown to be wrong."""
-        gone = set()
-        for node, fate in self._fates.items():
-            if node not in self._nodes and fate.by not in self._nodes:
+        reinstated = set()
+        for node, successor in self._superseded.items():
+            if node not in self._nodes and successor.by not in self._nodes:
                 continue
-            if self._merged.component_of(node) == self._merged.component_of(fate.by):
-                between = self._between(node, fate.by)
-                near = between.distance(Pose2()) < 1.1 * FARTHEST and abs(between.heading) < 1.1 * WIDEST
-                if near and _ordered(node, fate.by) not in self._refused:
+            if self._merged.component_of(node) == self._merged.component_of(successor.by):
+                between = self._between(node, successor.by)
+                close = between.distance(Pose2()) < 1.1 * FARTHEST and abs(between.heading) < 1.1 * WIDEST
+                if close and _ordered(node, successor.by) not in self._refused:
                     continue
-            gone.add(node)
-        for node in gone:
-            self._stands_for[self._fates.pop(node).by].discard(node)
-            self._passages.add(node)
-        return gone
+            reinstated.add(node)
+        for node in reinstated:
+            self._covered[self._superseded.pop(node).by].discard(node)
+            self._traversability.add(node)
+        return reinstated
 
-    def look_at(self, fresh: Iterable[NodeId]) -> None:
+    def update(self, fresh: Iterable[NodeId]) -> None:
         """See which nodes can be spared where something is new, the least needed first."""
         reach = FARTHEST
-        living = {node for node in fresh if node not in self._fates}
-        for node in tuple(living):
-            living.update(self._passages.around(node, reach))
-        since = {node: self._since(node) for node in living}
+        active = {node for node in fresh if node not in self._superseded}
+        for node in tuple(active):
+            active.update(self._traversability.around(node, reach))
+        newer = {node: self._newer_nodes(node) for node in active}
 
         def need(node: NodeId) -> tuple[int, int, NodeId]:
-            # It is worth what it stands for; each later view of its place makes it as much less so.
-            return len(self._stands_for.get(node, ())) - since[node], self._nodes[node].stamp_ns, node
+            # A node's value is the count of nodes that it covers, less the later views of its place.
+            return len(self._covered.get(node, ())) - newer[node], self._nodes[node].stamp_ns, node
 
-        queue = [need(node) for node in living]
+        queue = [need(node) for node in active]
         heapq.heapify(queue)
         while queue:
             node = queue[0][-1]
-            # What it stands for may have become more since; it never becomes less.
+            # The count of covered nodes may have grown since; it never shrinks.
             if (now := need(node)) != queue[0]:
                 heapq.heapreplace(queue, now)
                 continue
             heapq.heappop(queue)
-            self._try(node)
+            self._try_removing(node)
 
-    def _since(self, node: NodeId) -> int:
+    def _newer_nodes(self, node: NodeId) -> int:
         """How many newer nodes of other visits, superseded or not, are within the basin."""
-        one, others = self._nodes[node], (self._nodes[other] for other, _ in self._like(node))
-        return sum(is_older(one, other) and not self._one_visit(one, other) for other in others)
+        this, neighbours = (
+            self._nodes[node],
+            (self._nodes[neighbour] for neighbour, _ in self._neighbours(node)),
+        )
+        return sum(
+            is_older(this, neighbour) and not self._same_visit(this, neighbour) for neighbour in neighbours
+        )
 
-    def _try(self, node: NodeId) -> None:
-        """Leave a node out if others stand for it, and for all that it stood for."""
-        heirs: dict[NodeId, Superseded] = {}
+    def _try_removing(self, node: NodeId) -> None:
+        """Supersede a node if others cover it, and all nodes that it covers."""
+        successors: dict[NodeId, Superseded] = {}
         # What could not be left to others the last time comes first.
-        for orphan in sorted(
-            self._stands_for.get(node, ()), key=lambda one: (one != self._firm.get(node), one)
+        for covered in sorted(
+            self._covered.get(node, ()), key=lambda other: (other != self._blocking.get(node), other)
         ):
-            heir = self._heir(orphan, node)
-            if heir is None:
-                self._firm[node] = orphan
+            replacement = self._find_successor(covered, node)
+            if replacement is None:
+                self._blocking[node] = covered
                 return
-            heirs[orphan] = heir
-        fate = self._heir(node, node)
-        if fate is None or not self._passages.spare(node, fate.by, self._settings.detour):
+            successors[covered] = replacement
+        successor = self._find_successor(node, node)
+        if successor is None or not self._traversability.spare(node, successor.by, self._settings.detour):
             return
-        self._passages.remove(node)
-        self._stands_for.pop(node, None)
-        self._firm.pop(node, None)
-        for one, heir in ((node, fate), *heirs.items()):
-            self._fates[one] = heir
-            self._stands_for.setdefault(heir.by, set()).add(one)
+        self._traversability.remove(node)
+        self._covered.pop(node, None)
+        self._blocking.pop(node, None)
+        for other, replacement in ((node, successor), *successors.items()):
+            self._superseded[other] = replacement
+            self._covered.setdefault(replacement.by, set()).add(other)
 
-    def _heir(self, orphan: NodeId, but: NodeId) -> Superseded | None:
-        """Who stands for a node if it is not the one given: the living one that is most like it."""
-        for other, between in self._like(orphan):
-            if other != but and self._passages.has(other):
-                fate = self._covers(orphan, other, between)
-                if fate is not None:
-                    return fate
+    def _find_successor(self, covered: NodeId, excluded: NodeId) -> Superseded | None:
+        """The successor of a node, without the one excluded: the most similar active node."""
+        for candidate, between in self._neighbours(covered):
+            if candidate != excluded and self._traversability.has(candidate):
+                successor = self._covers(covered, candidate, between)
+                if successor is not None:
+                    return successor
         return None
 
-    def _like(self, node: NodeId) -> list[tuple[NodeId, Pose2]]:
-        """Nodes within the basin, living or not, and how they stand to it: those most like it first."""
+    def _neighbours(self, node: NodeId) -> list[tuple[NodeId, Pose2]]:
+        """Nodes within the basin, active or not, with relative poses; the most similar first."""
         if node not in self._basins:
-            around = self._passages.around(node, FARTHEST, also_gone=True)
-            between = self._passages.stances(node, around)
+            around = self._traversability.around(node, FARTHEST, with_removed=True)
+            between = self._traversability.stances(node, around)
             distances, turns = np.hypot(between[:, 0], between[:, 1]), np.abs(between[:, 2])
             order = np.argsort(distances / FARTHEST + turns / WIDEST, kind="stable")
             inside = (distances <= FARTHEST) & (turns <= WIDEST)
@@ -250,21 +270,21 @@ class _Round:
             ]
         return self._basins[node]
 
-    def _covers(self, one: NodeId, other: NodeId, between: Pose2) -> Superseded | None:
-        """Whether the other one, which is within the basin, can stand for the one."""
-        s, a, b = self._settings, self._nodes[one], self._nodes[other]
-        if self._one_visit(a, b):
+    def _covers(self, covered: NodeId, successor: NodeId, between: Pose2) -> Superseded | None:
+        """Whether a node within the basin can supersede another."""
+        s, a, b = self._settings, self._nodes[covered], self._nodes[successor]
+        if self._same_visit(a, b):
             return None
         if b.landmarks.has_depth.sum() < min(DEPTHS * a.landmarks.has_depth.sum(), ENOUGH):
             return None
-        link = self._links.between(one, other) or self._compare(a, b)
+        link = self._links.between(covered, successor) or self._compare(a, b)
         if link is None:
             return None
-        link = link if link.a == one else link.turned()
-        found = least_in_view(link.shared, a, b, between, STOPS)
-        if found < s.found:
+        link = link if link.a == covered else link.turned()
+        in_view = least_in_view(link.shared, a, b, between, STOPS)
+        if in_view < s.found:
             return None
-        return Superseded(other, found, between.distance(Pose2()), abs(between.heading))
+        return Superseded(successor, in_view, between.distance(Pose2()), abs(between.heading))
 
     def _compare(self, a: Node, b: Node) -> Link | None:
         """A link between two nodes that the merge had no need to compare; one that it refused is none."""
@@ -276,14 +296,14 @@ class _Round:
             return None
         off = (verdict.a_from_b.mean.inverse() @ self._between(*verdict.pair)).vector
         spread = verdict.a_from_b.covariance + np.diag(np.square(FLOOR))
-        # The map's own doubt only lets more pass, and of a large map it takes long to say.
+        # The map's own covariance only lets more pass, and is slow to compute for a large map.
         if _distance2(off, spread) >= GATE:
-            there = self._merged.relative(*verdict.pair)
-            assert there is not None, "nodes of one component"
-            return verdict if _distance2(off, spread + there.covariance) < GATE else None
+            relative = self._merged.relative(*verdict.pair)
+            assert relative is not None, "nodes of one component"
+            return verdict if _distance2(off, spread + relative.covariance) < GATE else None
         return verdict
 
-    def _one_visit(self, a: Node, b: Node) -> bool:
+    def _same_visit(self, a: Node, b: Node) -> bool:
         return a.id.map == b.id.map and abs(a.stamp_ns - b.stamp_ns) < AGAIN * SECOND
 
     def _between(self, a: NodeId, b: NodeId) -> Pose2:

@@ -20,7 +20,7 @@ from mapweave.registration.pose_arrays import compose_poses, inverse_poses
 
 
 class Traversability:
-    """Edges that can be driven, and nodes that stand in one place, among the nodes that are left.
+    """Edges that can be driven, and nodes at one place, among the active nodes.
 
     Nothing is worked out but around the nodes that are asked about.
     """
@@ -30,7 +30,7 @@ class Traversability:
         merged: MergedMap,
         links: Adjacency,
         reaches: ReachabilityCache,
-        near: float,
+        same_place: float,
         foreign: Iterable[Edge] = (),
         without: Iterable[NodeId] = (),
     ) -> None:
@@ -39,13 +39,13 @@ class Traversability:
         Args:
             merged: the map.
             links: of it.
-            reaches: what is known of edges; it is written to.
-            near: m, nodes nearer than this to each other stand in one place.
-            foreign: edges that lead out of the maps that tell them, see `ForeignEdges`.
+            reaches: cache of reachability; it is filled.
+            same_place: m, nodes nearer than this to each other are at one place.
+            foreign: edges that lead out of their own maps, see `ForeignEdges`.
             without: nodes that are left out from the start.
         """
-        self._merged, self._book, self._near = merged, reaches, near
-        self._gone = set(without)
+        self._merged, self._book, self._same_place = merged, reaches, same_place
+        self._removed = set(without)
         self._trees: dict[NodeId, cKDTree] = {}
         self._ways: dict[NodeId, dict[NodeId, float]] = {}
         self._foreign: dict[NodeId, list[Edge]] = {}
@@ -57,51 +57,55 @@ class Traversability:
 
     def has(self, node: NodeId) -> bool:
         """Whether a node is left."""
-        return node not in self._gone
+        return node not in self._removed
 
     def remove(self, node: NodeId) -> None:
         """Leave a node out from now on."""
-        self._gone.add(node)
+        self._removed.add(node)
 
     def add(self, node: NodeId) -> None:
         """Take a node in again."""
-        self._gone.discard(node)
+        self._removed.discard(node)
 
-    def around(self, node: NodeId, reach: float, also_gone: bool = False) -> list[NodeId]:
+    def around(self, node: NodeId, reach: float, with_removed: bool = False) -> list[NodeId]:
         """Other nodes that are left, of the same component, within a distance, m; in the order of ids.
 
         Args:
             node: in the middle.
             reach: m.
-            also_gone: those that were left out too.
+            with_removed: those that were left out too.
         """
         graph = self._graph(node)
         if graph.anchor not in self._trees:
             self._trees[graph.anchor] = cKDTree(graph.means[:, :2])
-        found = self._trees[graph.anchor].query_ball_point(graph.means[graph.rows[node], :2], reach)
-        near = (graph.nodes[k] for k in found)
-        return sorted(other for other in near if other != node and (also_gone or other not in self._gone))
+        rows = self._trees[graph.anchor].query_ball_point(graph.means[graph.rows[node], :2], reach)
+        nodes = (graph.nodes[k] for k in rows)
+        return sorted(
+            neighbour
+            for neighbour in nodes
+            if neighbour != node and (with_removed or neighbour not in self._removed)
+        )
 
     def stances(self, node: NodeId, others: Sequence[NodeId]) -> Array:
-        """(K, 3) m, m, rad, how other nodes of the same component stand to a node."""
+        """(K, 3) m, m, rad, relative poses of other nodes of the same component."""
         graph = self._graph(node)
-        here, there = (graph.means[graph.index(some)] for some in ([node], others))
-        return compose_poses(inverse_poses(here), there)
+        poses, other_poses = (graph.means[graph.index(some)] for some in ([node], others))
+        return compose_poses(inverse_poses(poses), other_poses)
 
     def spare(self, node: NodeId, successor: NodeId, detour: float) -> bool:
         """Whether every neighbour of a node is reached from its successor without the node.
 
         Args:
             node: that may be left out.
-            successor: that stands for it.
+            successor: that supersedes it.
             detour: m, by which such a way may be longer than over the node.
         """
         own = self._ways_of(node)
-        there = self._distance(node, successor)
+        to_successor = self._distance(node, successor)
         limits = {
-            other: length + there + detour
-            for other, length in own.items()
-            if other != successor and other not in self._gone
+            neighbour: length + to_successor + detour
+            for neighbour, length in own.items()
+            if neighbour != successor and neighbour not in self._removed
         }
         return not limits or self._reaches(successor, node, limits)
 
@@ -117,25 +121,27 @@ class Traversability:
             settled.add(node)
             if left.pop(node, length) < length:
                 return False
-            for other, step in self._ways_of(node).items():
-                barred = other == without or other in self._gone or other in settled
+            for neighbour, step in self._ways_of(node).items():
+                barred = neighbour == without or neighbour in self._removed or neighbour in settled
                 if not barred and length + step <= farthest:
-                    heapq.heappush(heap, (length + step, other))
+                    heapq.heappush(heap, (length + step, neighbour))
         return not left
 
     def _ways_of(self, node: NodeId) -> dict[NodeId, float]:
         """Neighbours, also those that were left out, with the distance, m."""
         if node not in self._ways:
-            others = {other for edge in self._edges(node) for other in (edge.a, edge.b)}
+            neighbours = {neighbour for edge in self._edges(node) for neighbour in (edge.a, edge.b)}
             graph = self._graph(node)
-            others |= set(self.around(node, self._near))
-            others = {other for other in others if other in graph.rows}
-            self._ways[node] = {other: self._distance(node, other) for other in others - {node}}
+            neighbours |= set(self.around(node, self._same_place))
+            neighbours = {neighbour for neighbour in neighbours if neighbour in graph.rows}
+            self._ways[node] = {
+                neighbour: self._distance(node, neighbour) for neighbour in neighbours - {node}
+            }
         return self._ways[node]
 
     def _edges(self, node: NodeId) -> Iterator[Edge]:
-        one = self._merged.maps[node.map]
-        own = (one.edges[edge_id] for _, _, edge_id in one.graph.edges(node, keys=True))
+        hybrid_map = self._merged.maps[node.map]
+        own = (hybrid_map.edges[edge_id] for _, _, edge_id in hybrid_map.graph.edges(node, keys=True))
         links = (link.edge() for link in self._links.at(node))
         for edge in (*own, *links, *self._foreign.get(node, ())):
             if edge.id not in self._false and self._drivable(edge):
@@ -160,19 +166,19 @@ class Traversability:
 
 
 class ForeignEdges:
-    """Edges that lead out of the maps that tell them: drives among others' nodes. A map is read once."""
+    """Edges that lead out of their own maps: drives among others' nodes. A map is read once."""
 
     def __init__(self) -> None:
         """Start with no maps."""
-        self._known: dict[MapId, tuple[HybridMap, tuple[Edge, ...]]] = {}
+        self._cache: dict[MapId, tuple[HybridMap, tuple[Edge, ...]]] = {}
 
     def of(self, maps: Mapping[MapId, HybridMap]) -> list[Edge]:
         """Those of all maps, in the order of the maps."""
-        before, self._known = self._known, {}
-        for map_id, one in maps.items():
-            known = before.get(map_id)
-            if known is None or known[0] is not one:
-                out = (edge for edge in one.edges.values() if {edge.a.map, edge.b.map} != {map_id})
-                known = one, tuple(out)
-            self._known[map_id] = known
-        return [edge for map_id in sorted(self._known) for edge in self._known[map_id][1]]
+        before, self._cache = self._cache, {}
+        for map_id, hybrid_map in maps.items():
+            entry = before.get(map_id)
+            if entry is None or entry[0] is not hybrid_map:
+                out = (edge for edge in hybrid_map.edges.values() if {edge.a.map, edge.b.map} != {map_id})
+                entry = hybrid_map, tuple(out)
+            self._cache[map_id] = entry
+        return [edge for map_id in sorted(self._cache) for edge in self._cache[map_id][1]]

@@ -10,7 +10,7 @@ class Collision:
     """Two robots that would have been at the same place at the same time, or would have seen each other.
 
     Attributes:
-        first: agent; the one that would have seen the other.
+        first: agent; the robot that would have seen the other.
         second: another one.
         clock: that says so.
         moments: how many moments they would have been too near, or seen each other.

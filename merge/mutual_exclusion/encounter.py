@@ -1,4 +1,4 @@
-"""Meetings: the moments of two robots, and what each says about a merge."""
+"""Encounters: the common moments of two robots, and their evidence about a merge."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
 
 WINDOW = 2.0
-"""Moments within as much time are one witness, s."""
+"""Moments within this time count as one observation, s."""
 NEIGHBOURHOOD = 5.0
-"""Robots that are further apart than as many least distances speak neither for nor against."""
+"""Robots further apart than this many least distances are no evidence for or against."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Encounter:
         known: (T,) whether both are known to be somewhere.
         distances: (T,) m, between them.
         close: (K,) indices of moments when they are too near.
-        seen: M looks at where the other one would have been.
+        seen: M observations of the other robot's expected place.
         least_apart: what is too near, m.
     """
 
@@ -47,14 +47,14 @@ class Encounter:
         out[self.known] = seats
         return out
 
-    def by_bodies(self, clear: Array, s: ExclusionSettings) -> Array:
+    def by_footprints(self, clear: Array, s: ExclusionSettings) -> Array:
         """(W,) logarithms of the odds against the merge that each window of time gives.
 
         Args:
             clear: (K,) chances that they were clear of each other after all in the moments that are close.
             s: how long a window is.
         """
-        # A body takes this share of the neighbourhood; without it many moments would prove anything.
+        # A footprint takes this share of the neighbourhood; without it many moments would prove anything.
         free = 1.0 - NEIGHBOURHOOD**-2
         odds = np.where(self.distances < NEIGHBOURHOOD * self.least_apart, free, 1.0)
         odds[self.close] = free / clear
@@ -63,22 +63,22 @@ class Encounter:
         out: Array = np.log(np.bincount(seats, odds[self.known]) / np.bincount(seats))
         return out
 
-    def by_sight(self, odds: Array, s: ExclusionSettings) -> Array:
+    def by_visibility(self, odds: Array, s: ExclusionSettings) -> Array:
         """(S, W) the same of what they should have seen.
 
         Args:
-            odds: (S, M) against the merge, of each look.
+            odds: (S, M) against the merge, of each observation.
             s: how long a window is.
         """
         seats = self._windows(s)
-        looks, count = seats[self.seen.moments], int(seats.max()) + 1
-        counts = np.bincount(looks, minlength=count)
-        sums = np.array([np.bincount(looks, row, minlength=count) for row in odds])
+        windows, count = seats[self.seen.moments], int(seats.max()) + 1
+        counts = np.bincount(windows, minlength=count)
+        sums = np.array([np.bincount(windows, row, minlength=count) for row in odds])
         out: Array = np.log(np.where(counts > 0, sums / np.maximum(counts, 1), 1.0))
         return out
 
     def refuses(
-        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings, besides: float = 0.0
+        self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings, prior: float = 0.0
     ) -> bool:
         """Whether that is enough to refuse a merge.
 
@@ -87,12 +87,12 @@ class Encounter:
             odds: as in `by_sight`.
             weights: (S,) how probable each way is in which poses may be wrong.
             s: what is enough.
-            besides: natural logarithm of the odds against the merge that other evidence gives.
+            prior: log odds against the merge by other evidence.
         """
         by_window, total = self.added(clear, odds, weights, s)
         # What was enough at any time is enough: later meetings do not make it possible.
-        witnesses = np.cumsum(by_window > math.log(2.0))
-        return bool(((witnesses >= s.least_witnesses) & (total + besides >= -math.log(s.doubt))).any())
+        windows = np.cumsum(by_window > math.log(2.0))
+        return bool(((windows >= s.least_witnesses) & (total + prior >= -math.log(s.doubt))).any())
 
     def added(self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings) -> tuple[Array, Array]:
         """(W,) logarithms of the odds against the merge that each window adds to those before, and (W,) sums.
@@ -100,7 +100,7 @@ class Encounter:
         Over all ways in which poses may be wrong, each as probable as it is: the later windows meet those
         that the earlier ones have left.
         """
-        by_way = np.cumsum(self.by_bodies(clear, s) + self.by_sight(odds, s), axis=1)
+        by_way = np.cumsum(self.by_footprints(clear, s) + self.by_visibility(odds, s), axis=1)
         total: Array = -scipy.special.logsumexp(-by_way, axis=0, b=weights[:, None])
         added: Array = np.diff(total, prepend=0.0)
         return added, total
@@ -108,15 +108,15 @@ class Encounter:
     def evidence(
         self, clear: Array, odds: Array, weights: Array, s: ExclusionSettings
     ) -> tuple[float, float]:
-        """By bodies and by sight, when it was most."""
-        by_bodies = np.cumsum(self.by_bodies(clear, s))
+        """By footprints and by mutual visibility, at the maximum."""
+        by_footprints = np.cumsum(self.by_footprints(clear, s))
         _, total = self.added(clear, odds, weights, s)
         most = int(np.argmax(total))
-        return float(by_bodies[most]), float(total[most] - by_bodies[most])
+        return float(by_footprints[most]), float(total[most] - by_footprints[most])
 
     def ample(self, clear: Array, odds: Array, s: ExclusionSettings) -> int:
         """Number of moments after which there is twice as much evidence as is asked for; all, if never."""
-        evidence = np.cumsum(self.by_bodies(clear, s) + self.by_sight(odds, s)[0])
+        evidence = np.cumsum(self.by_footprints(clear, s) + self.by_visibility(odds, s)[0])
         enough = np.flatnonzero(evidence >= -2.0 * math.log(s.doubt))
         seats = self._windows(s)
         return int(np.flatnonzero(seats == enough[0])[-1]) + 1 if len(enough) else len(seats)

@@ -1,21 +1,21 @@
 """Absence: views that show nothing of what another robot has mapped there.
 
-Two rooms that look alike are alike inside; what lies before their doors is not. Under a merge that takes the
-one for the other, a robot that looks out of the one door should see what was mapped from the other. A view
-should show a landmark if it projects well into the image, from about the distance and direction from which it
-was mapped, and if the view itself knows something about there that is no nearer: then nothing stands before
-it, and the robot looked that far. A view that should show many landmarks and shows as good as none speaks
-against the merge; one that shows some speaks for it.
+Two similar rooms look the same inside, but not outside their doors. Under a merge that takes one room for the
+other, a robot that looks out of one door should see landmarks that were mapped from the other. A view should
+show a landmark if it projects well into the image, from a distance and direction similar to where it was
+mapped, and if the view has a depth in that direction that is no nearer: then nothing occludes it. A view that
+should show many landmarks and shows almost none is evidence against the merge; one that shows some is
+evidence for it.
 
-**Why a true merge is safe.** Things are moved, people stand before them, descriptors fail. Under a true merge
-a view that should show many landmarks shows none with a chance of at most ε (`missed`). Against this stands a
-merge of places that look alike in a share q of what they show (`alike`). The odds against the merge are then
+**Why a true merge is safe.** Things are moved, people occlude them, descriptors fail. Under a true merge a
+view that should show many landmarks shows none with a probability of at most ε (`missed`). The alternative is
+a merge of places that share a part q of their appearance (`alike`). The odds against the merge are then
 (1 - q) / ε where nothing is shown and q / (1 - ε) where something is; their expectation under a true merge is
 at most 1, as in `mapweave.merge.mutual_exclusion.mutual_visibility`, and so is that of the mean over all
-views that look at one place, which are one witness. Views of places that are apart multiply. Whether a whole
-building was redecorated between two views no share tells: so only views within an hour by one clock are
-compared, the odds are never more than `most`, and by themselves they refute nothing: they are heard where
-robots' bodies speak against a merge.
+views of one place, which count once. The odds of different places multiply. No rate covers a building that
+was redecorated between two views: so only views within an hour by one clock are compared, the odds are never
+more than `most`, and by themselves they refute nothing: they count only where the robots' footprints are
+evidence against a merge.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from mapweave.registration.matching import match
 NEAR = 1.5
 """A view is held against nodes at most so far away, m."""
 TURN = math.radians(50.0)
-"""That look at most so much another way, rad."""
+"""With headings that differ by at most this, rad."""
 LASTING = 3600.0
 """And were made at most so much earlier or later, s."""
 MOST_NODES = 4
 """Against the nearest ones if there are more."""
 MOST_VIEWS = 80
-"""Of each robot are looked at, evenly chosen."""
+"""Of each robot are compared, evenly chosen."""
 SIGMA_XY = 0.15
-"""How the two stand is known as well as this at least, m."""
+"""Largest standard deviation of the relative pose, m."""
 SIGMA_HEADING = math.radians(3.0)
 """And this, rad."""
 MARGIN = 0.04
@@ -60,15 +60,15 @@ BEFORE = 0.8
 WITHIN = 0.15
 """It is found if what matches it is this near to where it should be, rad."""
 LEAST = 20
-"""Landmarks that a view should show before it says anything."""
+"""Landmarks that a view should show before it counts."""
 NOTHING = 0.03
 """A view shows nothing if it shows at most this share of them."""
 MISSED = 0.02
-"""Share of such views, at most, that show nothing though the merge is true."""
+"""Largest share of such views that show nothing though the merge is true."""
 ALIKE = 0.85
 """How often places that are taken for each other show the same."""
 APART = 1.5
-"""Views that look at what is nearer than this are one witness, m."""
+"""Views of places nearer to each other than this count once, m."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,8 @@ class Views:
         out: Array = np.where(self.show_nothing(s), (1.0 - ALIKE) / MISSED, ALIKE / (1.0 - MISSED))
         return out
 
-    def witnesses(self, s: NegativeEvidenceSettings) -> NDArray[np.int64]:
-        """(N,) number of the place that each looks at."""
+    def place_numbers(self, s: NegativeEvidenceSettings) -> NDArray[np.int64]:
+        """(N,) number of each view's place."""
         seats = np.full(len(self.places), -1, np.int64)
         for k in range(len(seats)):
             if seats[k] < 0:
@@ -119,7 +119,7 @@ class Views:
         """Natural logarithm of the odds against the merge."""
         if not len(self.places):
             return 0.0
-        seats = self.witnesses(s)
+        seats = self.place_numbers(s)
         means = np.bincount(seats, self.odds_against(s)) / np.bincount(seats)
         return min(float(np.log(means).sum()), math.log(s.most))
 
@@ -140,47 +140,56 @@ def negative_evidence(
     """
     s = settings or NegativeEvidenceSettings()
     rows: list[tuple[Array, int, int]] = []
-    for looking, mapped in ((first, second), (second, first)):
-        chosen = np.unique(np.linspace(0, len(looking.views) - 1, MOST_VIEWS).round().astype(np.int64))
-        pairs = _near(graph, looking, mapped, chosen, s)
+    for observer, mapped in ((first, second), (second, first)):
+        chosen = np.unique(np.linspace(0, len(observer.views) - 1, MOST_VIEWS).round().astype(np.int64))
+        pairs = _nearby_pairs(graph, observer, mapped, chosen, s)
         for k in np.unique(pairs[:, 0]):
-            one = [_look(graph, mapped.views[j], looking.views[k], s) for j in pairs[pairs[:, 0] == k, 1]]
-            points = np.concatenate([points for points, _ in one])
+            compared = [
+                _compare(graph, mapped.views[j], observer.views[k], s) for j in pairs[pairs[:, 0] == k, 1]
+            ]
+            points = np.concatenate([points for points, _ in compared])
             if len(points) >= LEAST:
-                rows.append((points.mean(axis=0), len(points), sum(found for _, found in one)))
+                rows.append((points.mean(axis=0), len(points), sum(shown for _, shown in compared)))
     return Views(
         np.array([place for place, _, _ in rows]).reshape(-1, 2),
         np.array([expected for _, expected, _ in rows], np.int64),
-        np.array([found for _, _, found in rows], np.int64),
+        np.array([shown for _, _, shown in rows], np.int64),
     )
 
 
-def _near(
+def _nearby_pairs(
     graph: PoseGraph,
-    looking: BodyTrajectory,
+    observer: BodyTrajectory,
     mapped: BodyTrajectory,
     chosen: NDArray[np.int64],
     s: NegativeEvidenceSettings,
 ) -> NDArray[np.int64]:
     """(P, 2) views, and nodes of the other robot that might show the same, the nearest ones of each view."""
-    lookers, mappers = ([view.id for view in trail.views] for trail in (looking, mapped))
-    here, there = graph.means[graph.index([lookers[k] for k in chosen])], graph.means[graph.index(mappers)]
-    ways = np.hypot(*(here[:, None, :2] - there[None, :, :2]).transpose(2, 0, 1))
-    turns = np.abs(np.angle(np.exp(1j * (here[:, None, 2] - there[None, :, 2]))))
-    gaps = np.abs(looking.view_times[chosen][:, None] - mapped.view_times[None])
+    observer_nodes, mapped_nodes = (
+        [view.id for view in trajectory.views] for trajectory in (observer, mapped)
+    )
+    poses, mapped_poses = (
+        graph.means[graph.index([observer_nodes[k] for k in chosen])],
+        graph.means[graph.index(mapped_nodes)],
+    )
+    ways = np.hypot(*(poses[:, None, :2] - mapped_poses[None, :, :2]).transpose(2, 0, 1))
+    turns = np.abs(np.angle(np.exp(1j * (poses[:, None, 2] - mapped_poses[None, :, 2]))))
+    gaps = np.abs(observer.view_times[chosen][:, None] - mapped.view_times[None])
     ways[(turns > TURN) | (gaps > LASTING)] = np.inf
     nearest = np.argsort(ways, axis=1, kind="stable")[:, :MOST_NODES]
     i, j = np.nonzero(np.take_along_axis(ways, nearest, axis=1) < NEAR)
     pairs = np.stack([chosen[i], nearest[i, j]], axis=1)
     if not len(pairs):
         return pairs
-    between = graph.relative([lookers[k] for k in pairs[:, 0]], [mappers[k] for k in pairs[:, 1]]).covariances
-    known = np.linalg.eigvalsh(between[:, :2, :2])[:, -1] < SIGMA_XY**2
-    out: NDArray[np.int64] = pairs[known & (between[:, 2, 2] < SIGMA_HEADING**2)]
+    between = graph.relative(
+        [observer_nodes[k] for k in pairs[:, 0]], [mapped_nodes[k] for k in pairs[:, 1]]
+    ).covariances
+    certain = np.linalg.eigvalsh(between[:, :2, :2])[:, -1] < SIGMA_XY**2
+    out: NDArray[np.int64] = pairs[certain & (between[:, 2, 2] < SIGMA_HEADING**2)]
     return out
 
 
-def _look(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings) -> tuple[Array, int]:
+def _compare(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings) -> tuple[Array, int]:
     """(K, 2) m, in merged, a node's landmarks that a view should show, and how many of them it shows."""
     merged_from_node = graph.pose(node.id)
     node_from_view = merged_from_node.inverse() @ graph.pose(view.id)
@@ -189,9 +198,9 @@ def _look(graph: PoseGraph, node: Node, view: Node, s: NegativeEvidenceSettings)
         return np.zeros((0, 2)), 0
     seats = np.full(len(node.landmarks), -1)
     seats[shown] = np.arange(len(shown))
-    one, other = match(node.landmarks.codes, view.landmarks.codes).T
-    one, other = seats[one[seats[one] >= 0]], other[seats[one] >= 0]
-    off = np.linalg.norm(pixels[one] - view.landmarks.pixels[other], axis=1) / view.camera.fx
+    landmarks, features = match(node.landmarks.codes, view.landmarks.codes).T
+    landmarks, features = seats[landmarks[seats[landmarks] >= 0]], features[seats[landmarks] >= 0]
+    off = np.linalg.norm(pixels[landmarks] - view.landmarks.pixels[features], axis=1) / view.camera.fx
     return merged_from_node.apply(node.points_in_robot[shown][:, :2]), int((off < WITHIN).sum())
 
 
@@ -203,13 +212,13 @@ def should_show(
     Args:
         node: that has mapped them.
         view: another node.
-        node_from_view: how they stand.
+        node_from_view: relative pose.
         s: when a landmark should be seen.
     """
-    there = ProjectedView.of(node, view, node_from_view, MARGIN * view.camera.fx, SCALE, ASIDE)
-    shown = np.flatnonzero(there.fits)
-    known = view.landmarks.take(view.landmarks.has_depth)
-    off = np.linalg.norm(there.pixels[shown, None] - known.pixels[None], axis=2) / view.camera.fx
-    about, before = off < AROUND, known.depths[None] < BEFORE * there.depths[shown, None]
+    projection = ProjectedView.of(node, view, node_from_view, MARGIN * view.camera.fx, SCALE, ASIDE)
+    shown = np.flatnonzero(projection.fits)
+    with_depth = view.landmarks.take(view.landmarks.has_depth)
+    off = np.linalg.norm(projection.pixels[shown, None] - with_depth.pixels[None], axis=2) / view.camera.fx
+    about, before = off < AROUND, with_depth.depths[None] < BEFORE * projection.depths[shown, None]
     clear = (about & ~before).any(axis=1) & ~(about & before).any(axis=1)
-    return shown[clear], there.pixels[shown[clear]]
+    return shown[clear], projection.pixels[shown[clear]]

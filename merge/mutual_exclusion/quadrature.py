@@ -1,4 +1,4 @@
-"""Draws: points that stand for a normal distribution in the plane, always the same ones."""
+"""Quadrature: fixed samples of a normal distribution in the plane."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def _evenly_spread() -> Array:
     return out
 
 
-DRAWS = _evenly_spread()
+SAMPLES = _evenly_spread()
 LEAST_SPREAD = 0.01
-"""Nobody's place is known better than this, m."""
+"""No position is known better than this, m."""
 
 
 def quadrature_points(spreads: Array) -> Array:
-    """(K, 64, 2) m, equally likely offsets from where something is thought to be.
+    """(K, 64, 2) m, equally likely offsets from the mean.
 
     Args:
         spreads: (K, 2, 2) m^2, covariances.
     """
     roots = np.linalg.cholesky(spreads + LEAST_SPREAD**2 * np.eye(2))
-    out: Array = DRAWS @ roots.transpose(0, 2, 1)
+    out: Array = SAMPLES @ roots.transpose(0, 2, 1)
     return out

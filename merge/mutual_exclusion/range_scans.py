@@ -1,4 +1,4 @@
-"""Looks: what one robot's proximity sensors saw, moment by moment."""
+"""Range scans: one robot's proximity readings, moment by moment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class RangeScans:
         bearings: (N, K) rad, in robot.
         distances: (N, K) m, from the robot's middle to the first thing; the sensors' reach where there was
             nothing.
-        seen: (N, K) whether there is a sensor that can be believed.
+        seen: (N, K) whether there is a valid reading.
     """
 
     bearings: Array
@@ -29,24 +29,28 @@ class RangeScans:
     seen: NDArray[np.bool_]
 
     @staticmethod
-    def of(ranges: Sequence[Ranges], wakes: Sequence[TrajectorySegment]) -> RangeScans:
-        """Of one robot's nodes, in their order, and then of their wakes, likewise.
+    def of(ranges: Sequence[Ranges], segments: Sequence[TrajectorySegment]) -> RangeScans:
+        """Of one robot's nodes, in their order, and then of their trajectory segments, likewise.
 
-        That there is nothing is also what a broken sensor says. So a look that met nothing at all, and a
-        sensor that has never met anything, are not believed.
+        A broken sensor also reports that there is nothing. So a scan without any reading in range, and a
+        sensor without any, are not used.
         """
-        looks = [*((one, one.distances) for one in ranges)]
-        looks += [(one, row) for one, wake in zip(ranges, wakes, strict=True) for row in wake.distances]
-        most = max((len(one) for one in ranges), default=0)
-        bearings, distances = np.zeros((2, len(looks), most))
-        there, met = np.zeros((2, len(looks), most), np.bool_)
-        for k, (one, row) in enumerate(looks):
-            there[k, : len(one)] = True
-            bearings[k, : len(one)], distances[k, : len(one)] = one.bearings, row
-            met[k, : len(one)] = row < one.reach - 1e-6
-        believed = there & met.any(axis=1, keepdims=True) & met.any(axis=0, keepdims=True)
-        return RangeScans(bearings, distances, believed)
+        scans = [*((node_ranges, node_ranges.distances) for node_ranges in ranges)]
+        scans += [
+            (node_ranges, row)
+            for node_ranges, segment in zip(ranges, segments, strict=True)
+            for row in segment.distances
+        ]
+        most = max((len(node_ranges) for node_ranges in ranges), default=0)
+        bearings, distances = np.zeros((2, len(scans), most))
+        present, met = np.zeros((2, len(scans), most), np.bool_)
+        for k, (node_ranges, row) in enumerate(scans):
+            present[k, : len(node_ranges)] = True
+            bearings[k, : len(node_ranges)], distances[k, : len(node_ranges)] = node_ranges.bearings, row
+            met[k, : len(node_ranges)] = row < node_ranges.reach - 1e-6
+        valid = present & met.any(axis=1, keepdims=True) & met.any(axis=0, keepdims=True)
+        return RangeScans(bearings, distances, valid)
 
     def take(self, order: NDArray[np.int64]) -> RangeScans:
-        """Some of the looks, or all in another order."""
+        """Some of the scans, or all in another order."""
         return RangeScans(self.bearings[order], self.distances[order], self.seen[order])

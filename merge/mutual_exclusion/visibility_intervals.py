@@ -14,19 +14,19 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 @dataclass(frozen=True, eq=False)
 class VisibilityInterval:
-    """M looks of robots at where another one would have been, and the P rays that they are made of.
+    """M observations of another robot's expected place, and their P rays.
 
     Attributes:
-        moments: (M,) indices of the times when they looked.
-        observers: (M,) rows in the graph of the nodes that tell where they were.
+        moments: (M,) indices of their times.
+        observers: (M,) rows in the graph of the observers' nodes.
         headings: (M,) rad, of the observers in the merged frame.
         levers: (M, 2) m, from that node to the observer, in the merged frame: it was on its way from it.
-        others: (M,) rows of the other robot's nodes that tell where it was.
+        others: (M,) rows of the other robot's nodes.
         other_levers: (M, 2) m, from that node to the other.
         offsets: (M, 2) m, from the observer to the other.
-        spreads: (M, 2, 2) m^2, how both wander beside these nodes and between them.
+        spreads: (M, 2, 2) m^2, covariance of both poses relative to these nodes.
         radii: (M,) m, of the other.
-        looks: (P,) which look a ray belongs to, ascending.
+        looks: (P,) observation of each ray, ascending.
         directions: (P, 2) of the rays, unit vectors in the merged frame.
         lengths: (P,) m, how far they went.
     """
@@ -45,17 +45,17 @@ class VisibilityInterval:
     lengths: Array
 
     def __len__(self) -> int:
-        """How many looks."""
+        """How many observations."""
         return len(self.moments)
 
     def __add__(self, other: VisibilityInterval) -> VisibilityInterval:
-        """These looks, then others."""
+        """These observations, then others."""
         pairs = {name: (getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__}
         pairs["looks"] = self.looks, other.looks + len(self)
         return VisibilityInterval(**{name: np.concatenate(pair) for name, pair in pairs.items()})
 
     def take(self, mask: NDArray[np.bool_]) -> VisibilityInterval:
-        """Some of these looks."""
+        """Some of these observations."""
         rays = ("looks", "directions", "lengths")
         of_rays = mask[self.looks]
         kept = {n: getattr(self, n)[of_rays if n in rays else mask] for n in self.__dataclass_fields__}
@@ -66,25 +66,25 @@ class VisibilityInterval:
 def visibility_intervals(
     graph: PoseGraph, observer: BodyTrajectory, other: BodyTrajectory, stay: Stay, times: Array
 ) -> VisibilityInterval:
-    """All looks of one robot in which the other one would have been in reach.
+    """All observations of one robot with the other robot's expected place in reach.
 
     Args:
         graph: the merged component that holds the nodes of both.
-        observer: its trail.
+        observer: its trajectory.
         other: the other's.
         stay: where the other one was at `times`.
-        times: (T,) s, ascending; among them all times of the observer's trail while both trails last.
+        times: (T,) s, ascending; among them all times of the observer's trajectory that both have in common.
     """
     rows, other_rows = graph.index(observer.nodes), graph.index(other.nodes)[stay.nearest]
     poses = observer.poses(graph)
     at = np.minimum(np.searchsorted(times, observer.times), len(times) - 1)
     offsets = stay.places[at] - poses[:, :2]
     furthest = np.max(observer.looks.distances, axis=1, initial=0.0, where=observer.looks.seen)
-    near = np.hypot(offsets[:, 0], offsets[:, 1]) < furthest + other.radius
-    good = np.flatnonzero((times[at] == observer.times) & stay.known[at] & near & (other.radius > 0.0))
+    nearby = np.hypot(offsets[:, 0], offsets[:, 1]) < furthest + other.radius
+    good = np.flatnonzero((times[at] == observer.times) & stay.known[at] & nearby & (other.radius > 0.0))
     moments = at[good]
-    looks, sensors = np.nonzero(observer.looks.seen[good])
-    angles = (poses[good, 2, None] + observer.looks.bearings[good])[looks, sensors]
+    scans, sensors = np.nonzero(observer.looks.seen[good])
+    angles = (poses[good, 2, None] + observer.looks.bearings[good])[scans, sensors]
     levers = poses[good, :2] - graph.means[rows[good], :2]
     return VisibilityInterval(
         moments=moments,
@@ -96,7 +96,7 @@ def visibility_intervals(
         offsets=offsets[good],
         spreads=stay.spreads[moments] + observer.drifts[good, None, None] ** 2 * np.eye(2),
         radii=np.full(len(good), other.radius),
-        looks=looks,
+        looks=scans,
         directions=np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        lengths=observer.looks.distances[good][looks, sensors],
+        lengths=observer.looks.distances[good][scans, sensors],
     )

@@ -1,10 +1,9 @@
 """Maps are joined step by step, best supported first, and each step is evidence for the next.
 
-Two maps that few links join may be joined by many once one of them is part of something larger; of two
-stories that are supported alike one may then prevail; and a link that was too little alone may be borne out
-by what others have joined. So in each round only pieces are joined of which each is the other's best
-supported one. Then the links between the larger pieces are sorted anew, all together, and those within one
-piece are tested against it.
+Two maps with few links may be joined by many once one of them is part of a larger piece; of two contradicting
+sets with equal support one may then win; and an isolated link may be confirmed by what others have joined. So
+each round joins only pieces that are each other's best supported partner. Then the links between the larger
+pieces are sorted again, all together, and those within one piece are tested against it.
 """
 
 from __future__ import annotations
@@ -50,36 +49,36 @@ def agglomerate(
     Args:
         solver: of the fragments.
         groups: by the names of the fragments.
-        s: when links are believed.
-        standing: links that are believed already; the others are tested against what they join.
+        s: when links are accepted.
+        standing: links that are accepted already; the others are tested against what they join.
         closed: pairs of links that are not asked: they were refused, and nothing near them has changed.
 
     Returns:
         The links that join, and those that do not; what a group has refuted or what is closed is in neither.
     """
     kept = list(standing)
-    told = {link.key for link in kept} | closed
-    asked = {key: [k for k in group.links if k.key not in told] for key, group in groups.items()}
+    keys = {link.key for link in kept} | closed
+    asked = {key: [k for k in group.links if k.key not in keys] for key, group in groups.items()}
     asked = {key: links for key, links in asked.items() if links}
     for key in asked:
         if groups[key].first is groups[key].second:
-            kept += [link for link in groups[key].sorted.kept if link.key not in told]
-    refused = {r.pair: r for key in asked for r in groups[key].sorted.refused if r.pair not in told}
+            kept += [link for link in groups[key].sorted.kept if link.key not in keys]
+    refused = {r.pair: r for key in asked for r in groups[key].sorted.refused if r.pair not in keys}
     waiting = [link for key, links in asked.items() if key[0] != key[1] for link in links]
     between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
-    heard = _heard(groups)
+    chance = _chance_support(groups)
     agreed = {
         link.key
         for key in asked
         if key in between
-        for link in _beyond_chance(between[key], [between[key]], heard[key[0].map], s).kept
+        for link in _beyond_chance(between[key], [between[key]], chance[key[0].map], s).kept
     }
     sorted_before: dict[Key, tuple[PoseGraph, PoseGraph, int, Sorted]] = {}
     while True:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in waiting if by_node[link.a] is by_node[link.b]]
         waiting = [link for link in waiting if by_node[link.a] is not by_node[link.b]]
-        borne_out = _borne_out(inside, by_node, agreed, heard, s)
+        borne_out = _borne_out(inside, by_node, agreed, chance, s)
         kept += borne_out
         fits = {link.pair for link in borne_out}
         for link in inside:
@@ -89,40 +88,42 @@ def agglomerate(
         if not pools:
             break
         own: dict[Key, list[Sorted]] = {}
-        for (a, b), found in between.items():
+        for (a, b), sorted_links in between.items():
             first, second = sorted((by_node[a].name, by_node[b].name))
-            own.setdefault((first, second), []).append(found)
+            own.setdefault((first, second), []).append(sorted_links)
         pooled = {}
         for key, links in pools.items():
             first_graph, second_graph = (by_node[name].graph for name in key)
-            known = sorted_before.get(key)
-            if known is None or known[:3] != (first_graph, second_graph, len(links)):
-                found = _sorted(links, key, groups, by_node, s)
-                known = sorted_before[key] = first_graph, second_graph, len(links), found
-            pooled[key] = _beyond_chance(known[3], own[key], heard[key[0].map], s)
-        chosen = joined({key: found.weight for key, found in pooled.items() if found.kept}, pooled)
+            cached = sorted_before.get(key)
+            if cached is None or cached[:3] != (first_graph, second_graph, len(links)):
+                sorted_links = _sorted(links, key, groups, by_node, s)
+                cached = sorted_before[key] = first_graph, second_graph, len(links), sorted_links
+            pooled[key] = _beyond_chance(cached[3], own[key], chance[key[0].map], s)
+        chosen = joined(
+            {key: sorted_links.weight for key, sorted_links in pooled.items() if sorted_links.kept}, pooled
+        )
         if not chosen:
-            for key, found in pooled.items():
-                refused = {**{r.pair: r for r in found.refused}, **refused}
+            for key, sorted_links in pooled.items():
+                refused = {**{r.pair: r for r in sorted_links.refused}, **refused}
                 for link in pools[key]:
-                    refused.setdefault(link.key, refuse(link, found.refused[0].reason))
+                    refused.setdefault(link.key, refuse(link, sorted_links.refused[0].reason))
             break
         kept += [link for key in chosen for link in pooled[key].kept]
         through = {link.key for key in chosen for link in pooled[key].kept}
         waiting = [link for link in waiting if link.key not in through]
-    told = {link.key for link in kept}
-    left = [link for links in asked.values() for link in links if link.key not in told]
-    kept = _heard_again(solver, kept, left, agreed, heard, s)
-    told = {link.key for link in kept}
-    return kept, [r for pair, r in refused.items() if pair not in told]
+    keys = {link.key for link in kept}
+    left = [link for links in asked.values() for link in links if link.key not in keys]
+    kept = _update_chance_support(solver, kept, left, agreed, chance, s)
+    keys = {link.key for link in kept}
+    return kept, [r for pair, r in refused.items() if pair not in keys]
 
 
-def _heard_again(
+def _update_chance_support(
     solver: ComponentSolver,
     kept: Sequence[Link],
     refused: Sequence[Link],
     agreed: set[tuple[NodeId, NodeId]],
-    heard: Mapping[MapId, ChanceSupport],
+    chance: Mapping[MapId, ChanceSupport],
     s: ConsistencySettings,
 ) -> list[Link]:
     """Refused links that the joined map bears out after all, until there is none.
@@ -134,7 +135,7 @@ def _heard_again(
     while refused:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
         inside = [link for link in refused if by_node[link.a] is by_node[link.b]]
-        back = _borne_out(inside, by_node, agreed, heard, s)
+        back = _borne_out(inside, by_node, agreed, chance, s)
         if not back:
             return kept
         kept += back
@@ -159,8 +160,8 @@ def _sorted(
     return sort_links(best, first, second, s)
 
 
-def _heard(groups: Mapping[Key, LinkGroup]) -> dict[MapId, ChanceSupport]:
-    """What false witnesses are like, by map: read off all maps that links tie to it, directly or not."""
+def _chance_support(groups: Mapping[Key, LinkGroup]) -> dict[MapId, ChanceSupport]:
+    """Chance support by map: measured on all maps that links connect to it, directly or not."""
     ties: nx.Graph = nx.Graph()
     ties.add_edges_from((group.first.name.map, group.second.name.map) for group in groups.values())
     out: dict[MapId, ChanceSupport] = {}
@@ -175,10 +176,10 @@ def _heard(groups: Mapping[Key, LinkGroup]) -> dict[MapId, ChanceSupport]:
 
 
 def _beyond_chance(
-    found: Sorted, own: Sequence[Sorted], heard: ChanceSupport, s: ConsistencySettings
+    sorted_links: Sorted, own: Sequence[Sorted], chance: ChanceSupport, s: ConsistencySettings
 ) -> Sorted:
     """What chance does is read off all pieces but the two that are judged."""
-    return found.beyond_chance(heard.without(ChanceSupport.of(one.supports[0] for one in own)), s)
+    return sorted_links.beyond_chance(chance.without(ChanceSupport.of(group.supports[0] for group in own)), s)
 
 
 def best_supported(weights: Mapping[Key, float]) -> dict[NodeId, Key]:
@@ -194,7 +195,7 @@ def joined(weights: Mapping[Key, float], tied: Container[Key]) -> list[Key]:
     """Which pieces are joined in this round: those of which each is the other's best supported one.
 
     A piece of which the other one has a better supported one is joined to it too, if no links at all tie it
-    to any of those: then they have nothing to say to each other, and whichever comes first is the same.
+    to any of those: then they are independent, and their order does not matter.
 
     Args:
         weights: behind the links that would join two pieces, the smaller first.
@@ -207,14 +208,14 @@ def joined(weights: Mapping[Key, float], tied: Container[Key]) -> list[Key]:
     better: dict[NodeId, list[NodeId]] = {}
     out = []
     for key in _ranked(weights):
-        for one, other in (key, key[::-1]):
-            if best[one] == key and not any(
-                (min(one, rival), max(one, rival)) in tied for rival in better.get(other, ())
+        for a, b in (key, key[::-1]):
+            if best[a] == key and not any(
+                (min(a, rival), max(a, rival)) in tied for rival in better.get(b, ())
             ):
                 out.append(key)
                 break
-        for one, other in (key, key[::-1]):
-            better.setdefault(one, []).append(other)
+        for a, b in (key, key[::-1]):
+            better.setdefault(a, []).append(b)
     return out
 
 
@@ -226,7 +227,7 @@ def _borne_out(
     links: Sequence[Link],
     by_node: Mapping[NodeId, Fragment],
     agreed: set[tuple[NodeId, NodeId]],
-    heard: Mapping[MapId, ChanceSupport],
+    chance: Mapping[MapId, ChanceSupport],
     s: ConsistencySettings,
 ) -> list[Link]:
     """The links within pieces that these bear out: others of their group agree with them and they fit, or how
@@ -237,10 +238,10 @@ def _borne_out(
         piece = by_node[link.a]
         inside.setdefault(piece.name, (piece.graph, []))[1].append(link)
     out: list[Link] = []
-    for graph, here in inside.values():
-        least = max(0.0, s.least_evidence - heard[here[0].a.map].log_odds)
-        good = borne_out(here, graph, agreed, least, s)
-        out += [link for link, yes in zip(here, good, strict=True) if yes]
+    for graph, inside_links in inside.values():
+        least = max(0.0, s.least_evidence - chance[inside_links[0].a.map].log_odds)
+        good = borne_out(inside_links, graph, agreed, least, s)
+        out += [link for link, yes in zip(inside_links, good, strict=True) if yes]
     return out
 
 
@@ -258,13 +259,13 @@ def borne_out(
         graph: the piece.
         agreed: links that others of their group agree with.
         least: natural logarithm of Bayes' factor from which any other one is likely enough.
-        s: when links are believed.
+        s: when links are accepted.
     """
     if not links:
         return []
     fits = misfits(links, graph, s) < s.gate
     out = [bool(good) and link.key in agreed for link, good in zip(links, fits, strict=True)]
     asked = [k for k, good in enumerate(out) if not good]
-    for k, found in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
-        out[k] = bool(found.log_factor > least)
+    for k, standpoint in zip(asked, standpoints([links[k] for k in asked], graph, kept=False), strict=True):
+        out[k] = bool(standpoint.log_factor > least)
     return out

@@ -1,14 +1,14 @@
-"""Distinctness: which landmarks tell a place at all.
+"""Distinctness: which landmarks identify a place.
 
-In a warehouse the same cartons stand in every other bay. What two nodes share there is found again between
-many nodes, and each time the geometry is right: nothing in the two images tells that it is another bay. But
-the fleet's maps do. A node's landmark that was recognised at one place, and at another one which by that
-robot's own way is not the same, is something that there is twice; so is one that a loop recognised against
-its map's own way. Such a landmark says what is seen, not where. It counts for no link of its node, wherever
-that leads to: only the rest of a link's landmarks speak for it. (Text retrieval has long weighed words by how
-few documents they are in, Sparck Jones 1972; here geometry tells which landmarks are in how many places.)
+In a warehouse the same cartons are in every other bay. Landmarks that two nodes share there are found again
+between many nodes, each time with correct geometry: nothing in the two images shows that it is another bay.
+But the fleet's maps do. A node's landmark that was recognised at one place, and at another that by that
+robot's own drive is different, occurs twice; so does one that a loop closure recognised against its map's own
+drive. Such a landmark is aliased: it shows what is seen, not where. It counts for no link of its node; only
+the rest of a link's landmarks support it. (Text retrieval weights words by how few documents contain them,
+Sparck Jones 1972; here geometry shows at how many places a landmark is.)
 
-What is left of a true link is what there is nowhere else: a sign, a wall, the one bay with other goods.
+What remains of a true link is unique: a sign, a wall, a bay with other goods.
 
 Landmarks are followed from node to node, by the images that a robot saw on its way and by loops that agree
 with it: what is found out at one node holds for all that show the same thing.
@@ -70,26 +70,26 @@ def weigh(
 
     Returns:
         The links in the same order; where there are such landmarks, with their number among the evidence.
-        Links that do not tell their landmarks stay as they are. The order has no say.
+        Links without landmarks are unchanged. The result does not depend on the order.
     """
     c, s = consistency or ConsistencySettings(), settings or DistinctnessSettings()
-    # What a robot says of nodes of others it did not see: they would lose their links by it.
-    own = (e for one in maps.values() for e in one.edges.values() if e.within)
+    # A robot's edges between nodes of others are not images: those nodes would lose links by them.
+    own = (e for a in maps.values() for e in a.edges.values() if e.within)
     claims = [link_of(e) for e in own if e.kind is EdgeKind.LOOP]
-    told = (link for link in (*links, *claims) if len(link.shared))
-    known = [link for link in told if link.a in by_node and link.b in by_node]
+    with_landmarks = (link for link in (*links, *claims) if len(link.shared))
+    connected = [link for link in with_landmarks if link.a in by_node and link.b in by_node]
     doubles: set[Landmark] = set()
-    if known:
-        sides = _Sides.of(known, by_node)
+    if connected:
+        sides = _Sides.of(connected, by_node)
         loops, pairs = sides.loops(), sides.pairs()
         astray = sides.contradict(loops, None, c, s)
         for k in loops[astray]:
-            doubles |= _ends(known[k])
+            doubles |= _ends(connected[k])
         for i, j in pairs[sides.contradict(pairs[:, 0], pairs[:, 1], c, s)]:
-            node, one, other = sides.meeting(i, j)
-            doubles |= {(node, int(landmark)) for landmark in np.intersect1d(one, other)}
+            node, a, b = sides.meeting(i, j)
+            doubles |= {(node, int(landmark)) for landmark in np.intersect1d(a, b)}
         if doubles:
-            doubles = _followed(doubles, [known[k] for k in loops[~astray]], maps)
+            doubles = _followed(doubles, [connected[k] for k in loops[~astray]], maps)
     return [_weighed(link, doubles) for link in links]
 
 
@@ -128,16 +128,16 @@ class _Sides:
             np.array([first[by_node[node].name] + graphs[by_node[node].name].rows[node] for node in nodes])
             for nodes in zip(*(link.pair for link in links), strict=True)
         )
-        there = PoseGaussians(
+        far_poses = PoseGaussians(
             np.array([(m.x, m.y, m.heading) for m in (link.a_from_b.mean for link in links)]),
             np.array([link.a_from_b.covariance for link in links]),
         )
-        back = there.inverse()
+        back = far_poses.inverse()
         return _Sides(
             links,
             PoseGaussians(
-                np.concatenate([there.means, back.means]),
-                np.concatenate([there.covariances, back.covariances]),
+                np.concatenate([far_poses.means, back.means]),
+                np.concatenate([far_poses.covariances, back.covariances]),
             ),
             np.concatenate([a, b]),
             np.concatenate([b, a]),
@@ -150,8 +150,8 @@ class _Sides:
     def loops(self) -> NDArray[np.int64]:
         """(L,) links within one fragment."""
         count = len(self.links)
-        found = self.fragments[self.near[:count]] == self.fragments[self.far[:count]]
-        return np.flatnonzero(found)
+        same_fragment = self.fragments[self.near[:count]] == self.fragments[self.far[:count]]
+        return np.flatnonzero(same_fragment)
 
     def pairs(self) -> NDArray[np.int64]:
         """(K, 2) sides that go from one node into one other fragment, two by two."""
@@ -168,13 +168,13 @@ class _Sides:
         count = len(self.links)
         links = self.links[i % count], self.links[j % count]
         columns = int(i >= count), int(j >= count)
-        one, other = (link.shared[:, column] for link, column in zip(links, columns, strict=True))
-        return links[0].pair[columns[0]], one, other
+        a, b = (link.shared[:, column] for link, column in zip(links, columns, strict=True))
+        return links[0].pair[columns[0]], a, b
 
     def contradict(
         self,
         sides: NDArray[np.int64],
-        others: NDArray[np.int64] | None,
+        but: NDArray[np.int64] | None,
         c: ConsistencySettings,
         s: DistinctnessSettings,
     ) -> NDArray[np.bool_]:
@@ -182,32 +182,32 @@ class _Sides:
 
         Args:
             sides: (K,) which.
-            others: (K,) which; None: loops, and the way between the two ends of each.
+            but: (K,) which; None: loops, and the way between the two ends of each.
             c: when they contradict it,
             s: and by how much at least.
         """
         starts = self.far[sides]
-        ends = self.near[sides] if others is None else self.far[others]
+        ends = self.near[sides] if but is None else self.far[but]
         own = compose_poses(inverse_poses(self.places[ends]), self.places[starts])
-        off = compose_poses(self._between(sides, others).means, own)
+        off = compose_poses(self._between(sides, but).means, own)
         much = (np.hypot(off[:, 0], off[:, 1]) > APART_XY) | (abs(off[:, 2]) > APART_HEADING)
         out = np.zeros(len(sides), bool)
         # Covariances cost more than all the rest: only where places seem to be different.
         for fragment in np.unique(self.fragments[starts[much]]):
-            here = np.flatnonzero(much & (self.fragments[starts] == fragment))
+            rows = np.flatnonzero(much & (self.fragments[starts] == fragment))
             nodes, first = self.graphs[fragment].nodes, self.starts[fragment]
             back = self.graphs[fragment].relative(
-                [nodes[k - first] for k in ends[here]], [nodes[k - first] for k in starts[here]]
+                [nodes[k - first] for k in ends[rows]], [nodes[k - first] for k in starts[rows]]
             )
-            loop = self._between(sides[here], None if others is None else others[here]) @ back
+            loop = self._between(sides[rows], None if but is None else but[rows]) @ back
             floor = np.diag([c.floor_xy**2, c.floor_xy**2, c.floor_heading**2])
-            out[here] = PoseGaussians(loop.means, loop.covariances + floor).distances2() > c.gate
+            out[rows] = PoseGaussians(loop.means, loop.covariances + floor).distances2() > c.gate
         return out
 
-    def _between(self, sides: NDArray[np.int64], others: NDArray[np.int64] | None) -> PoseGaussians:
-        """How the far ends stand to each other by the links alone; of a loop, its far and its near end."""
+    def _between(self, sides: NDArray[np.int64], but: NDArray[np.int64] | None) -> PoseGaussians:
+        """Relative pose of the far ends by the links alone; of a loop, of its far and its near end."""
         back = self.poses.take(sides).inverse()
-        return back if others is None else back @ self.poses.take(others)
+        return back if but is None else back @ self.poses.take(but)
 
 
 def _ends(link: Link) -> set[Landmark]:
@@ -224,20 +224,20 @@ def _followed(
         by_loop[link.a].append(link)
         by_loop[link.b].append(link.turned())
     onward: dict[NodeId, dict[int, list[Landmark]]] = {}
-    found, waiting = set(doubles), list(doubles)
+    reached, waiting = set(doubles), list(doubles)
     while waiting:
         node, landmark = waiting.pop()
         if node not in onward:
             onward[node] = _next_to(node, by_loop.get(node, ()), maps[node.map])
-        fresh = [same for same in onward[node].get(landmark, ()) if same not in found]
-        found.update(fresh)
+        fresh = [same for same in onward[node].get(landmark, ()) if same not in reached]
+        reached.update(fresh)
         waiting += fresh
-    return found
+    return reached
 
 
-def _next_to(node: NodeId, loops: Iterable[Link], one: HybridMap) -> dict[int, list[Landmark]]:
+def _next_to(node: NodeId, loops: Iterable[Link], hybrid_map: HybridMap) -> dict[int, list[Landmark]]:
     """Which landmarks of other nodes show the same things as a node's own."""
-    edges = (one.edges[key] for _, _, key in one.graph.edges(node, keys=True))
+    edges = (hybrid_map.edges[key] for _, _, key in hybrid_map.graph.edges(node, keys=True))
     ways = [link_of(edge) for edge in edges if edge.kind in FOLLOWED and edge.within]
     table: dict[int, list[Landmark]] = defaultdict(list)
     for way in (*(way if way.a == node else way.turned() for way in ways), *loops):

@@ -1,8 +1,8 @@
-"""Drives among the nodes of others: they say that a robot can get through, not where nodes are.
+"""Drives among the nodes of others: they show that a robot can get through, not where nodes are.
 
-A robot that follows a route through the merged map notes in its own log that it got from node to node. Where
-nodes of different maps stand to each other is settled by what both show, which anybody can verify again. So
-such an edge takes no part in the merge; it is only checked against its outcome.
+A robot that follows a route through the merged map records in its own log that it got from node to node. The
+relative pose of nodes of different maps comes from their landmarks, which can be verified again. So such an
+edge takes no part in the merge; it is only checked against the result.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mapweave.merge.pose_graph.links import RefusedLink, refuse_edge
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 VAGUE = np.array([0.6, 0.6, 0.2])
-"""m, m, rad: a drive known no better tells not even that the servo got there. Four of these are as far as it
-gets, see `mapweave.hybridmap.reachability.ReachabilitySettings`. Robots tell none above 0.1 m."""
+"""m, m, rad: an edge known no better does not even show that the servo got there. Four of these are its
+range, see `mapweave.hybridmap.reachability.ReachabilitySettings`. Robots report none above 0.1 m."""
 
 
 def refuse_drives(
@@ -38,8 +38,8 @@ def refuse_drives(
         merged map contradicts, or hardly anything.
     """
     refusals = []
-    for map_id, one in sorted(maps.items()):
-        for edge in sorted(one.edges.values(), key=lambda edge: edge.id):
+    for map_id, hybrid_map in sorted(maps.items()):
+        for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
             reason = "" if edge.a.map == edge.b.map == map_id else _objection(edge, graphs, s)
             if reason:
                 refusals.append(refuse_edge(edge, f"a drive {reason}"))

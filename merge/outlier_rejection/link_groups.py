@@ -45,8 +45,8 @@ class LinkGroup:
         links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings, verdict: Verdict
     ) -> LinkGroup:
         """Sort links; where two sets contradict each other and neither prevails, one may be impossible."""
-        found = sort_links(links, first, second, s)
-        return LinkGroup(first, second, tuple(links), found, tuple(links))._settled(s, verdict)
+        sorted_links = sort_links(links, first, second, s)
+        return LinkGroup(first, second, tuple(links), sorted_links, tuple(links))._settled(s, verdict)
 
     @property
     def refused(self) -> tuple[RefusedLink, ...]:
@@ -54,33 +54,33 @@ class LinkGroup:
         return self.sorted.refused + self.refuted
 
     def without(
-        self, story: Sequence[Link], reason: str, s: ConsistencySettings, verdict: Verdict
+        self, refuted: Sequence[Link], reason: str, s: ConsistencySettings, verdict: Verdict
     ) -> LinkGroup:
         """The rest get their chance when a set of links is refuted.
 
         Args:
-            story: links that agree and cannot be true; those that agree with most of them fall too.
+            refuted: links that agree and cannot be true; those that agree with most of them are refuted too.
             reason: in words.
-            s: when links are believed.
-            verdict: on sets that are now supported alike.
+            s: when links are accepted.
+            verdict: on sets that now have equal support.
         """
-        return self._without(story, reason, s)._settled(s, verdict)
+        return self._without(refuted, reason, s)._settled(s, verdict)
 
-    def _without(self, story: Sequence[Link], reason: str, s: ConsistencySettings) -> LinkGroup:
-        told = {link.key for link in story}
-        in_story = np.array([link.key in told for link in self.links])
+    def _without(self, refuted: Sequence[Link], reason: str, s: ConsistencySettings) -> LinkGroup:
+        keys = {link.key for link in refuted}
+        in_set = np.array([link.key in keys for link in self.links])
         agree = loop_distances2(self.links, self.first, self.second, s) < s.gate
-        falls = in_story | (agree[:, in_story].mean(axis=1) > 0.5)
-        left = tuple(link for link, gone in zip(self.links, falls, strict=True) if not gone)
-        gone = tuple(refuse(link, reason) for link, gone in zip(self.links, falls, strict=True) if gone)
-        found = sort_links(left, self.first, self.second, s)
-        return replace(self, links=left, sorted=found, refuted=self.refuted + gone)
+        falls = in_set | (agree[:, in_set].mean(axis=1) > 0.5)
+        left = tuple(link for link, fallen in zip(self.links, falls, strict=True) if not fallen)
+        fallen = tuple(refuse(link, reason) for link, fallen in zip(self.links, falls, strict=True) if fallen)
+        sorted_links = sort_links(left, self.first, self.second, s)
+        return replace(self, links=left, sorted=sorted_links, refuted=self.refuted + fallen)
 
     def _settled(self, s: ConsistencySettings, verdict: Verdict) -> LinkGroup:
         group = self
         while group.sorted.rivals:
-            reasons = [(story, verdict(story)) for story in group.sorted.rivals]
-            impossible = [(story, reason) for story, reason in reasons if reason]
+            reasons = [(links, verdict(links)) for links in group.sorted.rivals]
+            impossible = [(links, reason) for links, reason in reasons if reason]
             if not impossible:
                 break
             group = group._without(*impossible[0], s)

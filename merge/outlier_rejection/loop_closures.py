@@ -1,4 +1,4 @@
-"""Claims: what a robot says of two nodes of its own map that rests on recognising places."""
+"""Loop closures: edges between two nodes of a robot's own map that rest on place recognition."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySet
 from mapweave.merge.pose_graph.links import RefusedLink, link_of, refuse_edge
 
 CLAIMS = (EdgeKind.LOOP, EdgeKind.MERGED, EdgeKind.DRIVEN)
-"""Edges that stand and fall with the recognition of places."""
+"""Edge kinds that rest on place recognition."""
 
 Claims = dict[tuple[NodeId, NodeId], tuple[Edge, ...]]
-"""Edges by the two nodes, smaller id first: those that were recognised and driven alike, the surest first."""
+"""Edges by the two nodes, smaller id first: of both kinds, the most certain first."""
 
 
 def sort_loop_closures(edges: Iterable[Edge], s: ConsistencySettings) -> tuple[Claims, list[RefusedLink]]:
     """The claims among a robot's edges: between two nodes one that was recognised, one that was driven.
 
-    Of several that were recognised the last counts. One that was driven says how nodes stand that two views
-    showed one after the other; if it contradicts what one view shows, that is believed.
+    Of several that were recognised the last counts. A driven edge connects nodes that two views showed one
+    after the other; if it contradicts what one view shows, the one view is trusted.
 
     Args:
         edges: with both ends in the robot's map.
@@ -36,22 +36,24 @@ def sort_loop_closures(edges: Iterable[Edge], s: ConsistencySettings) -> tuple[C
         kind, word = (driven, "driven") if edge.kind is EdgeKind.DRIVEN else (recognised, "recognised")
         earlier = kind.get(link_of(edge).pair)
         if earlier is not None:
-            refusals.append(refuse_edge(earlier, f"{word} again, which {edge.id} tells"))
+            refusals.append(refuse_edge(earlier, f"{word} again, see {edge.id}"))
         kind[link_of(edge).pair] = edge
     claims: Claims = {pair: (edge,) for pair, edge in recognised.items()}
     for pair, edge in driven.items():
-        seen = recognised.get(pair)
-        if seen is None:
+        recognition = recognised.get(pair)
+        if recognition is None:
             claims[pair] = (edge,)
-        elif _alike(link_of(edge).a_from_b, link_of(seen).a_from_b, s):
-            both = sorted((edge, seen), key=lambda one: float(link_of(one).a_from_b.covariance.trace()))
+        elif _alike(link_of(edge).a_from_b, link_of(recognition).a_from_b, s):
+            both = sorted(
+                (edge, recognition), key=lambda one: float(link_of(one).a_from_b.covariance.trace())
+            )
             claims[pair] = tuple(both)
         else:
-            refusals.append(refuse_edge(edge, f"contradicts what was recognised, which {seen.id} tells"))
+            refusals.append(refuse_edge(edge, f"contradicts what was recognised, see {recognition.id}"))
     return claims, refusals
 
 
-def _alike(one: PoseGaussian, other: PoseGaussian, s: ConsistencySettings) -> bool:
-    spread = other.covariance.copy()
+def _alike(a: PoseGaussian, b: PoseGaussian, s: ConsistencySettings) -> bool:
+    spread = b.covariance.copy()
     spread[[0, 1, 2], [0, 1, 2]] += s.floor_xy**2, s.floor_xy**2, s.floor_heading**2
-    return PoseGaussian(one.mean, one.covariance + spread).mahalanobis2(other.mean) < s.gate
+    return PoseGaussian(a.mean, a.covariance + spread).mahalanobis2(b.mean) < s.gate

@@ -1,11 +1,11 @@
-"""Which links tell the same story: pairwise consistency, and the best supported set of it.
+"""Which links agree: pairwise consistency, and the best supported consistent set.
 
-Two links between the same two pieces of map close a loop: along one link, through the one piece, back along
-the other link, through the other piece. If both are right the loop comes back to where it began, within its
+Two links between the same two pieces of map close a loop: along one link, through one piece, back along the
+other link, through the other piece. If both are right the loop comes back to where it began, within its
 uncertainty (pairwise consistent measurement set maximisation, Mangelson et al., ICRA 2018). A false link, or
-a set of links into a room that merely looks alike, closes no loop with the true ones. The set that is kept is
-the clique with the most landmarks behind it, and it has to be clearly better than any that contradicts it.
-Links between the same two places are no independent witnesses and count for less (see witnesses.py).
+a set of links into a room that only looks the same, closes no loop with the true ones. The set that is kept
+is the clique with the most landmarks, and it has to be clearly better than any that contradicts it. Links
+between the same two places are not independent and count for less (see independent_support.py).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mapweave.merge.outlier_rejection.independent_support import (
 )
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
 from mapweave.merge.pose_graph.fragments import Fragment
-from mapweave.merge.pose_graph.links import Link, RefusedLink, place_told, refuse
+from mapweave.merge.pose_graph.links import Link, RefusedLink, place_distinct, refuse
 from mapweave.registration.pose_arrays import PoseGaussians
 
 HUNDREDTHS = 100.0
@@ -75,12 +75,12 @@ class ConsistencySettings:
 
 @dataclass(frozen=True, eq=False)
 class Sorted:
-    """Links between two pieces of map, sorted into believed and not.
+    """Links between two pieces of map, sorted into kept and refused.
 
     Attributes:
         kept: mutually consistent and enough, or nothing.
         refused: the others, with reasons.
-        rivals: two sets that contradict each other and are supported alike, if that is why nothing is kept.
+        rivals: two contradicting sets with equal support, if that is why nothing is kept.
         weight: landmarks behind the best set; links of one place count by the root of their number.
         sets: the best set, kept or not, and the best of those that contradict it.
         supports: behind these two.
@@ -99,25 +99,25 @@ class Sorted:
         What is no more than chance makes is not kept, and contradicts nothing.
 
         Args:
-            false: what false witnesses are like.
-            s: when links are believed.
+            false: statistics of false places.
+            s: when links are accepted.
         """
         real = [k for k in (0, 1) if self.supports[k].by_chance(false) < s.chance]
         if len(real) == 2 or (self.kept and 0 in real):
             return self
-        story = self.sets[real[0]] if real and not _too_little(self.sets[real[0]], s) else ()
-        if not self.kept and not story:
+        accepted = self.sets[real[0]] if real and not _too_little(self.sets[real[0]], s) else ()
+        if not self.kept and not accepted:
             return self
         reason = (
-            f"contradicts {len(story)} links, and what agrees with it is no more than chance makes"
-            if story
+            f"contradicts {len(accepted)} links, and agrees with no more than by chance"
+            if accepted
             else f"as many agree by chance where {100.0 * false.share:.0f} % of the links are false"
         )
-        told = {link.key for link in story}
+        keys = {link.key for link in accepted}
         every = [*self.kept, *(r.link for r in self.refused if r.link is not None)]
-        refused = [refuse(link, reason) for link in every if link.key not in told]
+        refused = [refuse(link, reason) for link in every if link.key not in keys]
         refused.sort(key=lambda refusal: refusal.pair)
-        return replace(self, kept=story, refused=tuple(refused), rivals=())
+        return replace(self, kept=accepted, refused=tuple(refused), rivals=())
 
 
 def loop_distances2(
@@ -167,7 +167,7 @@ def sort_links(
         links: from nodes of `first` to nodes of `second`.
         first: piece of map.
         second: piece of map; may be the same.
-        settings: when links are believed.
+        settings: when links are accepted.
 
     Returns:
         Kept and refused links, in the order of their nodes.
@@ -180,10 +180,10 @@ def sort_links(
     if not links:
         return Sorted((), tuple(refused))
     distances2, spreads = _loops(links, first, second, s)
-    agree, near = distances2 < s.gate, neighbours(links, first, second, s.place)
+    agree, neighbouring = distances2 < s.gate, neighbours(links, first, second, s.place)
     landmarks = np.array([link.weight for link in links])
-    # Witnesses that depend on each other count by the root of their number.
-    weights = landmarks / np.sqrt(crowds(agree, near))
+    # Dependent links count by the root of their number.
+    weights = landmarks / np.sqrt(crowds(agree, neighbouring))
     hundredths = np.maximum(np.rint(HUNDREDTHS * weights), 1).astype(np.int64)
     best = best_clique(agree, hundredths, s.exact)
     kept = [links[k] for k in best]
@@ -194,15 +194,21 @@ def sort_links(
     sets = tuple(kept), tuple(links[k] for k in rival)
     chance = chances(distances2, spreads, first, second)
     telling = np.array([link.telling for link in links])
-    own, others = (support_of(some, telling, agree, near, chance) for some in (best, rival))
+    best_support, rival_support = (
+        support_of(some, telling, agree, neighbouring, chance) for some in (best, rival)
+    )
     rivals: tuple[tuple[Link, ...], ...] = ()
     # In number and in places: a single place may bring many links however false they are.
     if not reason and (against_it * s.dominance > support or against * s.dominance > weight):
         reason = f"ambiguous: {support} landmarks support one way of joining, {against_it} another"
         rivals = sets
-    # One of two stories that would each be believed alone is false: landmarks and links do not tell which.
-    elif not reason and not _too_little(sets[1], s) and own.witnesses < s.dominance * others.witnesses:
-        places = f"{own.witnesses:.1f} and {others.witnesses:.1f} independent places"
+    # Of two sets that would each be accepted alone one is false: landmarks and links do not show which.
+    elif (
+        not reason
+        and not _too_little(sets[1], s)
+        and best_support.places < s.dominance * rival_support.places
+    ):
+        places = f"{best_support.places:.1f} and {rival_support.places:.1f} independent places"
         reason = f"ambiguous: two ways of joining contradict each other, with {places} behind"
         rivals = sets
     for k, link in enumerate(links):
@@ -217,14 +223,14 @@ def sort_links(
         rivals,
         weight,
         sets,
-        (own, others),
+        (best_support, rival_support),
     )
 
 
 def _against_odometry(
     links: Sequence[Link], fragment: Fragment, s: ConsistencySettings
 ) -> tuple[list[Link], list[RefusedLink]]:
-    """A loop within a map must also agree with the map's own way from the one node to the other."""
+    """A loop within a map must also agree with the map's own drive between the two nodes."""
     if not links:
         return [], []
     own = fragment.graph.relative([link.b for link in links], [link.a for link in links])
@@ -246,10 +252,10 @@ def _rival(
     agree: NDArray[np.bool_], weights: NDArray[np.int64], best: list[int], s: ConsistencySettings
 ) -> list[int]:
     """The best set among the links that agree with less than half of the kept ones."""
-    others = np.setdiff1d(np.arange(len(weights)), best)
-    others = others[agree[others][:, best].mean(axis=1) < 0.5] if best else others
-    clique = best_clique(agree[np.ix_(others, others)], weights[others], s.exact)
-    return [int(k) for k in others[clique]]
+    rest = np.setdiff1d(np.arange(len(weights)), best)
+    rest = rest[agree[rest][:, best].mean(axis=1) < 0.5] if best else rest
+    clique = best_clique(agree[np.ix_(rest, rest)], weights[rest], s.exact)
+    return [int(k) for k in rest[clique]]
 
 
 def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
@@ -257,7 +263,7 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
     if not kept:
         return "no links"
     telling = [link for link in kept if link.telling]
-    if not telling or not place_told(kept):
+    if not telling or not place_distinct(kept):
         agree = "the link shows" if len(kept) == 1 else f"the {len(kept)} links that agree show"
         return f"most of what {agree} is found at other places too"
     independent = independent_links(telling, s.least_links)

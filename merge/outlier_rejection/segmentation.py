@@ -1,11 +1,11 @@
-"""Cutting maps into fragments, and testing what each robot says of its own map.
+"""Segmentation of maps into fragments, and tests of each robot's own loop closures.
 
-That a robot drove or turned from one node to the next while mapping it has measured all the way. That it
-recognised a place (`loop`) is a claim: in a warehouse the next bay looks like this one. So is what it
-measured between two places that it recognised on a later drive (`driven`). So a robot's own claims join the
-pieces that its way makes just as links join maps: sorted by consistency. Two things differ. One claim is
-enough, for the way speaks for it. And a map is never torn apart: where a robot resumed its map elsewhere,
-claims are all that ties the new part to the old one.
+A drive or turn from one node to the next while mapping was measured all the way. A recognised place (`loop`)
+is less certain: in a warehouse the next bay looks like this one. So is a drive between two places that were
+recognised later (`driven`). So a robot's own loop closures join the pieces of its drive just as links join
+maps: sorted by consistency. Two things differ. A single one is enough, since the drive supports it. And a map
+is never torn apart: where a robot resumed its map elsewhere, loop closures alone connect the new part with
+the old one.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ def fragments_of(
     """Cut maps into connected pieces, each solved by itself, in the order of names.
 
     Args:
-        maps: by id. Edges whose ends are not both nodes of the same map are not theirs to say and are left
+        maps: by id. Edges whose ends are not both nodes of the same map are left
             out: maps are joined by links alone.
-        consistency: when a robot's own claims are believed.
+        consistency: when a robot's own loop closures are accepted.
     """
     s = consistency or ConsistencySettings()
-    found = [piece for map_id in sorted(maps) for piece in _pieces(maps[map_id], s)]
-    return sorted(found, key=lambda fragment: fragment.name)
+    fragments = [piece for map_id in sorted(maps) for piece in _pieces(maps[map_id], s)]
+    return sorted(fragments, key=lambda fragment: fragment.name)
 
 
-def _pieces(one: HybridMap, s: ConsistencySettings) -> list[Fragment]:
+def _pieces(hybrid_map: HybridMap, s: ConsistencySettings) -> list[Fragment]:
     """The fragments of one map."""
     own = sorted(
         (
             edge
-            for edge in one.edges.values()
-            if edge.a in one.nodes and edge.b in one.nodes and edge.a != edge.b
+            for edge in hybrid_map.edges.values()
+            if edge.a in hybrid_map.nodes and edge.b in hybrid_map.nodes and edge.a != edge.b
         ),
         key=lambda edge: edge.id,
     )
-    strands = _strands(one, [edge for edge in own if edge.kind not in CLAIMS])
+    strands = _strands(hybrid_map, [edge for edge in own if edge.kind not in CLAIMS])
     claims, refusals = sort_loop_closures(own, s)
     if not claims:
         return strands
@@ -84,16 +84,16 @@ def _pieces(one: HybridMap, s: ConsistencySettings) -> list[Fragment]:
     return pieces
 
 
-def _strands(one: HybridMap, edges: list[Edge]) -> list[Fragment]:
+def _strands(hybrid_map: HybridMap, edges: list[Edge]) -> list[Fragment]:
     """What a map's way alone connects."""
     graph: nx.Graph = nx.Graph()
-    graph.add_nodes_from(one.nodes)
+    graph.add_nodes_from(hybrid_map.nodes)
     graph.add_edges_from((edge.a, edge.b) for edge in edges)
     names = {node: min(piece) for piece in nx.connected_components(graph) for node in piece}
     measurements: dict[NodeId, list[Measurement]] = {name: [] for name in sorted(set(names.values()))}
     for edge in edges:
         measurements[names[edge.a]].append(Measurement(edge.a, edge.b, edge.a_from_b))
     return [
-        Fragment(name, solve_graph(name, one.nodes[name].map_from_robot.mean, inside), tuple(inside))
+        Fragment(name, solve_graph(name, hybrid_map.nodes[name].map_from_robot.mean, inside), tuple(inside))
         for name, inside in measurements.items()
     ]

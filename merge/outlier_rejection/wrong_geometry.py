@@ -56,7 +56,7 @@ LEAST_NODES = 4
 MOST_SIGMA_XY, MOST_SIGMA_HEADING = 0.25, math.radians(5.0)
 """Nodes whose place is known less well, by the surest link of a placement, are not compared, m and rad."""
 LEAST_LANDMARKS = 50
-"""In all views with which a node is compared."""
+"""Of a node that others confirm or refute: with fewer its share is chance."""
 SAME_XY, SAME_HEADING = 0.5, math.radians(20.0)
 """Links of one node agree where it is if they differ by less, m and rad."""
 REACH, MOST_NEAR = 5.0, 20
@@ -297,7 +297,7 @@ def _looked_through(
     fixed: Fragment,
     nodes: Mapping[NodeId, Node],
 ) -> Array:
-    """Of each node that can be placed: the share of landmarks through which it or others look.
+    """Of each node that can be placed: the share of its comparable landmarks that are looked through.
 
     Args:
         story: links from `placed` to `fixed` that place it.
@@ -337,9 +337,11 @@ def _looked_through(
 def looked_through(
     node: Node, view: Node, view_from_node: Pose2, sigma_xy: float, sigma_heading: float
 ) -> tuple[int, int]:
-    """How many of a node's landmarks are in a view, and through how many of these it looks.
+    """How many of a node's landmarks a view can confirm or refute, and how many it refutes.
 
-    A view looks through a landmark if it knows one behind it in the same direction, and none as far away.
+    A view confirms a landmark if it knows one as far away in the same direction. It looks through it, and so
+    refutes it, if it knows one only behind it. Landmarks that lie behind everything that the view knows
+    there are hidden, and say nothing: a map placed outside the walls would have too many of them.
 
     Args:
         node: whose landmarks.
@@ -353,13 +355,13 @@ def looked_through(
     pixels = view.camera.project(points)
     inside = view.camera.contains(pixels)
     if not inside.any() or not len(known):
-        return int(inside.sum()), 0
+        return 0, 0
     depths, pixels = points[inside, 0] - view.camera.mount_forward, pixels[inside]
     own = marks.depth_sigmas[inside].astype(np.float64) ** 2 + sigma_xy**2 + (sigma_heading * depths) ** 2
     sigmas = np.sqrt(own[:, None] + known.depth_sigmas.astype(np.float64)[None] ** 2)
     further = known.depths.astype(np.float64)[None] - depths[:, None]
     off = np.linalg.norm(pixels[:, None] - known.pixels[None], axis=2) / view.camera.fx
     same_direction = off < AROUND + 2.0 * sigma_heading
-    behind = same_direction & (further > SIGMAS * sigmas + MARGIN)
-    about = same_direction & (np.abs(further) <= SIGMAS * sigmas + MARGIN)
-    return len(depths), int((behind.any(axis=1) & ~about.any(axis=1)).sum())
+    behind = (same_direction & (further > SIGMAS * sigmas + MARGIN)).any(axis=1)
+    about = (same_direction & (np.abs(further) <= SIGMAS * sigmas + MARGIN)).any(axis=1)
+    return int((behind | about).sum()), int((behind & ~about).sum())

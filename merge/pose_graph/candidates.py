@@ -1,7 +1,7 @@
-"""Which pairs of nodes are worth a closer look: those that share many alike descriptors.
+"""Which pairs of nodes are worth a verification: those that share many similar descriptors.
 
-The overlap of two nodes depends on these two alone, not on what else is in the fleet, so a table of overlaps
-can grow node by node and the choice made from it is the same whatever came first.
+The overlap of two nodes depends on these two alone, not on the rest of the fleet, so a table of overlaps can
+grow node by node and the choice made from it does not depend on the order.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Pair = tuple[NodeId, NodeId]
 
 @dataclass(frozen=True)
 class CandidateSettings:
-    """Which pairs are looked at.
+    """Which pairs are compared.
 
     Attributes:
         most_per_map: best pairs of one node with the nodes of any one map.
@@ -43,13 +43,13 @@ class CandidateSettings:
 def overlap(
     rows: NDArray[np.int64], columns: NDArray[np.int64], squared: NDArray[Any], alike: float
 ) -> float:
-    """How many landmarks two nodes seem to share, from all pairs of descriptors that are alike.
+    """How many landmarks two nodes seem to share, from all pairs of similar descriptors.
 
     Each descriptor counts once, with its best partner and by how near that is; the smaller of the two sides'
     sums makes it symmetric.
 
     Args:
-        rows: (K,) descriptor of the one node.
+        rows: (K,) descriptor of the first node.
         columns: (K,) descriptor of the other.
         squared: (K,) squared distances, all below alike^2.
         alike: distance at which a pair counts nothing.
@@ -91,7 +91,7 @@ def choose_pairs(
     Args:
         table: overlaps by (smaller id, greater id).
         edges: of all maps; nodes that are few edges apart are left out.
-        settings: which pairs are looked at.
+        settings: which pairs are compared.
 
     Returns:
         Pairs that are among the best of either of their nodes, in the order of ids.
@@ -99,13 +99,15 @@ def choose_pairs(
     s = settings or CandidateSettings()
     graph: nx.Graph = nx.Graph()
     graph.add_edges_from((edge.a, edge.b) for edge in edges)
-    near = {node: set(nx.single_source_shortest_path_length(graph, node, s.least_hops - 1)) for node in graph}
+    neighbours = {
+        node: set(nx.single_source_shortest_path_length(graph, node, s.least_hops - 1)) for node in graph
+    }
     ranked: dict[tuple[NodeId, Any], list[tuple[float, Pair]]] = {}
     for pair, value in table.items():
         a, b = pair
-        if value < LEAST_OVERLAP or b in near.get(a, ()):
+        if value < LEAST_OVERLAP or b in neighbours.get(a, ()):
             continue
-        for one, other in ((a, b), (b, a)):
-            ranked.setdefault((one, other.map), []).append((-value, pair))
+        for first, second in ((a, b), (b, a)):
+            ranked.setdefault((first, second.map), []).append((-value, pair))
     chosen = {pair for best in ranked.values() for _, pair in sorted(best)[: s.most_per_map]}
     return sorted(chosen)

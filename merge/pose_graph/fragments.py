@@ -19,7 +19,7 @@ class Fragment:
     Attributes:
         name: the smallest id in it.
         graph: solved poses; the smallest id is held at its own pose.
-        measurements: the edges that are believed.
+        measurements: the accepted edges.
         refused: loops of the robot's own that are not.
     """
 

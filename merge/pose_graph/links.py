@@ -16,13 +16,13 @@ from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.pose_graph.factors import Measurement
 
 MERGE_AUTHOR = "merge"
-"""Stands for the agent in the ids of edges that the merge makes."""
+"""Takes the agent's place in the ids of edges that the merge makes."""
 LEAST_DISTINCT = 10
-"""A link with doubles and fewer other landmarks tells no place: a recognition needs as many at all."""
+"""A link with aliased and fewer other landmarks identifies no place: a recognition needs as many."""
 AGAINST = 2
-"""Of links that agree, a double speaks against them as much as so many distinct landmarks speak for them. In
-warehouses most of what a false link rests on is found out (some 60 %), and little of a true one (some 15 %):
-log(0.60 / 0.15) is about twice log(0.85 / 0.40)."""
+"""Of links that agree, an aliased landmark counts against them as much as so many distinct landmarks count
+for them. In warehouses most landmarks of a false link are aliased (some 60 %), and few of a true one (some 15
+%): log(0.60 / 0.15) is about twice log(0.85 / 0.40)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Link:
 
     @property
     def telling(self) -> bool:
-        """Whether it says which place it is, and not only what is seen."""
+        """Whether its landmarks identify a place."""
         return self.doubles == 0 or self.weight >= LEAST_DISTINCT
 
     def turned(self) -> Link:
@@ -84,13 +84,13 @@ class Link:
 
     @cached_property
     def _turned(self) -> Link:
-        other = Link(self.b, self.a, self.a_from_b.inverse(), self.shared[:, ::-1], self.evidence)
-        other.__dict__["_turned"] = self
-        return other
+        reversed_link = Link(self.b, self.a, self.a_from_b.inverse(), self.shared[:, ::-1], self.evidence)
+        reversed_link.__dict__["_turned"] = self
+        return reversed_link
 
     @cached_property
     def measurement(self) -> Measurement:
-        """What it says of the two nodes; it may be wrong."""
+        """Its relative pose of the two nodes; it may be wrong."""
         return Measurement(self.a, self.b, self.a_from_b, robust=True)
 
     def canonical(self) -> Link:
@@ -107,14 +107,14 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class RefusedLink:
-    """Two nodes that looked alike and were not joined.
+    """Two similar nodes that were not joined.
 
     Attributes:
         a: the smaller id.
         b: the greater id.
         reason: in words.
         link: the geometry that was found, or None if not even that.
-        edge: the robot's own edge that says so, if it was the robot that joined them.
+        edge: the robot's own edge, if the robot joined them.
     """
 
     a: NodeId
@@ -141,11 +141,11 @@ def refuse(link: Link, reason: str) -> RefusedLink:
 
 
 def refuse_edge(edge: Edge, reason: str) -> RefusedLink:
-    """Refuse what a robot says by an edge of its own."""
+    """Refuse a robot's own edge."""
     return replace(refuse(link_of(edge), reason), edge=edge.id)
 
 
-def place_told(links: Sequence[Link]) -> bool:
-    """Whether links that agree say which place it is, all together."""
+def place_distinct(links: Sequence[Link]) -> bool:
+    """Whether links that agree identify a place together."""
     doubles = sum(link.doubles for link in links)
     return doubles == 0 or sum(link.weight for link in links) - AGAINST * doubles >= LEAST_DISTINCT

@@ -111,21 +111,21 @@ class WrongGeometry(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MergedMap:
-    """A merge of maps. It keeps the maps as they are, so it can be explained, and made anew without a link.
+    """A merge of maps. It keeps the maps as they are, for explanations and for merging again without a link.
 
     Attributes:
         maps: the maps, by id.
         links: that join nodes, in the order of their ids.
-        refused: pairs that looked alike and were not joined, with reasons.
+        refused: similar pairs that were not joined, with reasons.
         components: nodes that belong together, largest first.
         poses: of all nodes.
         graphs: the solved graph of each component, for covariances between nodes.
-        rulings: of people on what shall not be linked; the refused say which of them had anything to undo.
-        superseded: nodes that newer ones of the same place stand for, see
-            mapweave.merge.map_maintenance.node_superseding. They go on tying poses; questions are answered
-            from the others.
-        faded: (N,) of nodes, which of their landmarks are thought to be gone, see
-            mapweave.merge.map_maintenance.landmark_removal. Nodes where none is are left out.
+        rulings: manual constraints; the refused pairs say which of them took effect.
+        superseded: nodes that newer ones of the same place replace, see
+            mapweave.merge.map_maintenance.node_superseding. They still constrain poses; answers use the other
+            nodes.
+        faded: (N,) of nodes, which of their landmarks have faded, see
+            mapweave.merge.map_maintenance.landmark_removal. Nodes without faded landmarks are left out.
         set_apart: maps that are not among these, because the merge fails with them, and why.
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
     """
@@ -165,26 +165,26 @@ class MergedMap:
         component = self.component_of(a)
         if component is None or component != self.component_of(b):
             return None
-        found = self.graphs[component].relative([a], [b])
-        return PoseGaussian(Pose2.from_vector(found.means[0]), nearest_covariance(found.covariances[0]))
+        poses = self.graphs[component].relative([a], [b])
+        return PoseGaussian(Pose2.from_vector(poses.means[0]), nearest_covariance(poses.covariances[0]))
 
     def check(self, end: NodeId | MapId) -> None:
         """Refuse a node or a map that is not there.
 
         Raises:
-            InvalidValue: the words say what is.
+            InvalidValue: the message lists what there is.
         """
         which = MapId(*end[:2])
-        one = self.maps.get(which)
+        hybrid_map = self.maps.get(which)
         if which in self.set_apart:
             raise InvalidValue(f"map {which} is set apart: {self.set_apart[which]}")
-        if one is None:
-            known = [str(other) for other in self.maps]
-            some = ", ".join(known[:MOST_NAMES]) or "none"
-            more = f" and {len(known) - MOST_NAMES} more" if len(known) > MOST_NAMES else ""
+        if hybrid_map is None:
+            names = [str(name) for name in self.maps]
+            some = ", ".join(names[:MOST_NAMES]) or "none"
+            more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
             raise InvalidValue(f"there is no map {which}; known are: {some}{more}")
-        if isinstance(end, NodeId) and end not in one.nodes:
-            numbers = sorted(node.number for node in one.nodes)
+        if isinstance(end, NodeId) and end not in hybrid_map.nodes:
+            numbers = sorted(node.number for node in hybrid_map.nodes)
             nearest = sorted(sorted(numbers, key=lambda number: abs(number - end.number))[:NEAREST])
             some = f"of its {len(numbers)} nodes the nearest are {', '.join(map(str, nearest))}"
             span = some if numbers else "it has none"
@@ -200,14 +200,14 @@ class MergedMap:
     def union(self) -> HybridMap:
         """All nodes and edges of all maps in one graph, with the links as edges.
 
-        A robot's own claims and drives that were refused are left out: nobody shall rely on them.
+        A robot's own loop closures and drives that were refused are left out.
         """
         whole = HybridMap()
         false = {refusal.edge for refusal in self.refused}
         for map_id in sorted(self.maps):
-            for body in self.maps[map_id].contents():
-                if not (isinstance(body, EdgePut) and body.edge.id in false):
-                    whole.apply(body)
+            for change in self.maps[map_id].contents():
+                if not (isinstance(change, EdgePut) and change.edge.id in false):
+                    whole.apply(change)
         for link in self.links:
             edge = link.edge()
             whole.edges[edge.id] = edge
@@ -224,7 +224,7 @@ class MergedMap:
         for refusal in self.refused:
             if refusal.pair == pair:
                 return f"{refusal.a} and {refusal.b} are not linked: {refusal.reason}"
-        return f"{a} and {b} were not compared: they share too few alike features"
+        return f"{a} and {b} were not compared: they share too few similar features"
 
     def summary(self) -> str:
         """For example `17 nodes, 3 maps, 2 components, 5 links, 1 loop, 2 refused, 4 superseded`.

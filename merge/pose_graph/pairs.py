@@ -1,8 +1,8 @@
 """The choice of pairs as it changes: the same as `mapweave.merge.pose_graph.candidates.choose_pairs`, node
 by node.
 
-A table of all overlaps is never gone through. What a change can bear on is looked at alone: the nodes whose
-overlaps it tells, and those few edges around an edge that comes or goes.
+The table of all overlaps is never traversed. Only what a change affects is updated: the nodes whose overlaps
+it contains, and the few edges around a new or removed edge.
 """
 
 from __future__ import annotations
@@ -28,51 +28,53 @@ class PairTable:
         self._changed: set[Pair] = set()
 
     def put(self, node: NodeId, overlaps: Mapping[NodeId, float]) -> None:
-        """Take note of a node's overlaps with others, beside those that are known."""
-        for other, value in overlaps.items():
-            self._overlaps.setdefault(node, {})[other] = value
-            self._overlaps.setdefault(other, {})[node] = value
+        """Add a node's overlaps with others."""
+        for neighbour, value in overlaps.items():
+            self._overlaps.setdefault(node, {})[neighbour] = value
+            self._overlaps.setdefault(neighbour, {})[node] = value
         self._stale |= {node, *overlaps}
 
     def overlaps(self) -> dict[Pair, float]:
         """All that are known, by (smaller id, greater id)."""
         return {
-            (node, other): value
-            for node, others in self._overlaps.items()
-            for other, value in others.items()
-            if node < other
+            (node, neighbour): value
+            for node, by_node in self._overlaps.items()
+            for neighbour, value in by_node.items()
+            if node < neighbour
         }
 
     def forget(self, node: NodeId) -> None:
         """Drop a node's overlaps: it is gone, or is known better."""
-        for other in self._overlaps.pop(node, ()):
-            del self._overlaps[other][node]
-            self._stale.add(other)
-            self._choose(other, frozenset(pair for pair in self._best.get(other, ()) if node not in pair))
+        for neighbour in self._overlaps.pop(node, ()):
+            del self._overlaps[neighbour][node]
+            self._stale.add(neighbour)
+            self._choose(
+                neighbour, frozenset(pair for pair in self._best.get(neighbour, ()) if node not in pair)
+            )
         self._choose(node, frozenset())
 
     def connect(self, a: NodeId, b: NodeId) -> None:
-        """An edge says that two nodes are neighbours."""
-        for one, other in ((a, b), (b, a)):
-            self._ways.setdefault(one, Counter())[other] += 1
+        """Make two nodes neighbours, by an edge."""
+        for first, second in ((a, b), (b, a)):
+            self._ways.setdefault(first, Counter())[second] += 1
         self._stale |= self._around(a) | self._around(b)
 
     def disconnect(self, a: NodeId, b: NodeId) -> None:
-        """An edge says so no longer."""
+        """Remove such an edge."""
         self._stale |= self._around(a) | self._around(b)
-        for one, other in ((a, b), (b, a)):
-            ways = self._ways[one]
-            ways[other] -= 1
-            if not ways[other]:
-                del ways[other]
+        for first, second in ((a, b), (b, a)):
+            ways = self._ways[first]
+            ways[second] -= 1
+            if not ways[second]:
+                del ways[second]
 
     def of(self, node: NodeId) -> list[Pair]:
-        """The pairs of one node that are chosen as things stand, in the order of ids."""
-        others = self._overlaps.get(node, {})
-        for one in self._stale & {node, *others}:
-            self._choose(one, self._ranked(one))
-        self._stale -= {node, *others}
-        pairs = ((min(node, other), max(node, other)) for other in others)
+        """The chosen pairs of one node, in the order of ids."""
+        overlaps = self._overlaps.get(node, {})
+        for stale in self._stale & {node, *overlaps}:
+            self._choose(stale, self._ranked(stale))
+        self._stale -= {node, *overlaps}
+        pairs = ((min(node, neighbour), max(node, neighbour)) for neighbour in overlaps)
         return sorted(pair for pair in pairs if self._votes[pair] > 0)
 
     def changed(self) -> list[Pair]:
@@ -90,15 +92,15 @@ class PairTable:
     def _ranked(self, node: NodeId) -> frozenset[Pair]:
         """The best pairs of a node with the nodes of each map."""
         s = self._settings
-        others = self._overlaps.get(node)
-        if not others:
+        overlaps = self._overlaps.get(node)
+        if not overlaps:
             return frozenset()
-        near = self._around(node)
+        neighbours = self._around(node)
         by_map: dict[MapId, list[tuple[float, Pair]]] = {}
-        for other, value in others.items():
-            if value >= LEAST_OVERLAP and other not in near:
-                pair = (node, other) if node < other else (other, node)
-                by_map.setdefault(other.map, []).append((-value, pair))
+        for neighbour, value in overlaps.items():
+            if value >= LEAST_OVERLAP and neighbour not in neighbours:
+                pair = (node, neighbour) if node < neighbour else (neighbour, node)
+                by_map.setdefault(neighbour.map, []).append((-value, pair))
         return frozenset(pair for best in by_map.values() for _, pair in sorted(best)[: s.most_per_map])
 
     def _choose(self, node: NodeId, pairs: frozenset[Pair]) -> None:
@@ -118,8 +120,13 @@ class PairTable:
 
     def _around(self, node: NodeId) -> set[NodeId]:
         """Nodes that are few edges away, the node itself too."""
-        found, ring = {node}, [node]
+        reached, ring = {node}, [node]
         for _ in range(self._settings.least_hops - 1):
-            ring = [other for one in ring for other in self._ways.get(one, ()) if other not in found]
-            found.update(ring)
-        return found
+            ring = [
+                neighbour
+                for current in ring
+                for neighbour in self._ways.get(current, ())
+                if neighbour not in reached
+            ]
+            reached.update(ring)
+        return reached

@@ -1,4 +1,4 @@
-"""What one node's landmarks look like from where another one stands, before anything hides them."""
+"""One node's landmarks as seen from another node, without occlusion."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class ProjectedView:
 
         Args:
             node: that has the landmarks.
-            view: from which they are looked at.
-            node_from_view: how the two stand.
+            view: from which they are seen.
+            node_from_view: relative pose.
             margin_px: a landmark fits if it projects this far inside the image,
             scale: if its distance has changed by at most this factor,
             aside: and if it is seen from a direction that differs by at most this, rad.
@@ -46,10 +46,10 @@ class ProjectedView:
         eye = np.array([node.camera.mount_forward, 0.0])
         eye_of_view = node_from_view.apply(np.array([[view.camera.mount_forward, 0.0, 0.0]]))[0, :2]
         ray, ray_of_view = points[:, :2] - eye, points[:, :2] - eye_of_view
-        far, far_of_view = np.linalg.norm(ray, axis=1), np.linalg.norm(ray_of_view, axis=1)
+        distance, view_distance = np.linalg.norm(ray, axis=1), np.linalg.norm(ray_of_view, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.maximum(far, far_of_view) / np.minimum(far, far_of_view)
-            cosine = (ray * ray_of_view).sum(axis=1) / (far * far_of_view)
+            ratio = np.maximum(distance, view_distance) / np.minimum(distance, view_distance)
+            cosine = (ray * ray_of_view).sum(axis=1) / (distance * view_distance)
             alike = (ratio < scale) & (cosine > math.cos(aside))
         fits = view.camera.contains(pixels, margin_px) & alike
         return ProjectedView(pixels, from_view[:, 0] - view.camera.mount_forward, fits)

@@ -31,9 +31,9 @@ class Verdicts:
     def drop(self, pair: Pair) -> None:
         """A pair is chosen no longer. One that never was is no error."""
         maps = pair[0].map, pair[1].map
-        known = self._between.get(maps, {})
-        known.pop(pair, None)
-        if not known and maps in self._between:
+        verdicts = self._between.get(maps, {})
+        verdicts.pop(pair, None)
+        if not verdicts and maps in self._between:
             del self._between[maps]
             self._partners[maps[0]].discard(maps[1])
 
@@ -45,30 +45,30 @@ class Verdicts:
         """Between which maps there is anything, if one of them is among these."""
         return {pair for pair in self._between if pair[0] in maps or pair[1] in maps} if maps else set()
 
-    def ties(self, rulings: ManualConstraints) -> Iterable[MapPair]:
-        """Maps between which there are links, those that people have ruled out left out."""
-        ruled = bool(rulings.in_force)
-        for maps, known in self._between.items():
+    def ties(self, constraints: ManualConstraints) -> Iterable[MapPair]:
+        """Maps between which there are links, without those that manual constraints exclude."""
+        ruled = bool(constraints.in_force)
+        for maps, verdicts in self._between.items():
             if maps[0] == maps[1]:
                 continue
-            found = (v for v in known.values() if isinstance(v, Link))
-            if any(not ruled or rulings.against(*link.pair) is None for link in found):
+            links = (v for v in verdicts.values() if isinstance(v, Link))
+            if any(not ruled or constraints.against(*link.pair) is None for link in links):
                 yield maps
 
     def among(self, maps: frozenset[MapId]) -> list[Verdict]:
         """Of all pairs with both ends in these maps."""
         return [
             verdict
-            for one in sorted(maps)
-            for other in sorted(self._partners.get(one, set()) & maps)
-            for verdict in self._between[one, other].values()
+            for first in sorted(maps)
+            for second in sorted(self._partners.get(first, set()) & maps)
+            for verdict in self._between[first, second].values()
         ]
 
     def across(self, island_of: Mapping[MapId, frozenset[MapId]]) -> list[Verdict]:
         """Of all pairs of which the two maps are in different islands; maps that are in none are left out."""
         return [
             verdict
-            for (one, other), known in self._between.items()
-            if one in island_of and other in island_of and island_of[one] is not island_of[other]
-            for verdict in known.values()
+            for (first, second), verdicts in self._between.items()
+            if first in island_of and second in island_of and island_of[first] is not island_of[second]
+            for verdict in verdicts.values()
         ]

@@ -33,8 +33,8 @@ class VerificationSettings:
 def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Link | RefusedLink:
     """Compare two nodes.
 
-    The answer depends on the two nodes alone: they are put in the order of their ids, and the random draws
-    of the estimator start from the ids, so neither order of arrival nor other nodes have a say.
+    The answer depends on the two nodes alone: they are put in the order of their ids, and the ids seed the
+    estimator's random numbers, so neither order of arrival nor other nodes matter.
 
     Args:
         a: one node.
@@ -59,7 +59,7 @@ def verify(a: Node, b: Node, settings: VerificationSettings | None = None) -> Li
 
 
 def examine(a: Node, b: Node, settings: VerificationSettings | None = None) -> Recognition | Refusal:
-    """What `verify` goes by: the same draws, the same numbers.
+    """Input of `verify`: the same seeds, the same numbers.
 
     Args:
         a: the node with the smaller id.

@@ -39,7 +39,7 @@ def build_world(design: Design, where: str = "world", folder: Path | None = None
     """Build a world.
 
     Args:
-        design: of anybody.
+        design: from any source.
         where: for the error's text, for example the name of the design's file.
         folder: that names of picture files start from.
 
@@ -232,7 +232,7 @@ BLANK = Texture.plain(0)
 
 
 def _start_rooms(design: Design) -> tuple[str, ...]:
-    """As the design says; else the rooms that are called so; else all but door openings."""
+    """The design's start rooms; else the rooms of that name; else all but door openings."""
     called = tuple(room.name for room in design.rooms if room.name.startswith("room"))
     large = tuple(room.name for room in design.rooms if floor_area(room) >= DARK)
     return design.start_rooms or called or large

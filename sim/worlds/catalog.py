@@ -71,7 +71,7 @@ def world_from_table(table: Mapping[str, Any], seed: int, folder: Path) -> World
 
     Args:
         table: `kind` (by default office) and its parameters, or `file` alone.
-        seed: of made worlds; a world from a file is the same whatever the seed.
+        seed: of generated worlds; a world from a file does not depend on it.
         folder: that the file's name starts from.
 
     Raises:

@@ -51,7 +51,7 @@ class CorridorParameters:
 
 
 def corridor(parameters: CorridorParameters, seed: int) -> Design:
-    """Design a ring; other seeds have other prints and doors at other places, no two alike."""
+    """Design a ring; other seeds have other prints and doors at other places, all different."""
     rng = np.random.default_rng([seed, 0xC0441D04])
     paint = int(rng.integers(125, 170))
     x, y, b = parameters.length, parameters.width, parameters.breadth
@@ -65,7 +65,7 @@ def corridor(parameters: CorridorParameters, seed: int) -> Design:
     outer = [(0.0, 0.0), (x, 0.0), (x, y), (0.0, y)]
     inner = [(b, b), (b, y - b), (x - b, y - b), (x - b, b)]
     faces = [(ring[k], ring[(k + 1) % 4]) for ring in (outer, inner) for k in range(4)]
-    # Outer walls close their corners behind the floor; the inner ones would stand out into it.
+    # Outer walls close their corners behind the floor; the inner ones would protrude into it.
     walls = tuple(_behind(*face, THICKNESS if k < 4 else 0.0) for k, face in enumerate(faces))
     posters = tuple(
         poster

@@ -51,15 +51,15 @@ class Room:
     paint: int | None = None
     seed: int | None = None
 
-    def check(self, here: str) -> None:
+    def check(self, where: str) -> None:
         """Refuse what cannot be built: see `check_design`."""
-        _check_text(f"{here}: name", self.name)
-        _check_point(f"{here}: low", self.low)
-        _check_point(f"{here}: high", self.high)
+        _check_text(f"{where}: name", self.name)
+        _check_point(f"{where}: low", self.low)
+        _check_point(f"{where}: high", self.high)
         if not (self.high[0] - self.low[0] >= 0.02 and self.high[1] - self.low[1] >= 0.02):
-            raise InvalidValue(f"{here}: high must be at least 2 cm east and north of low")
+            raise InvalidValue(f"{where}: high must be at least 2 cm east and north of low")
         if self.paint is not None:
-            within(f"{here}: paint", self.paint, 1, 255)
+            within(f"{where}: paint", self.paint, 1, 255)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Wall:
         thickness: half of it on each side of the line.
         height: by default the world's.
         texture: of all its faces.
-        seed: walls with the same seed look the same; by default each has its own looks.
+        seed: walls with the same seed look the same; by default each is different.
     """
 
     start: Point
@@ -82,15 +82,15 @@ class Wall:
     texture: str = "wall"
     seed: int | None = None
 
-    def check(self, here: str) -> None:
+    def check(self, where: str) -> None:
         """Refuse what cannot be built: see `check_design`."""
-        _check_point(f"{here}: start", self.start)
-        _check_point(f"{here}: end", self.end)
+        _check_point(f"{where}: start", self.start)
+        _check_point(f"{where}: end", self.end)
         if not math.dist(self.start, self.end) >= 0.02:
-            raise InvalidValue(f"{here}: start and end must be at least 2 cm apart")
-        within(f"{here}: thickness", self.thickness, 0.02, 2.0)
+            raise InvalidValue(f"{where}: start and end must be at least 2 cm apart")
+        within(f"{where}: thickness", self.thickness, 0.02, 2.0)
         if self.height is not None:
-            within(f"{here}: height", self.height, 0.05, 10.0)
+            within(f"{where}: height", self.height, 0.05, 10.0)
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ class Furniture:
         ends: of the faces towards its own +x and -x; by default the same.
         top: texture of its upper face.
         movable: whether people may push it around.
-        lit: whether the lamps of the room shine on it; otherwise it looks the same wherever it stands.
-        seed: pieces with the same seed look the same; by default each has its own looks.
+        lit: whether the lamps of the room shine on it; otherwise it looks the same everywhere.
+        seed: pieces with the same seed look the same; by default each is different.
     """
 
     name: str
@@ -125,13 +125,13 @@ class Furniture:
     lit: bool = True
     seed: int | None = None
 
-    def check(self, here: str) -> None:
+    def check(self, where: str) -> None:
         """Refuse what cannot be built: see `check_design`."""
-        _check_text(f"{here}: name", self.name)
-        _check_point(f"{here}: at", self.at)
+        _check_text(f"{where}: name", self.name)
+        _check_point(f"{where}: at", self.at)
         for field in ("length", "width", "height"):
-            within(f"{here}: {field}", getattr(self, field), 0.02, 10.0)
-        within(f"{here}: heading_deg", self.heading_deg, -360.0, 360.0)
+            within(f"{where}: {field}", getattr(self, field), 0.02, 10.0)
+        within(f"{where}: heading_deg", self.heading_deg, -360.0, 360.0)
 
 
 @dataclass(frozen=True)
@@ -154,12 +154,12 @@ class Poster:
     texture: str = "print"
     seed: int | None = None
 
-    def check(self, here: str) -> None:
+    def check(self, where: str) -> None:
         """Refuse what cannot be built: see `check_design`."""
-        _check_point(f"{here}: at", self.at)
+        _check_point(f"{where}: at", self.at)
         for field in ("width", "height"):
-            within(f"{here}: {field}", getattr(self, field), 0.02, 10.0)
-        within(f"{here}: bottom", self.bottom, 0.0, 10.0)
+            within(f"{where}: {field}", getattr(self, field), 0.02, 10.0)
+        within(f"{where}: bottom", self.bottom, 0.0, 10.0)
 
 
 Item = Room | Wall | Furniture | Poster
@@ -223,10 +223,10 @@ def check_design(design: Design, where: str) -> None:
         if len(items) > MAX_ITEMS:
             raise InvalidValue(f"{where}: {len(items)} {kind} are too many; at most {MAX_ITEMS}")
         for number, item in enumerate(items):
-            here = f"{where}: {kind}[{number}]"
+            element = f"{where}: {kind}[{number}]"
             if item.seed is not None:
-                within(f"{here}: seed", item.seed, 0, MAX_SEED)
-            item.check(here)
+                within(f"{element}: seed", item.seed, 0, MAX_SEED)
+            item.check(element)
     _check_rooms(design, where)
     total = sum(math.dist(wall.start, wall.end) for wall in design.walls)
     if total > MAX_WALLS:
@@ -238,14 +238,14 @@ def floor_area(room: Room) -> float:
     return (room.high[0] - room.low[0]) * (room.high[1] - room.low[1])
 
 
-def within(what: str, value: float, low: float, high: float) -> None:
+def within(name: str, value: float, low: float, high: float) -> None:
     """Refuse a number that is out of range.
 
     Raises:
         InvalidValue: it is, or is not finite.
     """
     if not low <= value <= high:
-        raise InvalidValue(f"{what} is {value}; use {low:g} to {high:g}")
+        raise InvalidValue(f"{name} is {value}; use {low:g} to {high:g}")
 
 
 def _check_rooms(design: Design, where: str) -> None:
@@ -267,11 +267,11 @@ def _check_rooms(design: Design, where: str) -> None:
         raise InvalidValue(f"{where}: {max(area, around):.0f} m^2 are too large; at most {MAX_AREA:.0f} m^2")
 
 
-def _check_point(what: str, point: Point) -> None:
+def _check_point(name: str, point: Point) -> None:
     for value in point:
-        within(what, value, -MAX_REACH, MAX_REACH)
+        within(name, value, -MAX_REACH, MAX_REACH)
 
 
-def _check_text(what: str, text: str) -> None:
+def _check_text(name: str, text: str) -> None:
     if not 1 <= len(text) <= 64 or not text.isprintable():
-        raise InvalidValue(f"{what} is {text[:64]!r}; use 1 to 64 letters that can be printed")
+        raise InvalidValue(f"{name} is {text[:64]!r}; use 1 to 64 letters that can be printed")

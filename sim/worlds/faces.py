@@ -16,7 +16,7 @@ SEGMENT = 1.3
 LEAST = 0.01
 """No piece is narrower than this, m."""
 BEFORE = 0.05
-"""A face belongs to the room in which one stands so far in front of it, m."""
+"""A face belongs to the room of the point so far in front of it, m."""
 
 
 def room_before(points: NDArray[np.float64], low: Array, high: Array) -> NDArray[np.intp]:
@@ -48,13 +48,13 @@ def cut_face(start: Array, end: Array, low: Array, high: Array) -> list[tuple[Ar
     inner = crossings[(crossings > 0.0) & (crossings < 1.0)]
     borders = np.concatenate([[0.0], np.unique(inner), [1.0]])
     rooms = room_before(front + (borders[:-1] + borders[1:])[:, None] / 2 * way, low, high)
-    cuts, here = [0.0], -1
+    cuts, current = [0.0], -1
     for border, room in zip(borders.tolist(), rooms.tolist(), strict=False):
         # Where there is no room, as before the end of another wall, a piece may be of either side.
-        if room >= 0 and room != here:
-            if here >= 0 and size * (border - cuts[-1]) > LEAST and size * (1.0 - border) > LEAST:
+        if room >= 0 and room != current:
+            if current >= 0 and size * (border - cuts[-1]) > LEAST and size * (1.0 - border) > LEAST:
                 cuts.append(border)
-            here = room
+            current = room
     pieces = []
     for begin, stop in itertools.pairwise([*cuts, 1.0]):
         count = max(1, math.ceil(size * (stop - begin) / SEGMENT - 1e-9))

@@ -70,9 +70,9 @@ def load_design(path: Path) -> Design:
     table.setdefault("name", path.stem)
     for name, cls in ITEMS.items():
         tables = table.get(name, [])
-        if not isinstance(tables, list) or not all(isinstance(one, dict) for one in tables):
+        if not isinstance(tables, list) or not all(isinstance(entry, dict) for entry in tables):
             raise SettingsError(f"{path}: {name} must be a list of tables: write [[{name}]]")
-        table[name] = tuple(build(cls, one, f"{path}: {name}[{k}]") for k, one in enumerate(tables))
+        table[name] = tuple(build(cls, entry, f"{path}: {name}[{k}]") for k, entry in enumerate(tables))
     return build(Design, table, str(path))
 
 

@@ -24,7 +24,7 @@ STOCK = (
     Furniture("desk", (0.0, 0.0), 1.3, 0.65, 0.72, texture="desk"),
     Furniture("crate", (0.0, 0.0), 0.5, 0.45, 0.6, texture="crate"),
 )
-"""What stands in offices."""
+"""Furniture of offices."""
 
 Place = Callable[[np.random.Generator, Rectangle, Rectangle], Rectangle]
 
@@ -41,10 +41,10 @@ def furnish(
 
     Args:
         rng: where chance comes from.
-        plan: with all that stands already.
+        plan: with the furniture so far.
         room: upright, of the plan.
         stock: what to choose from.
-        by_wall: so many of the pieces stand along the walls.
+        by_wall: so many of the pieces are placed along the walls.
         count: pieces that are wanted.
     """
     site = Site(plan, room)

@@ -23,8 +23,11 @@ def lamps_of(design: Design, plan: FloorPlan) -> list[tuple[Vector, ...]]:
     own = [_hung(room, design.height) for room in design.rooms]
     lamps = []
     for number, room in enumerate(design.rooms):
-        others = [k for k in _touching(design, number) if _open(design, plan, number, k)]
-        shine = [own[number], *(own[k] + [*np.subtract(design.rooms[k].low, room.low), 0.0] for k in others)]
+        neighbours = [k for k in _touching(design, number) if _open(design, plan, number, k)]
+        shine = [
+            own[number],
+            *(own[k] + [*np.subtract(design.rooms[k].low, room.low), 0.0] for k in neighbours),
+        ]
         lamps.append(tuple((x, y, z) for x, y, z in exact(np.concatenate(shine)).tolist()))
     return lamps
 
@@ -52,9 +55,9 @@ def _touching(design: Design, number: int) -> list[int]:
     ]
 
 
-def _open(design: Design, plan: FloorPlan, one: int, other: int) -> bool:
+def _open(design: Design, plan: FloorPlan, a: int, b: int) -> bool:
     """Whether two rooms that touch share an edge without a wall all along it."""
-    rooms = design.rooms[one], design.rooms[other]
+    rooms = design.rooms[a], design.rooms[b]
     low = np.max([room.low for room in rooms], axis=0)
     high = np.min([room.high for room in rooms], axis=0)
     if (high - low).max() < OPEN:

@@ -28,7 +28,7 @@ class Lit:
 
     Light falls off with the square of the distance and with the angles at the lamp and at the surface
     (Lambert's law for both). It is computed in the frame of a room, so that two rooms with the same lamps
-    and the same things at the same places are lit alike to the last bit.
+    and the same things at the same places are lit the same to the last bit.
 
     Attributes:
         painter: of the picture.

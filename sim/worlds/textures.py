@@ -60,14 +60,14 @@ NOTHING = "none"
 
 
 class Textures:
-    """Looks painters up, and reads each picture file once."""
+    """Finds painters by name, and reads each picture file once."""
 
     def __init__(self, folder: Path, common: int) -> None:
         """Start with no picture read.
 
         Args:
             folder: that relative names of picture files start from.
-            common: seed of what is alike all over this world: what is in the racks.
+            common: seed of what is the same all over this world: the contents of racks.
         """
         self._folder = folder
         self._common = common
@@ -99,13 +99,13 @@ class Textures:
             return shelving.Rack(self._common, argument == "changed")
         if name == "carton":
             return Carton(self._common)
-        known = [*WALLS, *PAINTERS, *WITH_ARGUMENT, NOTHING]
-        close = difflib.get_close_matches(word, known, 1)
+        names = [*WALLS, *PAINTERS, *WITH_ARGUMENT, NOTHING]
+        close = difflib.get_close_matches(word, names, 1)
         if word in WITH_ARGUMENT:
             hint = f"use {WITH_ARGUMENT[word]}"
         else:
             hint = (
-                f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)} and picture files"
+                f"did you mean {close[0]!r}?" if close else f"known are {', '.join(names)} and picture files"
             )
         raise InvalidValue(f"{where}: no texture {name!r}; {hint}")
 

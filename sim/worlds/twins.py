@@ -1,4 +1,4 @@
-"""Two rooms that look exactly the same: whatever a robot sees in one, it can see in the other."""
+"""Two rooms that look exactly the same: every view of one is also a view of the other."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TwinsParameters:
 
 
 def twins(parameters: TwinsParameters, seed: int) -> Design:
-    """Design the twins; other seeds, other looks.
+    """Design the twins; other seeds look different.
 
     The second room is the first, moved east by whole metres: then even rounding is the same in both.
     """
@@ -61,7 +61,7 @@ def twins(parameters: TwinsParameters, seed: int) -> Design:
     alone = plan_of(Design(rooms=tuple(rooms), walls=tuple(walls)))
     pieces = furnish(rng, alone, alone.rooms[0], STOCK, by_wall=PIECES - 1, count=PIECES)
     pieces = [replace(piece, seed=number) for number, piece in enumerate(pieces)]
-    rooms += [_moved_room(one, east) for one in rooms]
+    rooms += [_moved_room(west_room, east) for west_room in rooms]
     walls += [replace(w, start=_moved(w.start, east), end=_moved(w.end, east)) for w in walls]
     furniture = [*pieces, *(replace(piece, at=_moved(piece.at, east)) for piece in pieces)]
     if door is not None:

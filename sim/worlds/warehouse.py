@@ -1,4 +1,4 @@
-"""A warehouse: rows of racks, most of them alike, and signs where the aisles end."""
+"""A warehouse: rows of mostly equal racks, and signs at the ends of the aisles."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STACKS = (
     Furniture("stack", (0.0, 0.0), 0.8, 0.6, 0.8, texture="carton", top="carton"),
     Furniture("stack", (0.0, 0.0), 0.6, 0.5, 0.45, texture="carton", top="carton"),
 )
-"""Cartons that stand around in the cross aisles."""
+"""Cartons in the cross aisles."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def cost(node: Node) -> int:
     return len(encode_change(Change(node.id.map, 100_000, node.stamp_ns, NodePut(node)))) + FRAMING
 
 
-def test_a_node_costs_what_it_may(walls, description):
+def test_a_node_keeps_to_its_byte_budget(walls, description):
     large, small = (mapped(walls, description, most) for most in (3000, 900))
     assert cost(large) <= 3000
     assert 650 < cost(small) <= 900
@@ -37,7 +37,7 @@ def test_a_node_costs_what_it_may(walls, description):
     assert (np.ptp(small.landmarks.pixels, axis=0) > 0.8 * np.ptp(large.landmarks.pixels, axis=0)).all()
 
 
-def test_the_robot_has_the_numbers_that_everybody_gets(walls, description):
+def test_the_robot_uses_the_quantized_numbers(walls, description):
     node = mapped(walls, description, 3000)
     sent = decode_body(encode_body(NodePut(node)))
     assert isinstance(sent, NodePut)

@@ -134,7 +134,7 @@ def test_a_status_without_a_field_is_refused(status: Status, data: st.DataObject
 
 
 @given(st.text(), st.integers(1, 400))
-def test_whatever_was_said_can_be_told(text: str, times: int) -> None:
+def test_any_status_can_be_encoded(text: str, times: int) -> None:
     """A status quotes servers and drivers: line breaks and long stories must not end the robot's loop."""
     status = Status("looking", text * times, 0, 0, Pose2(), False)
     said = decode_agent_status(encode_agent_status(AgentStatus(status, 0))).status.detail
@@ -187,7 +187,7 @@ def test_operators_commands_arrive_in_order_and_once(link: FleetClient, other: M
         (msgpack.packb({"v": 1, "s": {"mission": "goto", "node": "r0.².1"}}), "is no node id"),
     ],
 )
-def test_what_is_no_command_is_refused_and_changes_nothing(
+def test_invalid_commands_are_refused_without_effect(
     link: FleetClient, other: MemoryBus, payload: bytes, said: str
 ) -> None:
     (reply,) = other.ask(KEYS.mission("r0"), payload, 2.0)
@@ -197,7 +197,7 @@ def test_what_is_no_command_is_refused_and_changes_nothing(
     assert not reply.error, "and the next command is taken"
 
 
-def test_the_fleet_hears_what_the_robot_does(link: FleetClient, other: MemoryBus) -> None:
+def test_the_fleet_receives_the_robots_status(link: FleetClient, other: MemoryBus) -> None:
     heard: list[AgentStatus] = []
     other.subscribe(KEYS.agent_statuses(), lambda sample: heard.append(decode_agent_status(sample.payload)))
     status = Status("turning", "why", 3, 40, Pose2(1, 2, 3), False, "goto", THERE, Pose2(0.1, 0, 0), 4)
@@ -205,7 +205,7 @@ def test_the_fleet_hears_what_the_robot_does(link: FleetClient, other: MemoryBus
     eventually(lambda: heard == [AgentStatus(status, 123, MAP.epoch)])
 
 
-def test_who_asks_is_told_the_state_of_now(hub: MemoryHub, other: MemoryBus) -> None:
+def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     """Also when nothing was published: what waits for the server, what has gone over the network."""
     bus, waiting = TrafficMeter(MemoryBus(hub)), [3]
     link = FleetClient(bus, KEYS, MAP, unsent=lambda: waiting[0])
@@ -250,7 +250,7 @@ QUESTIONS: list[Question] = [WhereAmI(7, VIEW), WhichWay(7, HERE, THERE), WhatIs
 
 
 @pytest.mark.parametrize("question", QUESTIONS, ids=["where", "way", "known"])
-def test_without_a_server_the_answer_says_so(link: FleetClient, question: Question) -> None:
+def test_without_a_server_the_answer_has_the_reason(link: FleetClient, question: Question) -> None:
     link.ask(question)
     (answer,) = link.answers(wait=True)
     assert (answer.number, answer.content, answer.error) == (7, None, NO_ANSWER)
@@ -288,7 +288,7 @@ def test_the_servers_answers_come_with_their_numbers(link: FleetClient, other: M
     assert request.start_from_robot == Pose2(0.25, -0.5, 1.0)
 
 
-def test_it_is_told_what_others_have_mapped(link: FleetClient, other: MemoryBus) -> None:
+def test_it_gets_what_others_have_mapped(link: FleetClient, other: MemoryBus) -> None:
     asked: list[KnownRequest] = []
 
     def known(request) -> None:
@@ -333,9 +333,7 @@ def test_waiting_ends_when_the_time_is_over(link: FleetClient, other: MemoryBus)
     release.set()
 
 
-def test_a_server_that_refuses_is_quoted_and_another_one_is_heard(
-    link: FleetClient, other: MemoryBus
-) -> None:
+def test_a_refusal_is_quoted_and_another_servers_answer_is_used(link: FleetClient, other: MemoryBus) -> None:
     other.serve(KEYS.route("s0"), lambda request: request.refuse("no such node"))
     link.ask(WhichWay(1, HERE, THERE))
     (answer,) = link.answers(wait=True)

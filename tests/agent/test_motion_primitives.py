@@ -38,7 +38,7 @@ def ask(fleet: Callable[[int, Question], Answer | None], patience: int = 100) ->
             answers = answers if answer is None else (answer,)
 
 
-def test_a_busy_server_is_asked_again_when_it_said() -> None:
+def test_a_busy_server_is_asked_again_at_its_time() -> None:
     def fleet(n: int, question: Question) -> Answer:
         pauses = (0.8, 2.0)
         if n < len(pauses):
@@ -53,7 +53,7 @@ def test_a_busy_server_is_asked_again_when_it_said() -> None:
     assert asked[2] - asked[1] == pytest.approx(2.1, abs=0.11)
 
 
-def test_a_server_that_stays_busy_is_left_with_the_time_it_said() -> None:
+def test_a_server_that_stays_busy_is_left_with_its_retry_time() -> None:
     answer, asked = ask(lambda _, question: Answer(question.number, None, "busy", 1.5), patience=50)
     assert (answer.content, answer.error, answer.retry_after) == (None, "busy", 1.5)
     assert len(asked) == 4

@@ -149,7 +149,7 @@ def test_the_room_is_seen_as_it_is():
     assert np.abs(floor.room() - exact_room(floor)).max() < 0.05 * floor.room().max()
 
 
-def test_what_moved_away_is_forgotten_and_what_came_is_seen():
+def test_moved_obstacles_are_forgotten_and_new_ones_are_seen():
     floor, pose = known_room(), Pose2(-1.0, -2.0, 0.0)
     box = np.array([[0.1, -2.2, 0.4, -1.8]])
     place = tuple(floor.cells(np.array([0.13, -2.0])))
@@ -277,7 +277,7 @@ def test_no_way_out_of_a_trap_leads_through_a_wall():
     assert len(floor.ways(np.zeros(2), 10.0).cells) == 0
 
 
-def test_a_rolled_floor_knows_what_is_left_on_it():
+def test_a_shifted_grid_keeps_its_overlap():
     """Against a floor that never rolls, cell by cell, wherever both reach."""
     rng = np.random.default_rng(4)
     whole, small = OccupancyGrid(ROBOT, SETTINGS), OccupancyGrid(ROBOT, OccupancyGridSettings(side=7.0))

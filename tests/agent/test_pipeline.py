@@ -57,7 +57,7 @@ def test_the_same_observations_give_the_same_steps(drive):
     assert len({step.command for step in steps}) > 10
 
 
-def test_observations_are_only_looked_at(drive):
+def test_observations_are_not_modified(drive):
     observations, _, _ = drive
     pipeline = on(Explore())
     for observation in observations[:20]:
@@ -79,7 +79,7 @@ def test_the_map_is_the_replay_of_the_changes(explored):
 
 
 @pytest.mark.parametrize("mission", [Idle(), Explore(), Carried(), GoTo(NodeId("r1", 1, 1))])
-def test_a_robot_without_a_camera_stands_still_and_says_why(mission):
+def test_a_robot_without_a_camera_stops_and_reports_why(mission):
     pipeline = on(mission)
     for tick in range(40):
         step = pipeline.step(Observation(tick * 100_000_000, Odometry(0.0, 0.0), None, rangers(Pose2())))
@@ -111,7 +111,7 @@ def test_a_camera_that_fails_now_and_then(walls):
     assert step.status.map_from_robot.distance(Pose2(xs[-1])) < 0.02
 
 
-def test_images_without_features_make_no_node_and_say_so():
+def test_images_without_features_make_no_node_and_are_reported():
     pipeline = on(Carried())
     grey = np.full((240, 320), 100, np.uint8)
     for tick in range(10):
@@ -120,7 +120,7 @@ def test_images_without_features_make_no_node_and_say_so():
     assert step.status.nodes == 0
 
 
-def test_until_there_is_a_node_it_says_why_there_is_none(walls):
+def test_until_the_first_node_the_reason_is_reported(walls):
     pipeline = on(Carried())
     before, said = Pose2(), []
     for tick, x in enumerate(np.arange(0.0, 0.8, 0.025)):
@@ -205,14 +205,14 @@ def moved_between(walls, mission) -> list[tuple[Edge, Pose2]]:
     return [(edge, when[edge.a].inverse() @ when[edge.b]) for edge in pipeline.map.edges.values()]
 
 
-def test_what_the_wheels_did_without_a_mission_is_not_forgotten(walls):
+def test_motion_without_a_mission_is_kept(walls):
     edges = [pair for pair in moved_between(walls, Idle()) if pair[0].kind is not EdgeKind.LOOP]
     assert len(edges) >= 2
     for edge, true in edges:
         assert edge.a_from_b.mean.distance(true) < 0.05
 
 
-def test_who_is_carried_off_before_the_first_node_begins_anew(walls):
+def test_a_robot_carried_off_before_the_first_node_restarts(walls):
     """There is no map yet to look on; what is seen there is where the map begins."""
     pipeline, elsewhere = on(Carried()), np.rot90(still(walls).image, 2)
     for tick in range(60):
@@ -288,7 +288,7 @@ def test_after_navigating_it_maps_on_once_it_recognises_a_place(walls):
             assert (from_start @ node.map_from_robot.mean).distance(Pose2(-1.0).inverse() @ true) < 0.05
 
 
-def test_after_navigating_to_where_it_knows_nothing_it_does_not_map_on(walls):
+def test_it_does_not_map_on_after_navigating_to_an_unknown_place(walls):
     away = [Pose2(x, 0.0, math.pi) for x in np.arange(0.3, 0.9, 0.025)]
     pipeline, elements, steps = carried_after_navigating(walls, away)
     assert set(pipeline.map.nodes) | set(pipeline.map.edges) == elements

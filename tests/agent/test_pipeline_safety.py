@@ -33,7 +33,7 @@ def near(bearing: float, distance: float) -> np.ndarray:
     return readings
 
 
-def test_no_command_drives_into_what_is_seen(walls, reckless):
+def test_no_command_drives_into_a_seen_obstacle(walls, reckless):
     pipeline = reckless(Command(0.3, 0.2))
     step = pipeline.step(still(walls, proximity=near(0.0, 0.02)))
     assert step.command == Command(0.0, 0.2), "it may still turn"
@@ -47,7 +47,7 @@ def test_no_command_drives_into_what_is_seen(walls, reckless):
         assert "obstacle" not in step.status.detail
 
 
-def test_nor_backward(walls, reckless):
+def test_no_drive_backward_into_an_obstacle(walls, reckless):
     pipeline = reckless(Command(-0.3, 0.0))
     assert pipeline.step(still(walls, proximity=near(math.pi, 0.02))).command == Command()
     assert pipeline.step(still(walls, tick=1, proximity=near(0.0, 0.02))).command == Command(-0.3, 0.0)

@@ -92,7 +92,7 @@ def test_a_description_survives_exactly() -> None:
     assert decode_description(encode_description(DESCRIPTION)) == DESCRIPTION
 
 
-def test_a_sliced_image_is_sent_as_it_looks() -> None:
+def test_a_sliced_image_is_sent_correctly() -> None:
     image = np.arange(100, dtype=np.uint8).reshape(10, 10)[::2, ::3]
     decoded = decode_observation(encode_observation(an_observation(image))).image
     assert decoded is not None
@@ -297,7 +297,7 @@ def far_away(request: Request) -> None:
         (far_away, "odometry of 10000 m and 0 rad in one step"),
     ],
 )
-def test_an_impossible_observation_is_asked_once_more_and_then_refused_in_one_line(
+def test_an_impossible_observation_is_retried_once_then_refused_in_one_line(
     body: Body, bus: MemoryBus, answer: Callable[[Request], None], reason: str
 ) -> None:
     robot = RemoteRobot(bus, "test", "r0")
@@ -312,35 +312,35 @@ def test_an_impossible_observation_is_asked_once_more_and_then_refused_in_one_li
     assert [step.sequence for step in body.steps] == [1, 1, 2, 2]
 
 
-def test_nobody_there_is_one_clear_line(bus: MemoryBus) -> None:
+def test_a_missing_base_is_reported_in_one_line(bus: MemoryBus) -> None:
     begin = time.monotonic()
-    with pytest.raises(DeviceError, match=r"robot/r0/describe: nobody answers .*mapweave sim") as error:
+    with pytest.raises(DeviceError, match=r"robot/r0/describe: no answer .*mapweave sim") as error:
         RemoteRobot(bus, "test", "r0", patience=0.2).describe()
     assert 0.2 <= time.monotonic() - begin < 20
     assert "\n" not in str(error.value)
 
 
-def test_who_is_stopped_while_it_waits_does_not_say_that_a_simulation_ended(bus: MemoryBus) -> None:
+def test_stopping_while_waiting_is_not_reported_as_the_end_of_a_simulation(bus: MemoryBus) -> None:
     robot = RemoteRobot(bus, "test", "r0", patience=20.0)
     stop = threading.Timer(0.1, robot.close)
     stop.start()
-    with pytest.raises(DeviceError, match="robot/r0/describe: stopped before its body has answered"):
+    with pytest.raises(DeviceError, match="robot/r0/describe: stopped before its base has answered"):
         robot.describe()
     stop.join()
 
 
-def test_nobody_gives_up_a_simulated_body_that_waits_for_another_robot() -> None:
+def test_a_simulated_base_that_waits_for_another_robot_is_not_given_up() -> None:
     assert simulator.PATIENCE + ASK_TIMEOUT < PATIENCE
 
 
-def test_two_bodies_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus) -> None:
+def test_two_bases_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus) -> None:
     second = Body(hub)
-    with pytest.raises(DeviceError, match="2 bodies answer"):
+    with pytest.raises(DeviceError, match="2 bases answer"):
         RemoteRobot(bus, "test", "r0").sense()
     second.bus.close()
 
 
-def test_a_body_that_comes_late_is_found(hub: MemoryHub, bus: MemoryBus) -> None:
+def test_a_base_that_starts_late_is_found(hub: MemoryHub, bus: MemoryBus) -> None:
     made: list[Body] = []
     late = threading.Timer(0.2, lambda: made.append(Body(hub)))
     late.start()

@@ -13,10 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.drivers.replay import Replay, read_camera
+from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Command, Odometry
 from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -82,7 +83,7 @@ def everything(replay: Replay):
     return list(iter(replay.sense, None))
 
 
-def test_what_was_recorded_is_played(folder, walls):
+def test_recordings_are_replayed(folder, walls):
     replay = Replay(folder)
     observations = everything(replay)
     assert len(replay) == len(observations) == COUNT
@@ -233,7 +234,7 @@ WRONG = {
     "lens of four": (replaced("camera.toml", ", 0.0, 0.0]", ", 0.0]"), "camera.toml"),
     "lens is one": (replaced("camera.toml", "[-0.1, 0.02, 0.001, 0.0, 0.0]", "0.1"), "camera.toml"),
     "lens is no number": (replaced("camera.toml", "0.02", "nan"), "camera.toml"),
-    "no odometry": (gone("odometry.csv"), "without odometry nothing tells the map's scale"),
+    "no odometry": (gone("odometry.csv"), "without odometry the map has no scale"),
     "odometry is a folder": (folder_at("odometry.csv"), "odometry.csv"),
     "odometry is empty": (written("odometry.csv", ""), "0 rows for 14 images"),
     "odometry without a turn": (replaced("odometry.csv", "turn_rad", "turn"), "no column 'turn_rad'"),
@@ -254,7 +255,7 @@ WRONG = {
     "times after all clocks": (written("times.txt", " ".join(f"{k}e200" for k in range(1, 15))), "times.txt"),
 }  # fmt: skip
 WRONG_SPLITS = {
-    "no splits": (gone("splits.toml"), "without it there is no robot 'b'"),
+    "no splits": (gone("splits.toml"), "it must describe robot 'b'"),
     "splits are no TOML": (written("splits.toml", "[[robot"), "splits.toml"),
     "splits are no text": (written("splits.toml", b"\xff\xfe"), "splits.toml"),
     "splits are a folder": (folder_at("splits.toml"), "splits.toml"),
@@ -281,7 +282,7 @@ WRONG_SPLITS = {
 WRONG_IMAGES = {
     "an image of another size": (
         lambda folder: cv2.imwrite(str(folder / "images" / "frame2.png"), np.zeros((120, 160), np.uint8)),
-        "160x120 px, but camera.toml says 320x240",
+        "160x120 px, but camera.toml gives 320x240",
     ),
     "an image that is none": (written("images/frame2.png", "no image"), "not an image that can be read"),
     "an empty image": (written("images/frame2.png", b""), "not an image that can be read"),
@@ -299,7 +300,7 @@ def refused(action) -> str:
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_said_in_one_line(folder, case):
+def test_errors_are_reported_in_one_line(folder, case):
     spoil, said = WRONG[case]
     spoil(folder)
     words = refused(lambda: Replay(folder))
@@ -308,7 +309,7 @@ def test_what_is_wrong_is_said_in_one_line(folder, case):
 
 
 @pytest.mark.parametrize("case", WRONG_SPLITS)
-def test_what_is_wrong_with_a_split_is_said_in_one_line(folder, case):
+def test_errors_of_a_split_are_reported_in_one_line(folder, case):
     spoil, said = WRONG_SPLITS[case]
     spoil(folder)
     words = refused(lambda: Replay(folder, "b"))
@@ -317,7 +318,7 @@ def test_what_is_wrong_with_a_split_is_said_in_one_line(folder, case):
 
 
 @pytest.mark.parametrize("case", WRONG_IMAGES)
-def test_what_is_wrong_with_an_image_is_said_when_its_turn_comes(folder, case):
+def test_errors_of_an_image_are_reported_at_its_turn(folder, case):
     replay = Replay(folder)
     spoil, said = WRONG_IMAGES[case]
     spoil(folder)
@@ -337,7 +338,7 @@ toml_values = st.one_of(
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.sampled_from(["width", "height", "fx", "cx", "height_m", "forward_m", "distortion"]), toml_values)
-def test_a_camera_is_read_or_refused_whatever_is_in_its_file(tmp_path, name, value):
+def test_any_camera_file_is_read_or_refused(tmp_path, name, value):
     path = tmp_path / "camera.toml"
     lines = [line for line in CAMERA.splitlines() if not line.startswith(f"{name} ")]
     path.write_text("\n".join([*lines, f"{name} = {value}"]))

@@ -55,7 +55,7 @@ class Drive:
 @pytest.mark.parametrize(
     ("mission", "ticks"), [(Explore(), 20), (GoTo(NodeId("r0", 1, 1)), 130)], ids=["explore", "goto"]
 )
-def test_it_stands_while_they_are_silent_and_says_so_and_goes_on_after(walls, mission, ticks, broken, read):
+def test_it_stops_and_reports_while_they_are_silent_and_then_goes_on(walls, mission, ticks, broken, read):
     drive = Drive(walls, on(mission))
     moving = drive.run(ticks)
     assert any(step.command != Command() for step in moving)
@@ -86,7 +86,7 @@ def test_a_long_silence_does_not_count_against_what_the_robot_was_doing(walls):
 
 
 @pytest.mark.parametrize("mission", [Idle(), Carried()])
-def test_whoever_drives_nothing_needs_none(walls, mission):
+def test_an_agent_without_wheels_needs_no_rangers(walls, mission):
     steps = Drive(walls, on(mission)).run(5, NONE)
     assert all("promised" not in step.status.detail for step in steps)
 
@@ -97,7 +97,7 @@ def test_a_robot_that_promises_none_drives_without(walls):
     assert any(step.command != Command() for step in drive.run(20, NONE))
 
 
-def test_one_sensor_is_named_as_one() -> None:
+def test_a_single_sensor_is_named() -> None:
     monitor = RangerMonitor(RobotDescription(BODY.camera, ranger_bearings=(0.0,), ranger_reach=1.0))
     assert monitor.fault == ""
     monitor.see(np.zeros(0))

@@ -9,14 +9,14 @@ from scipy.stats import chi2
 from synthetic.localization_run import FEW, Place, draw_place, drive, try_drives, try_start
 
 
-def test_a_place_knows_how_far_off_it_is() -> None:
+def test_a_place_has_a_pose_error() -> None:
     true = np.zeros((2, 3))
     place = Place(true, np.array([[0.3, 0.4, 0.0], [0.0, 0.0, 0.0]]), np.array([np.eye(3), np.eye(3)]) * 0.25)
     assert place.error == pytest.approx(0.5 / np.sqrt(2))
     assert place.nees == pytest.approx(0.5)
 
 
-def test_maps_are_drawn_as_uncertain_as_they_say() -> None:
+def test_map_errors_match_their_covariances() -> None:
     """The average NEES lies in its interval, widened for the bend of depth over inverse depth."""
     places = [draw_place(np.random.default_rng([31, k])) for k in range(100)]
     landmarks = sum(len(place.true) for place in places)

@@ -42,7 +42,7 @@ def followed(run: MappingRun, choice: Choice) -> TextbookFilter:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_a_moved_camera_sees_what_the_camera_model_projects(chart: Coordinates) -> None:
+def test_a_moved_camera_agrees_with_the_camera_model(chart: Coordinates) -> None:
     """Charts and motion against hybridmap's camera and poses, which share no formula with them."""
     rng = np.random.default_rng(1)
     points = AHEAD.back_project(rng.uniform(40, 200, (6, 2)), rng.uniform(2, 5, 6))
@@ -66,7 +66,7 @@ def test_complex_steps_are_derivatives(chart: Coordinates) -> None:
     assert np.abs(jacobian(moved, landmarks) - np.stack(numeric, axis=-1)).max() < 1e-8
 
 
-def test_the_textbook_filter_is_ours_where_it_chooses_the_same() -> None:
+def test_the_textbook_filter_agrees_with_ours_for_the_same_choices() -> None:
     run = short_run(2)
     ours = Ours(run, plain(run))
     for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
@@ -76,7 +76,7 @@ def test_the_textbook_filter_is_ours_where_it_chooses_the_same() -> None:
     assert max(gap((x, textbook.covariance), ours.belief)) < 1e-7
 
 
-def test_a_step_linearised_again_is_ours() -> None:
+def test_a_step_linearised_again_agrees_with_ours() -> None:
     """Ours skips a second linearisation that changes a step by less than 0.1 mm and 0.1 mrad."""
     run = short_run(3, steps=200)
     settings = FilterSettings(
@@ -144,7 +144,7 @@ def test_an_iterated_update_ends_where_the_posterior_does_not_slope() -> None:
         assert abs(cost(at + ahead) - cost(at - ahead)) / 2e-3 < 1e-3
 
 
-def test_what_diverges_is_counted_and_no_number_is_made_up() -> None:
+def test_divergence_is_counted_and_gives_no_number() -> None:
     kept, off, lost = Outcome(1.0, 3.0, 4.0), Outcome(11.0, 99.0, 99.0), Outcome(math.inf, math.nan, math.nan)
     told = summary([kept, kept, off, lost])
     assert told["ratio_median"] == 6.0
@@ -160,7 +160,7 @@ def test_a_filter_that_ends_without_a_number_has_diverged() -> None:
     assert try_textbook(run, broken, 1.0).ratio == math.inf
 
 
-def test_the_command_tells_all_filters(
+def test_the_command_lists_all_filters(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The whole command on one short run, which a process of its own makes."""
@@ -180,7 +180,7 @@ def test_the_command_tells_all_filters(
     assert list(told["ratio_median"]) == [*TEXTBOOK, *OURS]
 
 
-def test_no_runs_is_refused_in_one_line(
+def test_zero_runs_are_refused_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["ekf_variants", "--runs", "0"])

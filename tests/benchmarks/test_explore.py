@@ -31,7 +31,7 @@ PLAN = FloorPlan(
 
 
 @pytest.mark.parametrize("pose", [Pose2(1.0, 2.0, 0.0), Pose2(3.0, 0.8, 2.9), Pose2(6.0, 1.0, -3.0)])
-def test_a_node_shows_what_lies_in_its_field_of_view_before_anything_solid(pose: Pose2) -> None:
+def test_a_node_shows_what_is_visible_in_its_field_of_view(pose: Pose2) -> None:
     squares = floor_squares(PLAN)
     shown = shows(Look(0.0, pose, 0.5), squares, PLAN)
     steps = np.linspace(0.0, 1.0, 400)[:, None]
@@ -49,7 +49,7 @@ def test_a_node_shows_what_lies_in_its_field_of_view_before_anything_solid(pose:
     assert 0.01 < shown.mean() < 0.5
 
 
-def test_floor_is_mapped_from_the_first_look_on() -> None:
+def test_floor_is_mapped_from_the_first_view_on() -> None:
     west, east = Pose2(1.0, 2.0, 0.0), Pose2(7.0, 2.0, math.pi)
     looks = {"r0": [Look(5.0, west, 0.5), Look(9.0, west, 0.5)], "r1": [Look(7.0, east, 0.5)], "r2": []}
     floor = mapped_floor(PLAN, looks)
@@ -77,7 +77,7 @@ def test_time_to_a_share() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_fleet_is_set_down_in_one_place(seed: int) -> None:
+def test_a_fleet_starts_at_one_place(seed: int) -> None:
     plan = make_office(seed, 4).plan
     poses = gathered(plan, 3, seed)
     assert [p.vector.tolist() for p in poses] == [p.vector.tolist() for p in gathered(plan, 3, seed)]

@@ -63,7 +63,7 @@ def test_neighbours_come_first_when_there_are_too_many(photographs: Path) -> Non
 
 
 @pytest.mark.parametrize("content", ["missing", "empty", "one", "different"])
-def test_a_folder_that_is_none_costs_one_line(
+def test_a_missing_folder_is_reported_in_one_line(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "views"
@@ -88,7 +88,7 @@ def test_arguments_out_of_range(wrong: list[str], monkeypatch: pytest.MonkeyPatc
     assert error.value.code == 2
 
 
-def test_matches_of_a_warp_are_right_where_the_homography_says() -> None:
+def test_matches_of_a_warp_agree_with_the_homography() -> None:
     """To 3 px of where the homography takes a feature, written down here once more."""
     rng = np.random.default_rng(1)
     pair = _warped_pair(load("coins"), rng)
@@ -140,7 +140,7 @@ def test_ratios_are_of_the_pairs_that_floats_match() -> None:
     assert one["bytes"] == 2
 
 
-def test_a_node_is_one_of_150_landmarks() -> None:
+def test_a_node_has_150_landmarks() -> None:
     full, half = Packed(2800, 150, 2500, 2.0, 1.0), Packed(1550, 75, 1250, 1.0, 1.0)
     assert node_figures([full, half])["bytes_per_node"] == 2800
     reckoned = node_figures([half])
@@ -148,6 +148,6 @@ def test_a_node_is_one_of_150_landmarks() -> None:
     assert reckoned["bytes_per_landmark"] == pytest.approx(16.667, abs=1e-3)
 
 
-def test_the_folder_is_looked_at_before_anything_else(tmp_path: Path) -> None:
+def test_the_folder_is_checked_first(tmp_path: Path) -> None:
     with pytest.raises(InvalidFile, match="no such folder"):
         folder_pairs(tmp_path / "nothing", 0, 10)

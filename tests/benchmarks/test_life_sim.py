@@ -17,7 +17,7 @@ def fleet() -> Fleet:
     return made
 
 
-def test_landmarks_on_what_is_moved_lie_on_its_outline(fleet: Fleet) -> None:
+def test_landmarks_of_moved_furniture_are_on_its_outline(fleet: Fleet) -> None:
     pairs = zip(fleet.before.plan.furniture, fleet.after.plan.furniture, strict=True)
     moved = [old for old, new in pairs if old != new]
     on_it = 0
@@ -40,7 +40,9 @@ def test_nothing_has_been_shown_since_before_there_is_a_later_drive(fleet: Fleet
     assert last.seen == last.moved_faded == last.others_faded == 0 < last.moved
 
 
-def test_bad_input_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_reported_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("sys.argv", ["life_sim", "--drives", "0"])
     with pytest.raises(SystemExit) as ended:
         main()

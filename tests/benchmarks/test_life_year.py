@@ -10,7 +10,7 @@ from synthetic.drives import DriveSettings, drives
 from synthetic.fleet import FleetSettings
 
 
-def test_links_lead_to_nodes_for_which_no_newer_one_stands() -> None:
+def test_links_lead_to_active_nodes() -> None:
     settings = DriveSettings(FleetSettings(nodes=30, side=6.0), false_share=0.3)
     days, before = drives(np.random.default_rng(1), settings), frozenset[NodeId]()
     seen: dict[NodeId, Pose2] = {}

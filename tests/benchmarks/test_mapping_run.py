@@ -34,7 +34,7 @@ def run() -> MappingDrive:
     return drive(3, "arena", "line", 120)
 
 
-def test_the_command_draws_and_tells(
+def test_the_command_draws_and_prints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One short run: its pictures, and its last line for scripts."""
@@ -63,7 +63,7 @@ def test_the_command_draws_and_tells(
         (["--out", "{folder}", "--seed", "-1"], "seed"),
     ],
 )
-def test_what_cannot_be_run_is_told_in_one_line(
+def test_errors_are_reported_in_one_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -82,7 +82,7 @@ def test_what_cannot_be_run_is_told_in_one_line(
     assert file.read_text() == "not a folder"
 
 
-def test_what_spoils_a_comparison_is_told() -> None:
+def test_mismatched_comparisons_are_reported() -> None:
     seen: dict[str, float | None] = {"person_in_view_s": 3.0, "landmarks_left": 9.0}
     unseen: dict[str, float | None] = {"person_in_view_s": 0.0, "landmarks_left": 0.0}
     assert notes({"line": unseen | {"landmarks_left": 1.0}, "person": seen}, {"line": "", "person": ""}) == []
@@ -108,7 +108,7 @@ def test_a_run_is_near_the_truth(run: MappingDrive) -> None:
     assert told["landmarks_left"] <= told["landmarks"] <= told["tracks"]
 
 
-def test_somebody_walks_through_the_view_and_nothing_else_is_different() -> None:
+def test_a_person_in_the_view_changes_nothing_else() -> None:
     alone, passed = drive(2, "arena", "line", 60), drive(2, "arena", "line", 60, person=True)
     bearings = np.array([m.person for m in passed.moments])
     assert np.isfinite(bearings).sum() > 5
@@ -127,7 +127,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(run: MappingD
     assert other.world_from_anchor != run.world_from_anchor
 
 
-def test_true_points_are_on_what_the_picture_shows(run: MappingDrive) -> None:
+def test_true_points_are_on_the_surfaces_of_the_picture(run: MappingDrive) -> None:
     """A true point, seen from the end of the way, shows what the anchor showed around it: the truth moves
     with the picture as the robot does, whatever trackers and filters think.
     """

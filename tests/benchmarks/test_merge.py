@@ -20,7 +20,7 @@ SMALL = FleetSettings(robots=3, nodes=25, side=7.0, true_links=15)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.8])
-def test_links_are_true_and_false_as_told(share: float) -> None:
+def test_links_are_true_and_false_as_requested(share: float) -> None:
     fleet = draw_fleet(share, np.random.default_rng(3), SMALL)
     assert 1.0 - len(fleet.true) / len(fleet.links) == pytest.approx(share, abs=0.02)
     assert len({link.pair for link in fleet.links}) == len(fleet.links)
@@ -36,7 +36,7 @@ def test_a_robot_that_is_left_apart_counts() -> None:
     assert error(apart, fleet.truth) > 5.0 * error(oracle(fleet), fleet.truth)
 
 
-def test_a_split_graph_costs_what_the_whole_one_does() -> None:
+def test_a_split_graph_has_the_cost_of_the_whole() -> None:
     rng = np.random.default_rng(5)
     true = [Pose2(3.0 * math.cos(0.4 * k), 3.0 * math.sin(0.4 * k), 0.4 * k) for k in range(40)]
     sigmas = np.array([0.05, 0.05, 0.02])

@@ -29,7 +29,7 @@ def world() -> World:
     return make_world("warehouse", 4, rows=1, bays=2)
 
 
-def test_rays_end_where_the_renderer_draws(world: World) -> None:
+def test_rays_agree_with_the_renderer(world: World) -> None:
     """Each panel in a grey of its own: the pixel says which one a ray must meet, and that how far away."""
     panels = PanelSet.of(world.panels)
     count = len(panels.corner)
@@ -59,7 +59,7 @@ def test_rays_end_where_the_renderer_draws(world: World) -> None:
     assert compared > 1000 and agreed / compared > 0.97
 
 
-def test_views_are_shared_by_those_that_look_at_one_thing(world: World) -> None:
+def test_views_of_one_thing_share_landmarks(world: World) -> None:
     panels = PanelSet.of(world.panels)
     rng = np.random.default_rng(1)
     here = world.plan.random_free_pose(rng, 0.6)
@@ -71,7 +71,7 @@ def test_views_are_shared_by_those_that_look_at_one_thing(world: World) -> None:
     assert np.allclose(wanted, np.where(shared >= 0.5, shared, 0.0))
 
 
-def test_a_wall_is_not_seen_from_one_side_by_who_looks_along_it_from_either_end() -> None:
+def test_views_along_a_wall_from_both_ends_share_no_side() -> None:
     """A wall of 20 m along x, and two cameras that look at each other along it."""
     corner, along, down = (
         np.array([[-10.0, 0.5, 1.5]]),
@@ -89,7 +89,7 @@ def test_a_wall_is_not_seen_from_one_side_by_who_looks_along_it_from_either_end(
     assert one_side[0, 2] == pytest.approx(any_side[0, 2], abs=0.05) and one_side[0, 2] > 0.3
 
 
-def test_what_stands_between_hides() -> None:
+def test_objects_in_between_occlude() -> None:
     """Two cameras on both sides of a wall look the same way: they show nothing in common."""
     rooms = make_world("twins", 0)
     panels = PanelSet.of(rooms.panels)
@@ -118,7 +118,7 @@ def test_maps_that_are_joined_wrongly_are_counted() -> None:
     assert false_merges(close, truth) == 0
 
 
-def test_a_run_that_fails_or_is_killed_is_told() -> None:
+def test_a_failed_or_killed_run_is_reported() -> None:
     said = json.dumps(asdict(RUN))
     assert outcome("office", 3, 0, f"noise\n{said}\n", "") == RUN
     for status, out, words, reason in (

@@ -87,7 +87,7 @@ def test_no_way_leads_into_a_wall_or_outside(floor: Floor) -> None:
     assert math.isinf(Floor.of(closed, RADIUS).ways_from(Pose2(1.0, 1.0)).to(Pose2(5.0, 1.0)))
 
 
-def test_plots_are_what_they_promise(mapped: Mapped, floor: Floor) -> None:
+def test_plots_are_valid_pictures(mapped: Mapped, floor: Floor) -> None:
     starts = set()
     for seed in range(20):
         plot = draw_plot(mapped, PLAN, floor, np.random.default_rng(seed))
@@ -206,7 +206,7 @@ def test_a_drive_is_timed_measured_and_ended(arrives: bool) -> None:
 
 
 @pytest.mark.parametrize("wrong", [["--runs", "0"], ["--seed", "-1"]])
-def test_bad_input_gets_one_line(
+def test_bad_input_is_reported_in_one_line(
     wrong: list[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -32,7 +32,7 @@ def test_starts_are_drawn_by_the_rule(scene):
         assert scene.plan.is_free(there.x, there.y, 0.2)
 
 
-def test_a_parking_is_what_the_truth_says(scene):
+def test_parking_is_judged_by_the_truth(scene):
     """The same start twice gives the same to the last bit, and success is what its record shows."""
     start = Pose2(-0.7, 0.2, 0.1)
     first, second = (park(scene, start, 0.7, seed=5) for _ in range(2))
@@ -65,7 +65,7 @@ def test_the_command_prints_figures_and_draws(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("option", "words"), [(["--starts", "0"], "at least 1"), (["--out", "{file}/x"], "can be made")]
 )
-def test_bad_options_are_told_in_one_line(tmp_path, monkeypatch, capsys, option, words):
+def test_bad_options_are_reported_in_one_line(tmp_path, monkeypatch, capsys, option, words):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("sys.argv", ["parking", *(o.format(file=tmp_path / "file") for o in option)])
     with pytest.raises(SystemExit) as ended:

@@ -104,7 +104,7 @@ def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
     assert 1 <= len(set(owners)) <= 2
 
 
-def test_what_the_index_has_lost_is_told_of_the_same_views() -> None:
+def test_the_loss_of_the_index_is_measured_on_the_same_views() -> None:
     picture = picture_of(np.zeros((0, 128), np.uint8))
     query = Query("near", picture, 0)
 
@@ -153,7 +153,7 @@ def test_a_person_hides_about_a_third() -> None:
     assert 0.2 < np.mean(shares) < 0.4
 
 
-def test_twins_are_looked_at_alike() -> None:
+def test_twins_are_visited_in_the_same_way() -> None:
     world = make_world("twins", 5)
     east = world.plan.room("room 1").x - world.plan.room("room 0").x
     poses = twin_lookouts(world, 12, np.random.default_rng(6))
@@ -222,7 +222,7 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
             assert row["right"] == pytest.approx(row["told"], abs=0.05)
 
 
-def test_what_the_benchmark_itself_makes_is_no_part_of_an_answers_time() -> None:
+def test_the_benchmarks_own_work_is_not_timed() -> None:
     sift = np.zeros((0, 128), np.uint8)
     picture = Picture(Pose2(), CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
     making = np.zeros(2)

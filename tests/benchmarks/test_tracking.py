@@ -43,7 +43,7 @@ def drive(request: pytest.FixtureRequest) -> Drive:
     return make(np.random.default_rng(5), 16)
 
 
-def test_the_truth_is_what_the_pictures_show(drive: Drive):
+def test_the_truth_agrees_with_the_pictures(drive: Drive):
     """Features found anew in a later picture, by SIFT alone, are where the truth has those of the first."""
     lens = Lens(drive.description.camera, drive.description.distortion)
     first, last = (Sift(lens).extract(drive.images[k]) for k in (0, -1))
@@ -79,7 +79,7 @@ def test_the_last_line_is_for_scripts():
 
 
 @pytest.mark.parametrize("bad", [("--drives", "0"), ("--frames", "3"), ("--seed", "-1")])
-def test_bad_input_gets_one_line(
+def test_bad_input_is_reported_in_one_line(
     bad: tuple[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(sys, "argv", ["tracking", *bad])

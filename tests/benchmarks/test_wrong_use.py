@@ -29,7 +29,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("name", "wrong"), WRONG, ids=lambda case: "".join(case))
-def test_what_is_wrong_is_said_in_one_line(
+def test_errors_are_reported_in_one_line(
     name: str,
     wrong: list[str],
     monkeypatch: pytest.MonkeyPatch,

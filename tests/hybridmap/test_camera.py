@@ -45,7 +45,7 @@ def test_semi_aperture_is_the_narrower_side() -> None:
 @pytest.mark.parametrize(
     "wrong", [{"fx": 0.0}, {"width": 5}, {"height": 99999}, {"cx": math.nan}, {"mount_height": math.inf}]
 )
-def test_what_no_camera_can_be_is_refused(wrong: dict[str, float]) -> None:
+def test_impossible_cameras_are_refused(wrong: dict[str, float]) -> None:
     good = {"width": 320, "height": 240, "fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0, "mount_height": 0.2}
     with pytest.raises(InvalidValue):
         Camera(**{**good, **wrong})  # type: ignore[arg-type]

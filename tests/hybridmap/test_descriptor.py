@@ -34,14 +34,14 @@ def test_decoded_is_the_nearest_step_of_each_coordinate() -> None:
     assert np.allclose(decode(encode(sift)), grid[nearest], atol=1e-6)
 
 
-def test_what_was_decoded_encodes_to_itself_and_nothing_leaves_the_range() -> None:
+def test_decoded_values_encode_to_themselves_within_the_range() -> None:
     codes = np.random.default_rng(5).integers(0, SYMBOLS, (100, DIMENSIONS)).astype(np.uint8)
     assert np.array_equal(quantise(decode(codes)), codes)
     assert quantise(np.full((1, DIMENSIONS), 1e9)).max() == SYMBOLS - 1
     assert quantise(np.full((1, DIMENSIONS), -1e9)).min() == 0
 
 
-def test_projection_is_what_the_table_says() -> None:
+def test_projection_agrees_with_the_table() -> None:
     sift, tables = fake_sift(8, 2), landmark_tables()
     roots = np.sqrt(sift / sift.sum(axis=1, keepdims=True))
     assert np.allclose(project(sift), (roots - tables.mean) @ tables.basis, atol=1e-6)
@@ -56,12 +56,12 @@ def test_scale_of_the_input_does_not_matter_and_nothing_is_no_harm() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((3, 127)), np.full((1, 128), np.nan), np.zeros(128)])
-def test_what_is_no_sift_is_refused(wrong: np.ndarray) -> None:
+def test_invalid_sift_settings_are_refused(wrong: np.ndarray) -> None:
     with pytest.raises(InvalidValue):
         encode(wrong)
 
 
-def test_what_is_no_code_is_refused() -> None:
+def test_invalid_codes_are_refused() -> None:
     with pytest.raises(InvalidValue):
         decode(np.zeros((3, DIMENSIONS), np.int64))  # type: ignore[arg-type]
     with pytest.raises(InvalidValue):
@@ -84,7 +84,7 @@ def test_tables_that_are_none_are_refused() -> None:
             replace(good, **wrong)
 
 
-def test_rounding_adds_to_distances_what_is_said() -> None:
+def test_rounding_adds_the_stated_noise_to_distances() -> None:
     """Real descriptors, all pairs, before and after."""
     _, sift = real_sift(skimage.data.coins(), 300)
     exact, rounded = project(sift).astype(np.float64), decode(encode(sift)).astype(np.float64)

@@ -83,7 +83,7 @@ def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:
     assert run(tmp_path, "with", tmp_path / "cache")["hits"] == 1
 
 
-def test_where_nothing_can_be_kept_a_kernel_is_compiled_all_the_same(tmp_path: Path) -> None:
+def test_a_kernel_is_compiled_without_a_cache_folder(tmp_path: Path) -> None:
     pytest.importorskip("numba")
     (tmp_path / "file").write_text("")
     assert run(tmp_path, "with", tmp_path / "file" / "cache")["hits"] == 0

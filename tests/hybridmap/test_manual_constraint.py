@@ -22,12 +22,12 @@ def test_the_ends_are_put_in_order():
     ("ends", "who", "why"),
     [((A, A), "x", ""), ((A, B.map), "x", ""), ((A, B), "x\ny", ""), ((A, B), "x", "w" * 301)],
 )
-def test_what_is_no_ruling_is_refused(ends, who, why):
+def test_invalid_constraints_are_refused(ends, who, why):
     with pytest.raises(InvalidValue):
         ManualConstraint(ends, True, who, 0, why)
 
 
-def test_a_ruling_on_maps_holds_for_all_their_nodes():
+def test_a_constraint_on_maps_holds_for_all_their_nodes():
     rulings = ManualConstraints([ManualConstraint((A.map, B.map), True, "anna", 1)])
     assert rulings.against(A, B) is rulings.against(NodeId("b", 1, 99), NodeId("a", 1, 98)) is rulings.made[0]
     assert rulings.against(A, NodeId("b", 2, 5)) is None
@@ -38,7 +38,7 @@ ends = st.sampled_from([(A, B), (A, NodeId("b", 1, 7)), (A.map, B.map)])
 
 
 @given(st.lists(st.tuples(ends, st.booleans()), max_size=8), st.integers(0, 8))
-def test_the_last_one_counts_however_the_record_is_put_together(made, cut):
+def test_the_last_constraint_counts_in_any_order(made, cut):
     """Against a replay into a plain dictionary; and two halves joined are the whole."""
     rulings = [ManualConstraint(e, apart, "x", k) for k, (e, apart) in enumerate(made)]
     last = {}

@@ -99,13 +99,13 @@ def test_mahalanobis_distance_of_samples_has_three_degrees_of_freedom() -> None:
         np.array([[1, 1, 0], [0, 1, 0], [0, 0, 1.0]]),
     ],
 )
-def test_what_is_no_covariance_is_refused(covariance: np.ndarray) -> None:
+def test_invalid_covariances_are_refused(covariance: np.ndarray) -> None:
     with pytest.raises(InvalidValue):
         PoseGaussian(Pose2(), covariance)
 
 
 @pytest.mark.parametrize("seed", range(200))
-def test_what_counts_as_a_covariance_agrees_with_its_eigenvalues(seed: int) -> None:
+def test_the_covariance_check_agrees_with_eigenvalues(seed: int) -> None:
     rng = np.random.default_rng(seed)
     turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     values = 10.0 ** rng.uniform(-8, 3, 3) * rng.choice([1.0, 0.0], 3)
@@ -152,9 +152,7 @@ def test_arrays_agree_with_single_poses() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-6, 2), st.floats(0, 5))
-def test_whatever_comes_through_a_message_can_be_turned_round_and_composed(
-    seed: int, size: float, lever: float
-) -> None:
+def test_any_decoded_pose_can_be_inverted_and_composed(seed: int, size: float, lever: float) -> None:
     """Of any rank, rounded to float32, and seen from kilometres away, where only rounding is left of it."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, rng.integers(1, 4))) * 10.0**size

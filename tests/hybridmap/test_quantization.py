@@ -29,7 +29,7 @@ def test_a_depth_is_off_by_little_of_its_sigma(depth: float, share: float) -> No
 
 
 @given(st.integers(1, 63), st.integers(0, 55 * 512))
-def test_what_was_rounded_rounds_to_itself(share: int, depth: int) -> None:
+def test_rounded_values_round_to_themselves(share: int, depth: int) -> None:
     steps = np.array([share]), np.array([min(depth, (55 << int(FINE_BITS[share])) - 1)])
     again = round_depths(*restore_depths(*steps))
     assert (again[0][0], again[1][0]) == (steps[0][0], steps[1][0])
@@ -53,7 +53,7 @@ def test_pixels_are_off_by_half_a_step(width: int, height: int, step: float) -> 
     assert np.array_equal(grid.restore(*grid.round(back)), back)
 
 
-def test_settled_landmarks_stand_by_rows_and_keep_what_belongs_together() -> None:
+def test_settled_landmarks_are_ordered_by_rows() -> None:
     random = np.random.default_rng(4)
     pixels = (random.uniform(0, 1, (60, 2)) * [319, 30]).astype(np.float32)
     codes = random.integers(0, 64, (60, 32)).astype(np.uint8)
@@ -75,7 +75,7 @@ def test_settled_landmarks_stand_by_rows_and_keep_what_belongs_together() -> Non
 @pytest.mark.parametrize(
     ("depth", "sigma"), [(0.0, 0.1), (-1.0, 0.1), (1.0, math.nan), (1.0, -0.1), (1.0, math.inf)]
 )
-def test_what_is_no_depth_is_refused(depth: float, sigma: float) -> None:
+def test_invalid_depths_are_refused(depth: float, sigma: float) -> None:
     with pytest.raises(InvalidValue):
         round_depths(np.array([depth]), np.array([sigma]))
 

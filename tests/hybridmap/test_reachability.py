@@ -88,7 +88,7 @@ def test_few_landmarks_a_long_way_or_a_wide_turn_only_tie_poses() -> None:
     assert not reachability_of(turned, a, b).drivable and "degrees" in reachability_of(turned, a, b).reason
 
 
-def test_what_was_driven_can_be_driven_whatever_it_shows() -> None:
+def test_driven_edges_are_always_reachable() -> None:
     rng = np.random.default_rng(2)
     for kind in (EdgeKind.MAPPED, EdgeKind.TURNED, EdgeKind.DRIVEN):
         edge, a, b = pair(Pose2(3.0, 0.0, 2.0), wall(3, rng), rng, kind)
@@ -117,7 +117,7 @@ def test_closed_edges_of_a_map() -> None:
     assert closed_edges(one) == {closed.id}
 
 
-def test_landmarks_that_a_node_put_anew_lacks_are_not_in_view() -> None:
+def test_landmarks_missing_in_a_rewritten_node_are_not_in_view() -> None:
     rng = np.random.default_rng(2)
     edge, a, b = pair(Pose2(0.4, 0.1, 0.1), wall(60, rng), rng)
     whole, kept = reachability_of(edge, a, b), 9

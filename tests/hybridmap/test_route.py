@@ -90,7 +90,7 @@ def test_of_two_edges_the_cheaper_is_driven() -> None:
     assert route.edges == (NodeId("e", 1, 100),)
 
 
-def test_a_link_that_somebody_has_driven_costs_its_length() -> None:
+def test_a_driven_link_costs_its_length() -> None:
     """Two metres across a room, and a detour of four: the link is taken once it was driven, not before."""
     places = [Pose2(0, 0), Pose2(2, 0), Pose2(1, 1.7)]
     nodes = [node(k, place) for k, place in enumerate(places)]

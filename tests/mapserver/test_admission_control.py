@@ -48,7 +48,7 @@ class Counter:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_what_is_unusual_teaches_the_desk_nothing(workers: int) -> None:
+def test_unusual_jobs_do_not_change_the_estimated_duration(workers: int) -> None:
     """A person's question takes seconds; no robot is turned away for it afterwards."""
     clock = Clock()
     desk = AdmissionControl(AdmissionSettings(workers, first_guess=0.1), clock)
@@ -64,7 +64,7 @@ def test_what_is_unusual_teaches_the_desk_nothing(workers: int) -> None:
 
 
 @pytest.mark.parametrize(("workers", "seconds", "in_time"), [(1, 0.1, 0.65), (2, 0.05, 0.51), (4, 0.2, 0.23)])
-def test_what_is_taken_on_is_answered_in_time(workers: int, seconds: float, in_time: float) -> None:
+def test_accepted_questions_are_answered_in_time(workers: int, seconds: float, in_time: float) -> None:
     counter = Counter(AdmissionSettings(workers, in_time=in_time, first_guess=seconds))
     while not counter.ask():
         assert counter.taken < 1000
@@ -75,13 +75,13 @@ def test_what_is_taken_on_is_answered_in_time(workers: int, seconds: float, in_t
     counter.end()
 
 
-def test_a_free_worker_takes_on_whatever_it_costs() -> None:
+def test_a_free_worker_takes_a_job_of_any_cost() -> None:
     counter = Counter(AdmissionSettings(2, in_time=0.1, first_guess=5.0))
     assert [counter.ask() > 0.0 for _ in range(4)] == [False, False, True, True]
     counter.end()
 
 
-def test_a_crowd_that_was_refused_comes_back_one_after_the_other() -> None:
+def test_a_refused_crowd_comes_back_in_sequence() -> None:
     """Fifty ask at once and keep to what they are told: the queue never fills again."""
     workers, seconds = 2, 0.05
     settings = AdmissionSettings(workers, in_time=0.5, first_guess=seconds)
@@ -152,7 +152,7 @@ class Simulated:
         self.pool.shutdown()
 
 
-def test_everybody_has_a_turn() -> None:
+def test_all_get_a_turn() -> None:
     """Fifty robots ask on and on: with appointments, none waits much longer than a round takes."""
     seconds, robots = 0.06, 50
     fair = Simulated(robots, seconds, keep=True, rng=np.random.default_rng(1))
@@ -165,7 +165,7 @@ def test_everybody_has_a_turn() -> None:
     assert fair.refusals < 1.1 * len(fair.waits)
 
 
-def test_an_appointment_has_precedence_and_is_lost_by_who_does_not_come() -> None:
+def test_an_appointment_has_precedence_and_expires() -> None:
     counter = Counter(AdmissionSettings(1, in_time=0.5, first_guess=0.1))
     while not counter.ask():
         pass
@@ -207,7 +207,7 @@ def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
         desk.close()
 
 
-def test_what_has_waited_too_long_is_refused_at_its_turn() -> None:
+def test_questions_that_waited_too_long_are_refused() -> None:
     """Each question takes four times as long as was thought."""
     clock = Clock()
     settings = AdmissionSettings(1, in_time=0.6, too_late=1.5, first_guess=0.1)
@@ -241,7 +241,7 @@ def test_settings_that_cannot_work(name: str, value: float) -> None:
         AdmissionSettings(**{name: value})
 
 
-def test_closing_finishes_what_was_taken_on() -> None:
+def test_closing_finishes_accepted_jobs() -> None:
     desk = AdmissionControl(AdmissionSettings(1, in_time=60.0))
     done: list[int] = []
     for k in range(20):
@@ -250,7 +250,7 @@ def test_closing_finishes_what_was_taken_on() -> None:
     assert done == list(range(20))
 
 
-def test_in_lockstep_the_asker_works_and_nobody_is_refused() -> None:
+def test_in_lockstep_the_asking_thread_works_and_no_question_is_refused() -> None:
     schedule = LockstepSchedule()
     desk = AdmissionControl(
         AdmissionSettings(1, in_time=0.1, first_guess=100.0), schedule.monotonic, schedule.executor(1)

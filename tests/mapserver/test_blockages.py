@@ -20,7 +20,7 @@ A, B, C = (NodeId("a", 1, number) for number in (1, 3, 5))
 ME = MapId("a", 1)
 
 
-def test_a_blockage_is_forgotten_after_it_was_said_last() -> None:
+def test_a_blockage_is_forgotten_after_its_last_report() -> None:
     blockages = Blockages(BlockageSettings(forget=100.0))
     blockages.report([(B, A)], 0.0)
     blockages.report([(A, B), (B, C)], 50.0)

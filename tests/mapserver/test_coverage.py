@@ -69,7 +69,7 @@ def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
     assert "14 of 14 views" in answer.reason
 
 
-def test_only_what_is_near_is_told_nearest_first(scene: Scene) -> None:
+def test_only_near_views_are_returned_nearest_first(scene: Scene) -> None:
     everything = Coverage(scene.merged).answer(A, (5.0, 0.0), 100.0).views
     away = np.hypot(everything[:, 0] - 5.0, everything[:, 1])
     assert (np.diff(away) >= 0).all()
@@ -78,7 +78,7 @@ def test_only_what_is_near_is_told_nearest_first(scene: Scene) -> None:
     assert np.array_equal(near, everything[away <= reach])
 
 
-def test_a_map_that_nothing_joins_is_told_nothing(scene: Scene) -> None:
+def test_the_agent_of_an_isolated_map_gets_no_poses(scene: Scene) -> None:
     for asking, reason in ((C, "no other map is joined to c"), (MapId("d", 1), "is not in the merged map")):
         answer = Coverage(scene.merged).answer(asking, (0.0, 0.0), 100.0)
         assert answer.views.shape == (0, 4)
@@ -86,7 +86,7 @@ def test_a_map_that_nothing_joins_is_told_nothing(scene: Scene) -> None:
     assert not Coverage(MergedMap.empty()).answer(A, (0.0, 0.0), 9.0).views.size
 
 
-def test_a_bent_map_is_told_by_its_nearest_node() -> None:
+def test_a_bent_map_is_aligned_at_its_nearest_node() -> None:
     """The own map drifted by a turn halfway, the merged map knows better: each view keeps to its side."""
     rng = np.random.default_rng(3)
     nodes, _ = take_map(room(0, 0, 5, 4, 300, rng), A, [Pose2(1.0 + k, 2.0) for k in range(3)], rng)
@@ -106,7 +106,7 @@ def test_a_bent_map_is_told_by_its_nearest_node() -> None:
     assert (x, y, heading) == pytest.approx((expected.x, expected.y, expected.heading))
 
 
-def test_no_more_is_told_than_a_message_holds(scene: Scene) -> None:
+def test_answers_fit_into_a_message(scene: Scene) -> None:
     views = np.zeros((MAX_KNOWN + 9, 4))
     views[:, 0] = np.arange(len(views))[::-1]
 

@@ -163,7 +163,7 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
         assert "there is no map z.1; known are: a.1, b.1" in reply.error
 
 
-def test_where_a_robot_did_not_get_through_is_known_when_somebody_asks_for_the_way(path: Path) -> None:
+def test_blocked_edges_are_used_in_route_explanations(path: Path) -> None:
     one, two = NodeId("a", 1, 1), NodeId("a", 1, 3)
     with serving(path) as asker:
 
@@ -180,9 +180,7 @@ def test_where_a_robot_did_not_get_through_is_known_when_somebody_asks_for_the_w
         assert [hop.b for hop in told.gaps] == [two] and sum(h.cost for h in told.hops) > free.hops[0].cost
 
 
-def test_what_is_undone_stays_undone_when_the_server_is_started_again(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_undone_links_stay_undone_after_a_restart(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     with serving(path) as asker:
         assert str(asker.status()["event"]).startswith("a.1 and b.1 are one map now, by ")
@@ -200,7 +198,7 @@ def test_what_is_undone_stays_undone_when_the_server_is_started_again(
         assert "apart already" in asker.rule((A, B)).error
         assert not asker.rule((A, B), apart=False).error
         assert asker.maps().joined and len(asker.maps().rulings) == 2
-        assert "nothing that people have ruled keeps" in asker.rule((A, B), apart=False).error
+        assert "no manual constraint keeps" in asker.rule((A, B), apart=False).error
     with serving(path) as asker:
         assert asker.maps().joined
 
@@ -251,7 +249,7 @@ def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
         assert 0.0 < edge.evidence["probability"] < 1.0
 
 
-def test_what_has_faded_is_in_the_file(path: Path) -> None:
+def test_faded_landmarks_are_in_the_file(path: Path) -> None:
     with serving(path) as asker:
         merged = merged_of(asker.merged())
     node = min(merged.poses)
@@ -267,7 +265,7 @@ def test_what_has_faded_is_in_the_file(path: Path) -> None:
         pack_map_file(replace(content, faded={NodeId("z", 1, 1): gone}))
 
 
-def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
+def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
     bus, merged = MemoryBus(MemoryHub()), MergedMap.empty()
     with serving(path) as asker:
         merged = merged_of(asker.merged())
@@ -292,7 +290,7 @@ def test_before_all_is_merged_it_is_said(stored: bytes, path: Path) -> None:
     bus.close()
 
 
-def test_witnesses_are_held_to_the_gate_of_the_merge(path: Path) -> None:
+def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
     with serving(path) as asker:
         pair = min(links(asker.merged()))
     strict = ServerSettings(merge=MergeSettings(ConsistencySettings(gate=1e-9)))
@@ -305,10 +303,10 @@ def test_witnesses_are_held_to_the_gate_of_the_merge(path: Path) -> None:
     bus.close()
 
 
-def test_a_ruling_that_cannot_be_read_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = Store(path)
     store.add_ruling(b"rubbish")
     RulingBook(store).add(ManualConstraint((MapId("r0", 1), MapId("r1", 1)), True, "anna", 5))
     assert [ruling.who for ruling in RulingBook(store).rulings.made] == ["anna"]
-    assert "a ruling cannot be read" in caplog.text
+    assert "a manual constraint cannot be read" in caplog.text
     store.close()

@@ -77,7 +77,7 @@ JOINED = (MapEventKind.JOINED, "a.1 and b.1 are one map now")
 PARTED = (MapEventKind.PARTED, "a.1 and b.1 are no longer one map")
 
 
-def test_each_thing_is_told_once_with_its_time(one: MergedMap, two: MergedMap) -> None:
+def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap) -> None:
     times = iter(range(10**18, 10**19, 10**9))
     chronicle = MapHistory(clock=lambda: next(times))
     for merged in (MergedMap.empty(), one, one, two, two, one):
@@ -88,9 +88,7 @@ def test_each_thing_is_told_once_with_its_time(one: MergedMap, two: MergedMap) -
     assert stamps == sorted(stamps) and stamps[0] >= 10**18
 
 
-def test_a_server_that_starts_again_tells_only_what_is_new(
-    store: Store, one: MergedMap, two: MergedMap
-) -> None:
+def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, two: MergedMap) -> None:
     MapHistory(store).follow(one)
     again = MapHistory(store)
     # It merges before it has read its store if people's rulings come first.
@@ -111,7 +109,7 @@ def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap) -> None:
     assert told(chronicle) == [PARTED, JOINED, PARTED, JOINED, PARTED] == told(MapHistory(store))
 
 
-def test_very_much_at_once_is_told_as_a_number(one: MergedMap) -> None:
+def test_many_events_at_once_are_summarised(one: MergedMap) -> None:
     many = {MapId(f"r{k}", 1): one.maps[A] for k in range(200)}
     nodes = frozenset(next(iter(one.maps[A].nodes))._replace(agent=name.agent) for name in many)
     chronicle = MapHistory()
@@ -120,7 +118,7 @@ def test_very_much_at_once_is_told_as_a_number(one: MergedMap) -> None:
     assert chronicle.newest == f"and {199 - MOST_AT_ONCE} more at once"
 
 
-def test_who_cannot_have_been_there_is_told_until_the_maps_are_one(
+def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
     store: Store, one: MergedMap, two: MergedMap
 ) -> None:
     clash = Collision("a", "b", "hall", 40, 0.1, 12.0, 99.0)
@@ -148,9 +146,7 @@ def test_who_cannot_have_been_there_is_told_until_the_maps_are_one(
     assert "same place at the same time" in again.newest
 
 
-def test_however_many_are_kept_apart_each_is_told_once(
-    one: MergedMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_refused_pair_is_listed_once(one: MergedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapweave.mapserver.map_history.MOST_APART", 3)
     (link, *_) = (link for link in one.links if {link.a.map, link.b.map} == {A, B})
     names = [MapId(f"r{k}", 1) for k in range(6)]
@@ -180,7 +176,7 @@ def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> N
     assert told(chronicle) == [JOINED]
 
 
-def test_a_damaged_record_is_begun_anew_and_says_so(store: Store, one: MergedMap) -> None:
+def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap) -> None:
     store.put_result("history", b"rubbish")
     chronicle = MapHistory(store)
     (failed,) = chronicle.happenings
@@ -210,7 +206,7 @@ def test_a_disk_that_does_not_take_it_ends_nothing(
     store.close()
 
 
-def test_rulings_stand_among_what_happened() -> None:
+def test_constraints_are_listed_in_the_history() -> None:
     happenings = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
     kinds = [one.kind for one in with_rulings(happenings, APART)]
     assert kinds == [MapEventKind.JOINED, MapEventKind.RULED, MapEventKind.JOINED]

@@ -51,7 +51,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_a_store_that_is_read_at_once_merges_like_its_changes_one_by_one(
+def test_a_store_read_at_once_merges_as_change_by_change(
     broken: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rng = np.random.default_rng(1)
@@ -133,7 +133,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
 def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     world, tour, changes = mapped_room(("a", "b"))
     view, _ = take_view(world, tour[1], np.random.default_rng(3))
-    go, real = threading.Event(), Merger.look_around
+    go, real = threading.Event(), Merger.search_pairs
 
     def held(merger: Merger, most: int | None = None) -> None:
         assert go.wait(20)
@@ -156,7 +156,7 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
     upkeep.close()
 
 
-def test_in_lockstep_all_that_has_come_is_merged_when_somebody_asks() -> None:
+def test_in_lockstep_all_changes_are_merged_before_an_answer() -> None:
     _, _, changes = mapped_room(("a",))
     index, schedule = PlaceIndex(), LockstepSchedule()
     upkeep = MergeWorker(schedule, 1.0, index=index)

@@ -99,7 +99,7 @@ def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch: pytest.Mon
     assert served.packs <= 2
 
 
-def test_a_map_that_cannot_be_packed_is_refused_and_the_next_one_is_not(
+def test_a_map_that_cannot_be_packed_is_refused_and_the_next_is_not(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as broken:

@@ -82,7 +82,7 @@ def zenoh() -> Iterator[ZenohFleet]:
     fleet.close()
 
 
-def test_a_jiggle_is_not_told_and_jiggles_add_up(memory: MemoryFleet) -> None:
+def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) -> None:
     told = Told(memory)
     (first,) = told.tell(graph(A))
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
@@ -95,7 +95,7 @@ def test_a_jiggle_is_not_told_and_jiggles_add_up(memory: MemoryFleet) -> None:
     assert turned.placed[A[2]].merged_from_node.vector == pytest.approx([2.12, 0, math.radians(1.1)])
 
 
-def test_only_those_that_moved_are_told_each_agent_of_its_own(memory: MemoryFleet) -> None:
+def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
     told = Told(memory)
     told.tell(graph(A), graph(B))
     one = graph(A)
@@ -109,7 +109,7 @@ def test_only_those_that_moved_are_told_each_agent_of_its_own(memory: MemoryFlee
     assert {place.frame for place in PoseNews.decode(reply.payload, "r1").placed.values()} == {A[0]}
 
 
-def test_nodes_that_are_gone_are_told(memory: MemoryFleet) -> None:
+def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
     told = Told(memory)
     told.tell(graph(A))
     (news,) = told.tell(graph(A[:-1]))
@@ -119,7 +119,7 @@ def test_nodes_that_are_gone_are_told(memory: MemoryFleet) -> None:
     assert set(whole.placed) == set(A[:-1]) and whole.after == 0 and whole.sequence == 2
 
 
-def test_much_is_told_in_pieces_and_seldom(memory: MemoryFleet) -> None:
+def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet) -> None:
     told = Told(memory, PoseBroadcastSettings(most=2, beat=math.inf))
     pieces = told.tell(graph(A))
     assert [len(news.placed) for news in pieces] == [2, 2, 1]
@@ -143,7 +143,7 @@ def at(poses: MergedPoses, node: NodeId, x: float) -> Callable[[], bool]:
     return there
 
 
-def test_what_is_lost_is_made_up_over_zenoh(zenoh: ZenohFleet) -> None:
+def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet) -> None:
     """A late agent, lost news, lost last news, a server that starts again, and one that knows less."""
     fast = PoseBroadcastSettings(every=0.0, beat=0.0)
     server = zenoh.join()
@@ -181,7 +181,7 @@ def test_what_is_lost_is_made_up_over_zenoh(zenoh: ZenohFleet) -> None:
     herald.close()
 
 
-def test_a_map_server_tells_what_it_has_merged(
+def test_a_map_server_reports_its_merged_map(
     zenoh: ZenohFleet, mapped_room: Callable[[], MappedRoom]
 ) -> None:
     """From the store on the disk to an agent in another session, twice: the server starts again."""

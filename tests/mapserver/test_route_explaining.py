@@ -77,7 +77,7 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
     )
 
 
-def test_what_only_ties_poses_is_named_with_what_it_lacks(router: Router) -> None:
+def test_edges_that_only_constrain_poses_are_named_with_what_they_lack(router: Router) -> None:
     start, goal = nodes_of(ME)[0], nodes_of(OTHER)[2]
     told = explain_route(router, start, goal)
     assert not told.found and not told.hops and told.apart is None
@@ -91,7 +91,7 @@ def test_what_only_ties_poses_is_named_with_what_it_lacks(router: Router) -> Non
     assert "there is no way" in words[0] and "what is missing" in words[1] and gap.words in words[2]
 
 
-def test_the_way_is_the_one_that_robots_are_given(router: Router) -> None:
+def test_the_explained_route_is_the_one_that_robots_get(router: Router) -> None:
     start, goal = nodes_of(ME)[0], nodes_of(ME)[2]
     told = explain_route(router, start, goal)
     legs = router.route(start, goal).legs
@@ -103,19 +103,19 @@ def test_the_way_is_the_one_that_robots_are_given(router: Router) -> None:
     assert f"cost {sum(hop.cost for hop in told.hops):.2f} m" in told.reason
 
 
-def test_what_is_blocked_is_told_whether_there_is_another_way_or_none(router: Router) -> None:
+def test_blocked_edges_are_explained_with_and_without_another_way(router: Router) -> None:
     one, two, three = nodes_of(ME)
     told = explain_route(router, one, three, blocked=[(two, one)])
     legs = router.route(one, three, blocked=[(two, one)]).legs
     assert told.found is bool(legs)
-    assert all("said to be blocked" in gap.words for gap in told.gaps)
+    assert all("reported as blocked" in gap.words for gap in told.gaps)
     whole = [(one, other) for other in router.merged.poses if other != one]
     told = explain_route(router, one, three, blocked=whole)
     assert not told.found and not router.route(one, three, blocked=whole).legs
-    assert "is blocked" in told.reason and "said to be blocked" in told.gaps[0].words
+    assert "is blocked" in told.reason and "reported as blocked" in told.gaps[0].words
 
 
-def test_where_a_robot_did_not_get_through_of_late_is_told(router: Router) -> None:
+def test_recently_blocked_edges_are_reported(router: Router) -> None:
     one, two, _ = nodes_of(ME)
     free, wary = explain_route(router, one, two), explain_route(router, one, two, wary=[(one, two)])
     if [hop.b for hop in wary.hops] == [two]:
@@ -126,7 +126,7 @@ def test_where_a_robot_did_not_get_through_of_late_is_told(router: Router) -> No
     assert wary.gaps, "the way that would be cheaper is told"
 
 
-def test_maps_that_are_not_one_are_explained_in_place_of_a_way(router: Router, sent: bool) -> None:
+def test_unconnected_maps_are_explained_instead_of_a_route(router: Router, sent: bool) -> None:
     told = explain_route(router, nodes_of(ME)[0], nodes_of(FAR)[0])
     if sent:
         told = decode_route_explanation(encode_route_explanation(told))
@@ -137,7 +137,7 @@ def test_maps_that_are_not_one_are_explained_in_place_of_a_way(router: Router, s
     assert route_values(told)["apart"]["second"] == "c.1"
 
 
-def test_pieces_of_one_map_are_no_maps_to_be_joined() -> None:
+def test_pieces_of_one_map_are_not_joined_as_maps() -> None:
     """A robot that was carried from room to room: nothing in its own map says where the second one is."""
     rng, merger = np.random.default_rng(3), Merger()
     for number, first in ((0, 1), (1, 101)):
@@ -165,14 +165,14 @@ def renumbered(body: NodePut | EdgePut, more: int) -> NodePut | EdgePut:
     return EdgePut(replace(edge, id=later(edge.id), a=later(edge.a), b=later(edge.b)))
 
 
-def test_a_retired_map_says_who_retired_it() -> None:
+def test_a_retired_map_is_explained_with_the_persons_name() -> None:
     merger = fleet()
     merger.rule(ManualConstraints([ManualConstraint((OTHER, OTHER), True, "anna", 10**18, "burnt down")]))
     told = explain_route(Router(merger.merged()), nodes_of(ME)[0], nodes_of(OTHER)[0])
     assert not told.found and "anna" in told.reason and "burnt down" in told.reason
 
 
-def test_what_never_was_is_refused_with_what_there_is(router: Router) -> None:
+def test_unknown_ids_are_refused_with_the_known_range(router: Router) -> None:
     with pytest.raises(InvalidValue, match=r"map a\.1 has no node 9; of its 3 nodes the nearest are 1, 3, 5"):
         explain_route(router, nodes_of(ME)[0], NodeId(*ME, 9))
     with pytest.raises(InvalidValue, match=r"there is no map z\.1"):

@@ -49,7 +49,7 @@ def test_a_robot_on_an_edge_goes_on_and_not_back_to_its_beginning(
     assert begin(row, x, 0.1, goal=0) in (0, 1), "and the other way round"
 
 
-def test_beside_the_edge_or_if_it_is_blocked_nothing_is_cheaper(row: tuple[Router, list[NodeId]]) -> None:
+def test_away_from_the_edge_or_with_it_blocked_nothing_is_cheaper(row: tuple[Router, list[NodeId]]) -> None:
     nodes = row[1]
     assert begin(row, 0.1, 0.4, goal=4) == 1
     assert begin(row, 0.2, 0.0, goal=4, blocked=[(nodes[2], nodes[1])]) != 2

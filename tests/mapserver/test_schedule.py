@@ -84,7 +84,7 @@ def test_periodic_jobs_do_not_wait_for_long_ones() -> None:
     assert len(beats) == count
 
 
-def test_in_lockstep_nothing_runs_until_somebody_asks_and_time_is_that_of_the_robots() -> None:
+def test_in_lockstep_work_runs_on_demand_in_simulated_time() -> None:
     schedule, done = LockstepSchedule(), list[str]()
     schedule.every(1.0, lambda: done.append("beat"))
     schedule.start()

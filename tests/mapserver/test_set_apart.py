@@ -332,7 +332,7 @@ def test_300_random_legal_contents_change_nothing_for_sound_robots(part: int, be
         beside.check(seed)
 
 
-def test_contents_that_show_what_others_show_end_nothing(beside: Beside) -> None:
+def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
     """They are linked with sound maps, and may move these; nothing fails by them, and nobody is unheard."""
     seen = [body.node for _, body in beside.sound if isinstance(body, NodePut)]
     linked = 0
@@ -393,7 +393,7 @@ def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
         upkeep.close()
 
 
-def test_of_the_puts_of_one_node_that_wait_the_last_counts() -> None:
+def test_the_last_waiting_write_of_a_node_counts() -> None:
     upkeep = MergeWorker(LiveSchedule(), 1.0)
     nodes = [replace(node(1), stamp_ns=k) for k in range(50)]
     for k, one in enumerate(nodes):

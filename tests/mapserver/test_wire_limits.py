@@ -43,7 +43,7 @@ def place(number: int, node_from_robot: PoseGaussian, merged_from_robot: PoseGau
         (Certainty.UNKNOWN, [], (Certainty.UNKNOWN, [])),
     ],
 )
-def test_what_cannot_be_said_is_left_out(
+def test_values_out_of_range_are_left_out(
     certainty: Certainty,
     places: list[tuple[PoseGaussian, PoseGaussian]],
     left: tuple[Certainty, list[int]],
@@ -71,7 +71,7 @@ def test_a_node_where_no_robot_can_be_is_no_second_place() -> None:
     encode_relocalize_answer(said(answer))
 
 
-def test_a_view_that_looks_nowhere_is_not_told_to_others() -> None:
+def test_a_view_without_a_heading_is_not_published() -> None:
     two, rng = Two(), np.random.default_rng(2)
     tour = [Pose2(1.5 + 0.7 * k, 2.0, 0.2 * k) for k in range(4)]
     nodes, edges = take_map(two.worlds[HERE], C, tour, rng)

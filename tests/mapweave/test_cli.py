@@ -42,7 +42,7 @@ def test_a_wrong_use_shows_how_to_use_it(arguments, capfd):
 
 
 @pytest.mark.parametrize("name", ["R0", "a b", "", "r0/1", "*", "ä", "x" * 33, "-x"])
-def test_names_that_cannot_stand_in_a_key(name, capfd, recording, nobody, tmp_path):
+def test_names_that_cannot_be_in_a_key(name, capfd, recording, nobody, tmp_path):
     said = complaint(capfd, "agent", "--", name)
     assert "use 1 to 32 of a-z" in said
     if name:
@@ -148,7 +148,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_a_process_that_fails_says_one_line_and_ends(tmp_path):
+def test_a_failing_process_prints_one_line_and_ends(tmp_path):
     done = run("map", "show", tmp_path / "nothing.mapweave")
     assert (done.returncode, done.stdout) == (1, "")
     assert (

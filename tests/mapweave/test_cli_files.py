@@ -37,7 +37,7 @@ def test_map_files(tmp_path, capfd):
 
 
 @pytest.mark.parametrize("pipe", [False, True])
-def test_what_has_no_end_is_not_read(tmp_path, capfd, pipe):
+def test_endless_input_is_not_read(tmp_path, capfd, pipe):
     path = tmp_path / "pipe" if pipe else Path("/dev/zero")
     if pipe:
         os.mkfifo(path)
@@ -89,7 +89,7 @@ def test_settings(tmp_path, capfd, recording):
 
 def test_recordings(tmp_path, capfd, recording):
     assert "no such folder" in complaint(capfd, "replay", tmp_path / "nothing")
-    assert "without it there is no robot 'a'" in complaint(capfd, "replay", recording, "--robot", "a")
+    assert "it must describe robot 'a'" in complaint(capfd, "replay", recording, "--robot", "a")
     (recording / "camera.toml").unlink()
     assert "camera's intrinsics" in complaint(capfd, "replay", recording)
 

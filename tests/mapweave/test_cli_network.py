@@ -49,7 +49,7 @@ def test_an_address_of_another_machine(capfd, tmp_path):
     assert "cannot listen at tcp/192.0.2.1:7447" in said
 
 
-def test_asking_where_nobody_is(capfd, recording, nobody):
+def test_asking_without_a_server(capfd, recording, nobody):
     picture = recording / "images" / "0.png"
     said = complaint(capfd, "relocalize", picture, "--connect", nobody, "--timeout", "0.3")
     assert f"no router at {nobody}: start `mapweave server`" in said
@@ -72,12 +72,12 @@ def test_asking_about_an_image(capfd, recording, tmp_path, nobody):
     assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)
     assert "not an image" in complaint(capfd, "relocalize", tmp_path, *camera, *rest)
     cv2.imwrite(str(lonely), np.zeros((10, 20), np.uint8))
-    assert f"{lonely}: 20x10 px, but {camera[1]} says 64x48" in complaint(
+    assert f"{lonely}: 20x10 px, but {camera[1]} gives 64x48" in complaint(
         capfd, "relocalize", lonely, *camera, *rest
     )
 
 
-def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_path):
+def test_an_agent_interrupted_before_its_base_answers_reports_it(nobody, tmp_path):
     command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", nobody, "--data", str(tmp_path)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         watchdog = threading.Timer(40, process.kill)
@@ -87,22 +87,22 @@ def test_an_agent_that_is_interrupted_before_it_has_a_body_says_so(nobody, tmp_p
         _, said = process.communicate()
         watchdog.cancel()
     *before, last = said.splitlines()
-    assert last.endswith("robot/r0/describe: stopped before its body has answered")
-    assert all("waits for its body" in line or "finds no router" in line for line in before)
+    assert last.endswith("robot/r0/describe: stopped before its base has answered")
+    assert all("waits for its robot" in line or "finds no router" in line for line in before)
     assert process.returncode == 1
 
 
 @pytest.mark.parametrize(
     ("command", "hints"),
     [
-        (["agent", "r0"], {"r0: waits for its body", "r0 finds no router: start `mapweave server`"}),
+        (["agent", "r0"], {"r0: waits for its robot", "r0 finds no router: start `mapweave server`"}),
         pytest.param(
             ["sim", "serve", "office"], {"the simulator finds no router: start `mapweave server`"},
             marks=needs_simulator,
         ),
     ],
 )  # fmt: skip
-def test_who_waits_says_what_for(command, hints, nobody, tmp_path):
+def test_waiting_is_reported_with_its_reason(command, hints, nobody, tmp_path):
     data = ["--data", str(tmp_path)] if command[0] == "agent" else []
     whole = [sys.executable, "-m", "mapweave", *command, "--connect", nobody, *data]
     with subprocess.Popen(whole, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.drawing.link_picture import draw_link
-from mapweave.explanation_text import MOST_WITNESSES, WIDTH, pair_words
+from mapweave.explanation_text import MOST_LINKS, WIDTH, pair_words
 from mapweave.hybridmap.explanation import PairExplanation, Witness
 from mapweave.hybridmap.node import NodeId
 from mapweave.merge.explanation.node_explanation import explain_nodes
@@ -24,7 +24,7 @@ def told() -> PairExplanation:
 
 
 @pytest.mark.parametrize(("agree", "against"), [(40, 3), (40, 40), (2, 40), (40, 0), (3, 4), (0, 0)])
-def test_links_that_contradict_are_told_however_many_agree(
+def test_contradicting_links_are_listed_among_many_that_agree(
     told: PairExplanation, agree: int, against: int
 ) -> None:
     distances = [*(0.1 + 0.1 * k for k in range(agree)), *(100.0 + k for k in range(against))]
@@ -32,14 +32,14 @@ def test_links_that_contradict_are_told_however_many_agree(
     witnesses = tuple(Witness(*nodes, d, d < 50.0, True) for d in distances)
     lines = pair_words(replace(told, witnesses=witnesses))
     counts = [sum(f": {word}, " in line for line in lines) for word in ("agrees", "contradicts")]
-    assert sum(counts) == min(agree + against, MOST_WITNESSES)
-    assert counts[1] >= min(against, MOST_WITNESSES // 2) and counts[0] >= min(agree, MOST_WITNESSES // 2)
-    assert ("--json tells all" in "\n".join(lines)) == (agree + against > MOST_WITNESSES)
+    assert sum(counts) == min(agree + against, MOST_LINKS)
+    assert counts[1] >= min(against, MOST_LINKS // 2) and counts[0] >= min(agree, MOST_LINKS // 2)
+    assert ("--json lists all" in "\n".join(lines)) == (agree + against > MOST_LINKS)
     nearest = [line for line in lines if "contradicts" in line][:1]
     assert not nearest or "10.0 standard deviations" in nearest[0]
 
 
-def test_every_number_of_the_evidence_stands_beside_its_name(told: PairExplanation) -> None:
+def test_every_number_of_the_evidence_is_next_to_its_name(told: PairExplanation) -> None:
     lines = pair_words(told)
     begin = next(k for k, line in enumerate(lines) if line.startswith("  evidence "))
     rest = [line for line in lines[begin:] if line.startswith(("  evidence ", " " * 16))]

@@ -116,7 +116,7 @@ def test_networkx_reads_the_graph(part: MapPart, tmp_path: Path) -> None:
         assert data["heading"] == pytest.approx(part.pose(NodeId.parse(node)).heading)
 
 
-def test_the_route_graph_is_what_nav2_demands(part: MapPart, tmp_path: Path) -> None:
+def test_the_route_graph_has_the_format_of_nav2(part: MapPart, tmp_path: Path) -> None:
     """By hand: points with ids and a frame; lines both ways between them; no id twice."""
     (path,) = FORMATS["geojson"](part, tmp_path / "map.geojson")
     graph = json.loads(path.read_text())
@@ -165,7 +165,7 @@ def test_nav2_is_led_as_robots_are(merged: MergedMap, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", list(FORMATS))
-def test_the_command_writes_and_says_what_is_left_out(
+def test_the_command_writes_and_prints_what_is_left_out(
     merged: MergedMap, form: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "m.mapweave"
@@ -256,11 +256,14 @@ LINE = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\n"
         ("VERTEX_SE2 0 0 zero 0\n", "line 1: a word is no number"),
         ("VERTEX_SE2 0 nan 0 0\n", "line 1: a number is not finite"),
         (LINE + "EDGE_SE2 0 1 0 0 0 1 2 0 1 0 1\n", "line 3: the information must be positive definite"),
-        (LINE + "EDGE_SE2 4 5 0 0 0 1 0 0 1 0 1\n", "no vertex and no way along edges says where 4 is"),
+        (
+            LINE + "EDGE_SE2 4 5 0 0 0 1 0 0 1 0 1\n",
+            "neither a vertex nor a chain of edges gives the pose of 4",
+        ),
         ("\x89PNG", "is none of"),
     ],
 )
-def test_what_is_no_planar_graph_is_said_with_its_line(text: str, words: str, tmp_path: Path) -> None:
+def test_non_planar_graphs_are_reported_with_the_line(text: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.g2o"
     path.write_text(text)
     with pytest.raises(InvalidFile, match=words):

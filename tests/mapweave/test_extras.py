@@ -43,7 +43,7 @@ CASES: list[tuple[str, str, str]] = [
     ("sim batch", "office --out {tmp}", TRIAL),
     ("sim serve", "office --connect {nobody}", SIM),
     ("server", "--listen {nobody} --data {tmp}", SERVER),
-    ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its body
+    ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its robot
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
     ("relocalize", "{recording}/images/0.png --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),
@@ -130,7 +130,7 @@ def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str,
             assert status == MISSING_EXTRA, what
 
 
-def test_each_extra_is_enough_for_what_asks_for_it(filled: dict[str, object]) -> None:
+def test_each_extra_is_enough_for_its_commands(filled: dict[str, object]) -> None:
     """With the server's libraries alone every command works that asks for no more."""
     lines = [f"{command} {arguments}".format(**filled) for command, arguments, words in CASES
              if words == SERVER and "map" in command and command != "map from-photos"]  # fmt: skip

@@ -179,7 +179,7 @@ def test_maps_of_a_journal_are_extracted_and_no_file_is_written_over(tmp_path, c
     assert not (tmp_path / "out" / "r0.1.mapweave").exists(), "all or nothing"
 
 
-def test_what_is_neither_journal_nor_store_or_is_in_use_is_named(tmp_path, capfd):
+def test_other_files_and_files_in_use_are_named(tmp_path, capfd):
     assert "no such file" in complaint(capfd, "map", "extract", tmp_path / "none")
     other = tmp_path / "other.txt"
     other.write_text("no database at all")
@@ -195,7 +195,7 @@ def test_what_is_neither_journal_nor_store_or_is_in_use_is_named(tmp_path, capfd
     assert "neither an agent's journal nor a server's store" in complaint(capfd, "map", "extract", empty)
 
 
-def test_what_a_store_can_still_read_is_extracted_and_the_rest_is_named(tmp_path, capfd):
+def test_readable_rows_of_a_store_are_extracted_and_the_rest_is_named(tmp_path, capfd):
     import sqlite3
 
     from mapweave.hybridmap.change import Change

@@ -76,7 +76,7 @@ def links(path: Path) -> list[tuple[NodeId, NodeId]]:
     return [link.pair for link in merged_of(read_map_file(path)).links if not link.within]
 
 
-def test_merging_says_what_is_one_and_what_is_not(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_merging_prints_joined_and_separate_maps(files: list[Path], said: Said, tmp_path: Path) -> None:
     out = said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave")
     assert "12 nodes, 3 maps, 2 components" in out and "r0.1 and r1.1 are one map now, by " in out
     assert "r0.1 and r2.1 are not one map: " in out
@@ -131,7 +131,7 @@ def test_a_route_is_explained(
     told = json.loads(said("map", "route", start, goal, "--json", "--map", files[3]))
     assert told["found"] and told["hops"][0]["a"] == str(start) and told["hops"][-1]["b"] == str(goal)
     out = said("map", "route", start, goal, "--map", files[3])
-    assert out.startswith(f"{start} to {goal}: the way leads so: {told['reason']}")
+    assert out.startswith(f"{start} to {goal}: the route is: {told['reason']}")
     assert len(out.splitlines()) == 1 + len(told["hops"])
     drawn = tmp_path / "pictures" / "way.png"
     out = said("map", "route", start, goal, "--map", files[3], "--draw", drawn)
@@ -141,7 +141,7 @@ def test_a_route_is_explained(
     assert image is not None and (np.abs(image.astype(int) - [0, 215, 255]).max(axis=2) < 8).sum() > 100
     barred = [word for one in links(files[3]) for word in ("--blocked", *map(str, one))]
     others = json.loads(said("map", "route", start, goal, *barred, "--json", "--map", files[3]))
-    assert others["gaps"] and "said to be blocked" in others["gaps"][0]["words"]
+    assert others["gaps"] and "reported as blocked" in others["gaps"][0]["words"]
     none = tmp_path / "none.png"
     assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3]), "--draw", str(none)]) == 2
     out, err = capfd.readouterr()
@@ -173,7 +173,7 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     out = said("map", "unmerge", "r1.1", "r0.1", "--undo", "--by", "bob", "--map", path)
     assert "are one map" in out and links(path) == links(files[3])
     out = said("map", "explain", "r0.1", "r1.1", "--map", path)
-    assert "anna ruled that they shall not" in out and "bob ruled that they may be linked again" in out
+    assert "anna decided that they shall not" in out and "bob decided that they may be linked again" in out
     lines = said("map", "history", "--map", path).splitlines()
     kinds = [line.split("UTC  ")[1][:10].strip() for line in lines]
     assert kinds == ["ruled", "parted", "ruled", "joined"]
@@ -205,7 +205,9 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     assert not links(path)
     said("map", "retire", "r1.1", "--undo", "--map", path)
     assert links(path) == links(files[3])
-    assert "ruled that it is in use again (map r1.1)" in said("map", "explain", "r0.1", "r1.1", "--map", path)
+    assert "decided that it is in use again (map r1.1)" in said(
+        "map", "explain", "r0.1", "r1.1", "--map", path
+    )
 
 
 @pytest.mark.parametrize(
@@ -232,11 +234,11 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
         (["retire", "r0.1.1"], "r0.1.1 is a node: give its map, r0.1"),
         (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1"),
         (["retire", "r0.1", "--undo"], "map r0.1 is not retired"),
-        (["unmerge", "r0.1", "r1.1", "--undo"], "nothing that people have ruled keeps r0.1 and r1.1 apart"),
+        (["unmerge", "r0.1", "r1.1", "--undo"], "no manual constraint keeps r0.1 and r1.1 apart"),
         (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line"),
     ],
 )
-def test_bad_input_is_one_line(
+def test_bad_input_is_reported_in_one_line(
     files: list[Path], capfd: pytest.CaptureFixture[str], arguments: list[str], words: str
 ) -> None:
     before = files[3].read_bytes()
@@ -272,11 +274,11 @@ def test_of_an_older_and_a_newer_file_the_newer_counts(
     less = replace(content, changes=tuple(body for body in content.changes if body is not nodes[0]))
     write_map_file(other, less)
     assert main(["map", "merge", str(files[0]), str(other), "-o", str(tmp_path / "none")]) == 1
-    assert "nobody can tell which is newer" in capfd.readouterr().err
+    assert "it cannot be decided which is newer" in capfd.readouterr().err
     assert not (tmp_path / "none").exists()
 
 
-def test_files_that_do_not_fit_are_one_line(
+def test_mismatched_files_are_reported_in_one_line(
     files: list[Path], capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     capfd.readouterr()
@@ -306,9 +308,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
         children.end("server")
 
 
-def test_a_running_server_explains_and_what_is_unmerged_stays_so_when_it_starts_again(
-    files: list[Path], said: Said, tmp_path: Path
-) -> None:
+def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
     store = Store(tmp_path / "s0.sqlite")
     for map_id, bodies in logs().items():
         entries = [

@@ -9,7 +9,7 @@ from mapweave.wire.bus import Reply, Request
 from mapweave.wire.memory import MemoryBus, MemoryHub
 
 
-def test_a_busy_server_is_asked_again_when_it_says() -> None:
+def test_a_busy_server_is_asked_again_at_its_time() -> None:
     hub = MemoryHub()
     server, person = MemoryBus(hub), MemoryBus(hub)
     asked: list[float] = []

@@ -62,7 +62,7 @@ def test_a_motion_is_found_again(motion, points):
     assert np.allclose(found.apply(estimated), motion.apply(estimated), atol=1e-6)
 
 
-def test_one_point_is_only_shifted_and_none_not_at_all():
+def test_one_point_is_shifted_and_none_is_unchanged():
     found = align(np.array([[1.0, 2.0]]), np.array([[4.0, 6.0]]))
     assert (found.x, found.y, found.heading) == (3.0, 4.0, 0.0)
     assert align(np.zeros((0, 2)), np.zeros((0, 2))) == Pose2()
@@ -75,7 +75,7 @@ def a_tour() -> dict[NodeId, Pose2]:
 
 
 @given(poses)
-def test_a_perfect_map_has_no_error_wherever_its_frame_is(frame):
+def test_a_perfect_map_has_no_error_in_any_frame(frame):
     truth = a_tour()
     score = score_map({n: (0, frame.inverse() @ p) for n, p in truth.items()}, [], truth)
     assert score.components == 1
@@ -173,7 +173,7 @@ def test_a_line_meets_a_box_if_one_of_its_points_lies_in_it(box, start, end):
         assert not met
 
 
-def test_lines_along_and_beside_a_wall():
+def test_lines_along_and_next_to_a_wall():
     wall = Rectangle.spanning(0, 0, 4, 0.2)
     starts = np.array([[-1, 0.1], [-1, 0.3], [1, 0.1], [2, -1], [5, -1], [2.0, 0.1]])
     ends = np.array([[5, 0.1], [5, 0.3], [2, 0.1], [2, 1], [5, 1], [2.0, 0.1]])
@@ -182,7 +182,7 @@ def test_lines_along_and_beside_a_wall():
     assert crossed(starts[:0], ends[:0], [wall]).shape == (0,)
 
 
-def test_the_same_place_is_near_looks_the_same_way_and_is_not_behind_a_wall():
+def test_the_same_place_is_near_with_a_similar_heading_and_no_wall_between():
     here = np.array([[0.0, 0.0, math.radians(170)]])
     there = np.array(
         [
@@ -224,7 +224,7 @@ def recall_by_hand(links, truth, walls):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_recall_is_what_its_definition_says(seed):
+def test_recall_agrees_with_its_definition(seed):
     rng = np.random.default_rng(seed)
     truth = {
         node(k, agent): Pose2(*rng.uniform(0, 5, 2), rng.uniform(-0.9, 0.9))

@@ -93,7 +93,7 @@ def test_two_robots_of_one_walk_become_one_map(
     assert sum(row["kept"] == "yes" for row in rows) == report["links"]
 
 
-def test_who_cannot_find_itself_begins_another_map(recording: Path, tmp_path: Path) -> None:
+def test_a_robot_that_cannot_localize_begins_another_map(recording: Path, tmp_path: Path) -> None:
     """After 60 images it stands in a world upside down, which it then drives through."""
     folder = tmp_path / "carried off"
     (folder / "images").mkdir(parents=True)
@@ -141,7 +141,7 @@ def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
     [
         (lambda folder: shutil.rmtree(folder), (), "no such folder"),
         (lambda folder: (folder / "splits.toml").unlink(), (), "give --robots"),
-        (lambda folder: (folder / "odometry.csv").unlink(), (), "without odometry nothing tells"),
+        (lambda folder: (folder / "odometry.csv").unlink(), (), "without odometry the map has no scale"),
         (lambda folder: (folder / "camera.toml").unlink(), (), "it must give the camera's intrinsics"),
         (lambda folder: shutil.rmtree(folder / "images"), ("--robots", "2"), "no images"),
         (lambda folder: (folder / "splits.toml").write_text("robot = 5"), (), "write a [[robot]] table"),
@@ -160,7 +160,7 @@ def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
         (lambda folder: None, ("--robots", "20"), "too few"),
     ],
 )  # fmt: skip
-def test_a_recording_that_cannot_be_used_is_one_line(
+def test_an_unusable_recording_is_reported_in_one_line(
     recording: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

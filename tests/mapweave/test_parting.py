@@ -107,7 +107,7 @@ def fleet(tmp_path: Path) -> Iterator[tuple[Children, list[str], list[Robot], in
         yield children, serve, told, http
 
 
-def test_a_merge_that_loses_its_support_is_undone_and_says_so(
+def test_a_merge_that_loses_its_support_is_undone_and_reported(
     fleet: tuple[Children, list[str], list[Robot], int], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     children, serve, robots, http = fleet
@@ -137,7 +137,7 @@ def test_a_merge_that_loses_its_support_is_undone_and_says_so(
     assert str(status()["event"]).startswith("r0.1 and r1.1 are one map now, by ")
     eventually(lambda: all(robot.frames() == {NodeId(*R0, 1)} for robot in robots))
     assert said("explain", R0, R1).startswith("r0.1 and r1.1 are one map: ")
-    assert "the way leads so" in said("route", "r0.1.1", "r1.1.1")
+    assert "the route is" in said("route", "r0.1.1", "r1.1.1")
 
     for robot in robots:
         robot.maps(slice(FIRST, ALL))

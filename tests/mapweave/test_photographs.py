@@ -43,7 +43,7 @@ def stretch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Pose2]
     return folder, [one.world_from_camera for one in taken]
 
 
-def test_nodes_stand_where_the_photographs_were_taken_up_to_scale(stretch) -> None:
+def test_nodes_are_where_the_photographs_were_taken_up_to_scale(stretch) -> None:
     folder, truth = stretch
     images = [folder / f"{number}.png" for number in range(COUNT)]
     changes = map_of_photographs(images, PHONE.intrinsics, PHONE.distortion, SPACING, MapId("hall", 1))
@@ -83,7 +83,7 @@ def test_the_command_writes_a_map_file(stretch, tmp_path: Path, capfd) -> None:
     assert not list(tmp_path.glob("*.sqlite"))
 
 
-def test_what_is_no_stretch_is_one_line(stretch, tmp_path: Path, capfd) -> None:
+def test_an_invalid_stretch_is_reported_in_one_line(stretch, tmp_path: Path, capfd) -> None:
     folder, _ = stretch
     out = tmp_path / "hall.mapweave"
 

@@ -117,7 +117,7 @@ def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Pat
     assert told is not None and float(told[1]) == pytest.approx(MOVED.x, abs=0.03)
 
 
-def test_what_is_not_known_is_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
+def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
     drawn = tmp_path / "matches.png"
     assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == 2
@@ -146,7 +146,7 @@ def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypat
     assert "the map server refused: busy, retry after 60.0 s" in capfd.readouterr().err
 
 
-def test_what_agrees_is_what_the_pose_explains(node: Node) -> None:
+def test_matches_that_agree_are_explained_by_the_pose(node: Node) -> None:
     """By hand, match by match; a pose that is wrong explains next to nothing."""
     view = view_of(picture(MOVED))
     overlay = Overlay.of(node, view, MOVED)
@@ -161,7 +161,7 @@ def test_what_agrees_is_what_the_pose_explains(node: Node) -> None:
     assert wrong.agreeing.sum() < 0.1 * len(wrong.pairs)
 
 
-def test_wide_images_stand_above_each_other(node: Node, tmp_path: Path) -> None:
+def test_wide_images_are_stacked(node: Node, tmp_path: Path) -> None:
     view = view_of(picture(MOVED))
     wide = Camera(640, 240, 277.0, 277.0, 319.5, 119.5, mount_height=0.3)
     moved = View(view.pixels + np.array([160, 0], np.float32), view.codes, wide)

@@ -38,7 +38,7 @@ def test_without_a_file_all_is_default(tmp_path):
     assert load_settings(None) == Settings() == load(tmp_path, "")
 
 
-def test_what_is_given_lies_over_the_defaults(tmp_path):
+def test_given_values_replace_the_defaults(tmp_path):
     given_settings = load(
         tmp_path,
         """
@@ -124,7 +124,7 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[pipeline]\nseed = 1979-05-27", "is no int"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(tmp_path, text, said):
+def test_errors_are_reported_in_one_line(tmp_path, text, said):
     assert said in refused(tmp_path, text)
 
 
@@ -151,14 +151,14 @@ def test_the_merge_too_can_be_written_down_and_chosen(tmp_path):
         ("[merge.consistency]\nleast_links = 1.5", "merge: consistency: least_links: 1.5 is no int"),
     ],
 )
-def test_what_is_wrong_with_the_merge_is_said_in_one_line(tmp_path, text, said):
+def test_errors_of_the_merge_are_reported_in_one_line(tmp_path, text, said):
     with pytest.raises(SettingsError) as error:
         merging(tmp_path, text)
     assert said in str(error.value) and "\n" not in str(error.value)
     assert str(error.value).startswith(str(tmp_path / "robot.toml"))
 
 
-def test_a_robot_reads_the_file_without_what_a_merge_needs():
+def test_a_robot_reads_the_file_without_the_merges_libraries():
     """gtsam, faiss and scipy are the server's; a robot may not have them."""
     code = (
         "import sys; from mapweave.settings import load_settings; load_settings(None); "
@@ -187,7 +187,7 @@ class Strict:
             raise ValueError(f"share {self.share} is not in 0..1")
 
 
-def test_what_a_part_refuses_is_said_with_its_place():
+def test_errors_of_a_part_name_its_place():
     assert build(Strict, {"share": 1, "name": "x"}, "here") == Strict(1.0, "x")
     with pytest.raises(SettingsError, match=r"^here: share 2\.0 is not in 0\.\.1$"):
         build(Strict, {"share": 2}, "here")

@@ -90,7 +90,7 @@ def test_points_lie_where_their_features_are_seen() -> None:
     assert ((found.features >= 0).sum(axis=0) >= 1).all()
 
 
-def test_what_is_no_walk_is_refused() -> None:
+def test_invalid_walks_are_refused() -> None:
     walk, other = Walk(1), Walk(2)
     with pytest.raises(InvalidValue, match="two photographs"):
         reconstruct(walk.views[:1], 0.6)

@@ -75,7 +75,7 @@ def check(merged: MergedMap, anew: MergedMap) -> None:
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(60, 0.0), (61, 0.3), (62, 0.5)])
-def test_days_that_stand_are_what_deciding_everything_gives(seed: int, false_share: float) -> None:
+def test_standing_decisions_agree_with_deciding_everything(seed: int, false_share: float) -> None:
     """Batch merges of all days are the second opinion.
 
     In 24 of 25 such lives every merge had the same links. In the other a drive had been joined, rightly, that
@@ -87,7 +87,7 @@ def test_days_that_stand_are_what_deciding_everything_gives(seed: int, false_sha
         check(daily.live(1), daily.anew())
 
 
-def test_people_rule_on_days_that_stand() -> None:
+def test_constraints_apply_to_standing_decisions() -> None:
     daily = Daily(5)
     merged = daily.live(6)
     pair = merged.links[len(merged.links) // 2].pair
@@ -105,7 +105,7 @@ def test_people_rule_on_days_that_stand() -> None:
     check(merged, daily.anew())
 
 
-def test_maps_and_nodes_of_days_that_stand_are_retired() -> None:
+def test_maps_and_nodes_of_earlier_days_are_retired() -> None:
     daily = Daily(6)
     daily.live(6)
     daily.rulings = ManualConstraints([ManualConstraint((MapId("r0", 2), MapId("r0", 2)), True, "anna", 1)])
@@ -125,7 +125,7 @@ def test_maps_and_nodes_of_days_that_stand_are_retired() -> None:
 
 
 @pytest.mark.parametrize("seed", [9, 11])
-def test_a_false_join_of_days_that_stand_falls_when_others_contradict_it(seed: int) -> None:
+def test_a_false_join_is_undone_when_later_maps_contradict_it(seed: int) -> None:
     """The second drive is joined to the wrong place by links that agree; nothing contradicts them then."""
     daily, rng = Daily(seed), np.random.default_rng(seed)
     first, second = daily.drive(), daily.drive()

@@ -55,7 +55,7 @@ def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> Non
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(40, 0.0), (41, 0.3), (42, 0.5)])
-def test_what_is_decided_together_is_the_merge_made_anew(
+def test_joint_decisions_agree_with_a_fresh_merge(
     seed: int, false_share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However it began: once too much has changed, nothing of what stood has a say."""
@@ -70,9 +70,7 @@ def test_what_is_decided_together_is_the_merge_made_anew(
 
 
 @pytest.mark.parametrize("seed", [43, 44, 45])
-def test_decisions_that_stand_are_those_of_the_merge_made_anew(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is ever decided again here, and few nodes are moved at a time."""
     monkeypatch.setattr(islands_module, "CHANGED", math.inf)
     monkeypatch.setattr(component_solver, "WHOLE", 0)
@@ -91,9 +89,7 @@ def test_decisions_that_stand_are_those_of_the_merge_made_anew(
 
 
 @pytest.mark.parametrize(("seed", "false_share"), [(46, 0.0), (47, 0.3), (48, 0.3)])
-def test_whatever_happens_decisions_stand_or_fall_as_in_a_merge_made_anew(
-    seed: int, false_share: float
-) -> None:
+def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int, false_share: float) -> None:
     """Nodes, links, rulings and retired maps come and go."""
     life, islands = Life(seed, false_share), Islands(exact=0)
     apart = links = 0
@@ -145,7 +141,7 @@ def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.Mon
     assert found[0] == found[1]
 
 
-def test_what_nothing_touches_is_kept() -> None:
+def test_untouched_components_are_kept() -> None:
     life, islands = Life(7, 0.0), Islands(MergeSettings())
     for _ in range(60):
         life.step()

@@ -69,7 +69,7 @@ def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) 
     assert not merger.merged().joined(A, B)
 
 
-def test_who_parts_two_maps_that_a_third_joins_is_told_how(merger: Merger) -> None:
+def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> None:
     rng = np.random.default_rng(3)
     world = room(0, 0, 5, 4, 700, rng)
     third = MapId("c", 1)

@@ -147,7 +147,7 @@ def test_a_room_that_is_just_like_another_is_not_taken_for_it() -> None:
         assert refused, "the alike rooms must have looked alike"
 
 
-def test_a_room_that_fits_two_others_alike_is_joined_to_neither() -> None:
+def test_a_room_that_fits_two_others_equally_is_joined_to_neither() -> None:
     """One robot saw two alike rooms, the other one of them: both stories have the same support."""
     rng = np.random.default_rng(7)
     left = room(0, 0, 5, 4, 600, rng)

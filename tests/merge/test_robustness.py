@@ -74,7 +74,7 @@ def test_half_of_the_links_may_be_false() -> None:
         assert np.median(ratios[name]) < 1.1 and np.median(precisions[name]) == 1.0
 
 
-def test_links_that_are_too_few_between_two_maps_join_what_others_join() -> None:
+def test_too_few_links_between_two_maps_confirm_a_join_by_others() -> None:
     """One link from c to a and one to b: neither is enough alone, together and through a-b they are."""
     rng = np.random.default_rng(5)
     fleet = draw_fleet(0.0, rng, FleetSettings(robots=3, nodes=30, side=6.0, true_links=60))

@@ -57,7 +57,7 @@ def test_a_small_flat_thing_seen_from_aside_is_ambiguous(seed):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("depth", [0.0, 1.5])
-def test_what_is_wide_or_deep_is_not(seed, depth):
+def test_wide_or_deep_arrays_are_refused(seed, depth):
     """And the pose found is the right one, whichever of the two the search came upon first."""
     rng = np.random.default_rng(seed)
     points = poster(rng, 0.4 if depth else 2.6, depth)
@@ -69,7 +69,7 @@ def test_what_is_wide_or_deep_is_not(seed, depth):
     assert fix.node_from_robot.mean.distance(true) < 0.15
 
 
-def test_who_looks_straight_at_a_wall_has_no_rival():
+def test_a_frontal_view_of_a_wall_has_no_ambiguity():
     rng = np.random.default_rng(1)
     points = poster(rng, 2.0, 0.0)
     pixels = CAMERA.project(points) + rng.normal(0.0, 0.5, (60, 2))

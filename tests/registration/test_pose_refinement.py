@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged
 from mapweave.registration.planar_pose import PlanarPoseSettings
-from mapweave.registration.pose_refinement import look_closer
+from mapweave.registration.pose_refinement import refine_pose
 from mapweave.registration.recognition import recognise
 from synthetic.world import Sensing, room, take_node, take_view
 
@@ -32,7 +32,7 @@ def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, 
         found = recognise(node, view, None, rng)
         if found is None:
             continue
-        best, true = look_closer(node, view, found, PlanarPoseSettings()), a.inverse() @ b
+        best, true = refine_pose(node, view, found, PlanarPoseSettings()), a.inverse() @ b
         first.append(found.node_from_robot.mean.distance(true))
         closer.append(best.mean.distance(true))
         squared.append(best.mahalanobis2(true))
@@ -40,14 +40,14 @@ def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, 
     return np.array(first), np.array(closer), np.array(squared)
 
 
-def test_sharp_pixels_tell_more_and_the_covariance_knows() -> None:
+def test_sharp_pixels_give_a_smaller_covariance() -> None:
     first, closer, squared = looks(0.12)
     assert np.median(closer) < 0.9 * np.median(first)
     assert np.median(closer) < 0.003
     assert 0.5 < np.mean(squared) < 4.5, "3 is expected"
 
 
-def test_blunt_pixels_are_taken_for_what_they_are() -> None:
+def test_the_noise_of_blurred_pixels_is_estimated() -> None:
     first, closer, squared = looks(1.0)
     assert np.median(closer) < 1.15 * np.median(first)
     assert np.mean(squared) < 4.5

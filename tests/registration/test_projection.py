@@ -158,7 +158,7 @@ def test_linearised_against_finite_differences(seed: int, n: int) -> None:
         np.testing.assert_allclose(normal_equations(linear)[1:], information, rtol=1e-3, atol=1e-3 * scale)
 
 
-def test_what_does_not_determine_a_pose() -> None:
+def test_degenerate_points_determine_no_pose() -> None:
     assert determined(np.diag([1.0, 1.0, 1e-6]))
     assert not determined(np.diag([1.0, 1.0, 1e-12]))
     assert not determined(np.zeros((3, 3)))

@@ -71,7 +71,7 @@ def test_twins_come_last() -> None:
     assert (distinctness(some, 0.5)[30:] == 0).all()
 
 
-def test_what_is_kept_first_lies_all_over_the_image() -> None:
+def test_the_first_selected_landmarks_cover_the_image() -> None:
     """Nine tenths of the candidates are in one corner."""
     some = candidates(150, 3)
     some.pixels[:135] *= 0.2
@@ -80,7 +80,7 @@ def test_what_is_kept_first_lies_all_over_the_image() -> None:
     assert (kept >= 135).sum() >= 12
 
 
-def test_what_was_seen_again_and_strong_comes_before_what_was_not() -> None:
+def test_tracked_and_strong_landmarks_come_first() -> None:
     seen, rank = np.array([1.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.9])
     likely = worth(seen, rank)
     assert likely[0] > likely[2] > likely[1] > 0

@@ -22,7 +22,7 @@ from mapweave.sim.worlds.catalog import KINDS, make_world
 NOBODY = np.zeros((0, 2))
 
 
-def test_somebody_goes_to_and_fro_at_its_speed() -> None:
+def test_a_person_walks_to_and_fro_at_its_speed() -> None:
     """Along both legs and back, never faster, looking where it goes."""
     actor = Actor("person", ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5)), 0.5, 100, NOBODY, 0.16)
     poses = [actor.pose]
@@ -39,7 +39,7 @@ def test_somebody_goes_to_and_fro_at_its_speed() -> None:
     assert math.cos(back) == pytest.approx(-1.0)
 
 
-def test_somebody_waits_for_a_robot_then_turns_back() -> None:
+def test_a_person_waits_for_a_robot_then_turns_back() -> None:
     """Never nearer than 0.5 m to what is ahead."""
     robot = np.array([[1.5, 0.1]])
     actor = Actor("person", ((0.0, 0.0), (3.0, 0.0)), 1.0, 1000, robot, 0.16)

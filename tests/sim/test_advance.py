@@ -64,7 +64,7 @@ def table(bare):
     made.end()
 
 
-def test_time_stands_still_until_it_is_asked_for_and_after(table):
+def test_time_passes_only_on_request(table):
     table.drive("r0")
     table.drive("r1", 0.01)
     time.sleep(0.15)
@@ -80,7 +80,7 @@ def test_time_stands_still_until_it_is_asked_for_and_after(table):
     assert table.control.advance(9, 30.0)
 
 
-def test_whoever_loses_patience_may_ask_again(table):
+def test_a_client_may_ask_again_after_a_timeout(table):
     table.drive("r0")
     table.drive("r1", 0.05)
     assert not table.control.advance(8, 0.01)
@@ -104,7 +104,7 @@ def test_without_any_driver_time_passes_all_the_same(table):
     )
 
 
-def test_who_meets_the_others_goes_on_when_they_have_finished_and_no_time_has_passed(table):
+def test_a_rendezvous_waits_for_the_others_without_time_passing(table):
     table.meet = {("r0", 2), ("r0", 4), ("r1", 4)}
     table.drive("r0")
     table.drive("r1", 0.03)

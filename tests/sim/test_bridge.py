@@ -67,7 +67,7 @@ def test_the_first_observation_comes_after_one_tick_in_which_nothing_moves(stage
     assert (second.image == 2).all()
 
 
-def test_a_command_beyond_the_limits_is_clipped_by_the_body_too(stage: Stage) -> None:
+def test_a_command_beyond_the_limits_is_clipped_by_the_base_too(stage: Stage) -> None:
     simulation = FakeSimulation(robots=("r0",))
     stage.start(simulation)
     stage.join().ask(KEYS.robot_step("r0"), encode_step(StepRequest(1, Command(50.0, -50.0))), 5.0)
@@ -124,7 +124,7 @@ def test_a_silent_agent_blocks_the_others_only_for_the_patience(
 
 
 @pytest.mark.parametrize("end", ["close", "cut"])
-def test_a_dead_agent_blocks_nobody(stage: Stage, end: str) -> None:
+def test_a_dead_agent_blocks_no_other(stage: Stage, end: str) -> None:
     simulation = FakeSimulation()
     stage.start(simulation, patience=60.0)
     bus = stage.join()
@@ -182,7 +182,7 @@ def drive_real(pace: float) -> list[object]:
         return [*seen, simulation.truth("r0"), simulation.truth("r1")]
 
 
-def test_the_real_simulation_repeats_itself_over_the_bus_whatever_the_agents_speed() -> None:
+def test_the_simulation_repeats_over_the_bus_at_any_speed_of_the_agents() -> None:
     first, second = drive_real(0.0), drive_real(0.02)
     assert len(first) == 22
     assert first == second

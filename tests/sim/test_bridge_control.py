@@ -14,7 +14,7 @@ from tests.sim.stage import KEYS, PLAN, TICK_NS, Driver, FakeSimulation, Stage
 from tests.waiting import eventually
 
 
-def test_control_is_answered_while_nobody_drives(stage: Stage) -> None:
+def test_control_is_answered_without_a_driver(stage: Stage) -> None:
     simulation = FakeSimulation()
     control = stage.start(simulation)
     status = control.status()
@@ -53,7 +53,7 @@ def test_truth_of_the_past(stage: Stage) -> None:
     assert reply.error.startswith("control: ")
 
 
-def test_a_kidnapped_robot_is_elsewhere_in_the_next_tick_and_its_wheels_know_nothing(stage: Stage) -> None:
+def test_a_kidnapped_robot_is_elsewhere_in_the_next_tick_without_odometry(stage: Stage) -> None:
     simulation = FakeSimulation(robots=("r0",))
     control = stage.start(simulation)
     robot = stage.robot("r0")
@@ -65,7 +65,7 @@ def test_a_kidnapped_robot_is_elsewhere_in_the_next_tick_and_its_wheels_know_not
     assert simulation.truth("r0") == Pose2(2.0, 2.0, 0.0)
 
 
-def test_stop_ends_the_run_and_tells_every_agent(stage: Stage) -> None:
+def test_stop_ends_the_run_and_notifies_every_agent(stage: Stage) -> None:
     simulation = FakeSimulation()
     control = stage.start(simulation, farewell=2.0)
     waiting = Driver(stage.robot("r0"), 10**6, lambda _: 0.0)
@@ -82,11 +82,11 @@ def test_stop_ends_the_run_and_tells_every_agent(stage: Stage) -> None:
         driver.join(30.0)
         assert driver.ended
     assert simulation.tick == 5
-    with pytest.raises(NotConnected, match=r"sim/ground_truth_client: nobody answers; .*mapweave sim"):
+    with pytest.raises(NotConnected, match=r"sim/ground_truth_client: no answer; .*mapweave sim"):
         SimControl(stage.join(), "test", timeout=0.5).status()
 
 
-def test_who_asks_between_end_and_close_is_refused(stage: Stage) -> None:
+def test_questions_between_end_and_close_are_refused(stage: Stage) -> None:
     stage.start(FakeSimulation())
     stage.stop.set()
     assert stage.thread is not None

@@ -60,7 +60,7 @@ def still(setup: CameraSetup, scene: Scene, stand, **changes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["wide", "phone", "cheap"])
-def test_corners_are_seen_where_the_lens_model_says(name: str, stand) -> None:
+def test_corners_agree_with_the_lens_model(name: str, stand) -> None:
     """Found as saddle points in the picture: against cv2.projectPoints, and the agent's lens undoes it."""
     exposure = replace(CAMERAS[name].exposure, gain_error=0.0, vignetting=0.0)
     setup = replace(CAMERAS[name], **SILENT, exposure=exposure)
@@ -187,7 +187,7 @@ def test_corners_get_less_light(stand) -> None:
 
 @pytest.mark.parametrize("turn_rate", [0.8, -0.5])
 @pytest.mark.parametrize("name", ["webcam", "wide"])
-def test_blur_is_the_mean_of_what_was_seen(name: str, turn_rate: float, stand) -> None:
+def test_blur_is_the_mean_image(name: str, turn_rate: float, stand) -> None:
     """Against the mean of 41 sharp pictures taken on the way."""
     sharp = replace(CAMERAS[name], **SILENT, exposure=Exposure(automatic=False))
     slow = replace(sharp, exposure=Exposure(automatic=False, seconds=0.03))

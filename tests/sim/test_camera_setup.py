@@ -14,7 +14,7 @@ from mapweave.sim.camera import CAMERAS
 from mapweave.sim.robots import RobotSetup, robot_from_table, robot_setups
 
 
-def test_a_camera_is_a_name_or_what_differs_from_one() -> None:
+def test_a_camera_is_a_name_or_a_variation_of_a_named_camera() -> None:
     """The rest stays as it is in the camera that is named."""
     assert robot_from_table({"name": "a", "camera": "wide"}).camera == CAMERAS["wide"]
     assert robot_from_table({"name": "a"}).camera == CAMERAS["webcam"]
@@ -61,7 +61,7 @@ def test_a_robot_describes_what_was_ordered() -> None:
         ({"name": "a", "start": [1, 2]}, "start: must be a list of 3"),
     ],
 )
-def test_wrong_tables_say_why(table: dict[str, object], says: str) -> None:
+def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str) -> None:
     """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:
         robot_from_table(table)

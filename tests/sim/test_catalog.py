@@ -26,7 +26,9 @@ from mapweave.sim.worlds.catalog import KINDS, make_world, parameter_names, worl
         ("arena", {"length": -3.0}, "use 2 to 60"),
     ],
 )
-def test_wrong_parameters_are_one_line(kind: str, parameters: dict[str, object], says: str) -> None:
+def test_wrong_parameters_are_reported_in_one_line(
+    kind: str, parameters: dict[str, object], says: str
+) -> None:
     """Which parameter, and what it may be."""
     with pytest.raises(MapweaveError, match=says) as caught:
         make_world(kind, 1, **parameters)

@@ -57,7 +57,7 @@ def test_tables_become_events() -> None:
         ({"do": "fail", "robot": "r0", "sensor": "rangers", "how": "spike", "amount": 3}, "amount is 3"),
     ],
 )
-def test_wrong_tables_say_why(table: dict[str, object], says: str) -> None:
+def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str) -> None:
     """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:
         parse_event(table)
@@ -109,7 +109,7 @@ def test_unknown_robots_rooms_and_places_are_refused(office: World) -> None:
         assert simulation.snapshot().actors == ()
 
 
-def test_kidnapped_robots_stand_free_and_apart(office: World) -> None:
+def test_kidnapped_robots_are_put_on_free_floor_away_from_others(office: World) -> None:
     """Wherever they are sent, also where another robot stands already."""
     with Simulation(office, ["r0", "r1"], 2) as simulation:
         room = office.plan.room("room 2")
@@ -203,7 +203,7 @@ def run(seed: int, office: World, threads: int) -> str:
     return digest.hexdigest()
 
 
-def test_events_are_repeatable_and_robots_may_look_at_the_same_time(office: World) -> None:
+def test_events_are_repeatable_and_images_may_be_concurrent(office: World) -> None:
     """The same bits from one thread and from three; others for another seed."""
     first = run(5, office, 1)
     assert run(5, office, 3) == first

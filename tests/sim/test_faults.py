@@ -119,7 +119,7 @@ def test_bumpers_stick_and_die(walled: World) -> None:
         assert any(simulation.step({"r0": Command(0.3)})["r0"].bumped for _ in range(10))
 
 
-def test_what_is_said_of_a_fault() -> None:
+def test_faults_are_described() -> None:
     """One line that names robot, sensor and way."""
     assert describe(Fail("r0", "camera", "drop", 3.0)) == "the camera of r0 fails (drop) for 3 s"
     assert describe(Fail("r0", "encoders", "spike")) == "the encoders of r0 jump by 0.3 m"

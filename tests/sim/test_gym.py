@@ -84,7 +84,7 @@ def test_parking_succeeds_and_pays() -> None:
     env.close()
 
 
-def test_goal_is_told_in_the_frame_of_the_start() -> None:
+def test_the_goal_is_given_in_the_frame_of_the_start() -> None:
     """So that a robot that knows where it started knows where to go."""
     env = MapweaveEnv()
     seen, info = env.reset(seed=4)
@@ -98,7 +98,7 @@ def test_goal_is_told_in_the_frame_of_the_start() -> None:
         env.step(np.zeros(2, np.float32))
 
 
-def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_gymnasium_one_line_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     """Importing fails with a hint."""
     real = builtins.__import__
 

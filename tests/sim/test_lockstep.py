@@ -68,7 +68,7 @@ def test_time_begins_when_all_expected_have_asked() -> None:
     assert late.answers
 
 
-def test_those_who_never_come_are_given_up(caplog: pytest.LogCaptureFixture) -> None:
+def test_absent_robots_are_given_up(caplog: pytest.LogCaptureFixture) -> None:
     table = Table(["a", "b"])
     table.ask("a", 1, now=5.0)
     assert table.due(24.9) == []
@@ -77,7 +77,7 @@ def test_those_who_never_come_are_given_up(caplog: pytest.LogCaptureFixture) -> 
     assert warned == ["robot b has not asked for 20 s: time begins without it"]
 
 
-def test_those_who_wait_for_the_beginning_are_told_for_whom(caplog: pytest.LogCaptureFixture) -> None:
+def test_robots_that_the_start_waits_for_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "mapweave.sim")
     table = Table(["a", "b", "c"])
     table.ask("b", 1, now=5.0)
@@ -86,7 +86,7 @@ def test_those_who_wait_for_the_beginning_are_told_for_whom(caplog: pytest.LogCa
     assert [r.message for r in caplog.records] == ["time waits for the agents of a, c, 20 s at the longest"]
 
 
-def test_the_silent_one_stands_still_until_it_asks_again(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_silent_robot_stands_still_until_it_asks_again(caplog: pytest.LogCaptureFixture) -> None:
     table = Table(["a", "b"])
     table.ask("a", 1)
     table.ask("b", 1)
@@ -136,7 +136,7 @@ def test_of_a_step_asked_twice_the_newer_question_is_answered() -> None:
     assert (first.answers, second.answers, second.refusals) == ([], [b"a@3.0"], [])
 
 
-def test_an_old_step_is_refused_and_the_first_begins_anew() -> None:
+def test_an_old_step_is_refused_and_the_first_resets() -> None:
     table = Table(["a"])
     for sequence in (1, 2, 3):
         table.ask("a", sequence)

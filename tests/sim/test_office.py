@@ -83,7 +83,7 @@ def test_robots_start_free_and_in_their_rooms(offices: list[World], seed: int) -
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_furniture_stands_in_its_room_and_apart(offices: list[World], seed: int) -> None:
+def test_furniture_is_in_its_room_and_does_not_overlap(offices: list[World], seed: int) -> None:
     """Drawn one by one, no piece covers a wall or another piece."""
     plan = offices[seed].plan
     for number, piece in enumerate(plan.furniture):

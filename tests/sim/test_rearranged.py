@@ -97,7 +97,7 @@ def test_shares_that_are_none_are_refused(share: float) -> None:
         world_of("office", 1).rearranged(1, share)
 
 
-def test_what_has_no_furniture_cannot_be_rearranged() -> None:
+def test_a_world_without_furniture_cannot_be_rearranged() -> None:
     """One line says so."""
-    with pytest.raises(InvalidValue, match="no furniture that can stand elsewhere"):
+    with pytest.raises(InvalidValue, match="no furniture that can be moved"):
         world_of("corridor", 1).rearranged(1, 0.5)

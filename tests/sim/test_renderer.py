@@ -59,7 +59,7 @@ def mark_shifts(image: np.ndarray, pixels: np.ndarray, places: np.ndarray) -> np
 @pytest.mark.parametrize("size_px", [(400, 320), (1230, 987)])
 @pytest.mark.parametrize("slant_deg", [0, 35, -60])
 @pytest.mark.parametrize("distance", [0.9, 1.4, 2.2])
-def test_marks_are_seen_where_the_camera_says(
+def test_marks_agree_with_the_camera_model(
     distance: float, slant_deg: float, size_px: tuple[int, int], stand
 ) -> None:
     """Corners of a board at known places, whatever the board's resolution."""
@@ -119,7 +119,7 @@ def random_panels(rng: np.random.Generator, count: int) -> PanelSet:
 
 
 @pytest.mark.parametrize(("seed", "count"), [*((seed, 28) for seed in range(6)), (6, 150), (7, 150)])
-def test_what_is_in_front_is_what_a_ray_meets_first(seed: int, count: int, caster) -> None:
+def test_the_nearest_surface_is_the_first_hit_of_a_ray(seed: int, count: int, caster) -> None:
     """Every pixel of a world in disorder, seen by a tilted camera; of many panels most are hidden."""
     rng = np.random.default_rng(seed)
     camera = Camera(80, 60, 60.0, 62.0, 41.0, 28.5, mount_height=0.3, mount_forward=0.1)

@@ -61,7 +61,7 @@ def test_same_seed_and_commands_give_the_same_bits() -> None:
     assert fingerprint(6) != here
 
 
-def test_odometry_errs_as_the_slip_model_says(bare: World) -> None:
+def test_odometry_errors_match_the_slip_model(bare: World) -> None:
     """Eight robots: 2 m straight, then two full turns, against variances derived from the settings."""
     names = [f"r{k}" for k in range(8)]
     poses = [Pose2(0.0, 3.0 * k, 0.0) for k in range(8)]

@@ -74,13 +74,13 @@ def test_saved_worlds_are_the_same_again(kind: str, tmp_path: Path) -> None:
     assert same(load_world(path), build_world(design))
 
 
-def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+def test_an_unwritable_file_is_reported_in_one_line(tmp_path: Path) -> None:
     """A folder that is not there."""
     with pytest.raises(MapweaveError, match="No such file"):
         save_design(make_design("arena", 1), tmp_path / "nowhere" / "a.toml")
 
 
-def test_what_is_left_out_keeps_its_default(tmp_path: Path) -> None:
+def test_missing_values_keep_their_defaults(tmp_path: Path) -> None:
     """One room is a world; it is called like its file."""
     world = load(tmp_path, ROOM)
     assert world.name == "my"
@@ -183,7 +183,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("text", "says"), WRONG)
-def test_what_is_wrong_is_said_in_one_line(text: str, says: str, tmp_path: Path) -> None:
+def test_errors_are_reported_in_one_line(text: str, says: str, tmp_path: Path) -> None:
     """Which file, which item, and what to do."""
     (tmp_path / "my.toml.png").write_text("no picture")
     (tmp_path / "folder.png").mkdir()
@@ -193,7 +193,7 @@ def test_what_is_wrong_is_said_in_one_line(text: str, says: str, tmp_path: Path)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported_in_one_line(tmp_path: Path) -> None:
     """Its name, and that it is not there."""
     with pytest.raises(MapweaveError, match=r"gone\.toml: no such file"):
         load_world(tmp_path / "gone.toml")
@@ -274,7 +274,7 @@ TOP = st.dictionaries(st.sampled_from([field.name for field in dataclasses.field
 @given(
     DESIGNS, st.dictionaries(st.sampled_from([f.name for f in dataclasses.fields(Design)]), ODD, max_size=1)
 )
-def test_no_table_makes_anything_but_a_world_or_one_line(lists: dict[str, Any], top: dict[str, Any]) -> None:
+def test_any_table_makes_a_world_or_one_line(lists: dict[str, Any], top: dict[str, Any]) -> None:
     """Whatever stands in the file; and what is built can be asked for poses, and moved."""
     try:
         table = {**lists, **top}

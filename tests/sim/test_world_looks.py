@@ -26,7 +26,7 @@ def twin_poses(world: World) -> list[Pose2]:
 
 @pytest.mark.parametrize("name", ["twins", "joined twins", "large twins"])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_twins_look_exactly_alike(name: str, seed: int) -> None:
+def test_twins_look_exactly_the_same(name: str, seed: int) -> None:
     """The same pose in the other room gives the same image to the last bit, unless one sees the corridor."""
     world = world_of(name, seed)
     rooms = [world.plan.room(f"room {k}") for k in (0, 1)]
@@ -59,7 +59,7 @@ def test_joined_twins_differ_where_the_corridor_shows() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_two_prints_of_the_corridor_are_alike(seed: int) -> None:
+def test_no_two_prints_of_the_corridor_are_the_same(seed: int) -> None:
     """As small pictures, each differs from each."""
     design = make_design("corridor", seed)
     world = world_of("corridor", seed)
@@ -72,7 +72,7 @@ def test_no_two_prints_of_the_corridor_are_alike(seed: int) -> None:
             assert np.abs(one.astype(float) - other).mean() > 4.0
 
 
-def test_racks_are_alike_but_for_some_cartons() -> None:
+def test_racks_are_equal_but_for_some_cartons() -> None:
     """Most bays show one and the same picture, some another, and every aisle has signs of its own."""
     world = world_of("warehouse", 1)
     racks = [k for k, piece in enumerate(world.plan.furniture) if piece.name == "rack"]

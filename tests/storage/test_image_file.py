@@ -18,7 +18,7 @@ from mapweave.storage.image_file import decode_grey, image_size, read_grey
 CAMERA = Camera(64, 48, 60, 60, 32, 24, 0.3)
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_written_files_are_read(tmp_path):
     grey = np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8)
     path = tmp_path / "grün 1.png"
     cv2.imwrite(str(path), grey)
@@ -31,7 +31,7 @@ def test_what_was_written_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["missing", "a folder", "empty", "text", "torn"])
-def test_what_is_no_image_is_one_line(tmp_path, how, capfd):
+def test_an_invalid_image_is_reported_in_one_line(tmp_path, how, capfd):
     path = tmp_path / "1.png"
     match how:
         case "a folder":
@@ -53,7 +53,7 @@ def test_an_image_of_another_camera_is_refused(tmp_path):
     path = tmp_path / "1.png"
     cv2.imwrite(str(path), np.zeros((48, 60), np.uint8))
     assert read_grey(path).shape == (48, 60)
-    with pytest.raises(DeviceError, match=re.escape(f"{path}: 60x48 px, but camera.toml says 64x48")):
+    with pytest.raises(DeviceError, match=re.escape(f"{path}: 60x48 px, but camera.toml gives 64x48")):
         read_grey(path, CAMERA, "camera.toml")
 
 

@@ -89,7 +89,7 @@ def test_points_on_an_edge_are_left_out(angle):
 
 
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
-def test_what_is_kept_is_held_in_both_directions(pictures, name):
+def test_held_tracks_match_in_both_directions(pictures, name):
     image = pictures.photograph(name)
     settings = SiftSettings()
     weak, strong = structure(image, Sift(IDEAL, settings).extract(image).raw).T

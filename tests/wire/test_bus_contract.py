@@ -45,7 +45,7 @@ def test_patterns(fleet: Fleet, pattern: str, keys: set[str]) -> None:
     assert len(got) == len(keys)
 
 
-def test_one_hears_oneself(fleet: Fleet) -> None:
+def test_a_publisher_receives_its_own_messages(fleet: Fleet) -> None:
     bus = fleet.join()
     got = subscribe(bus, bus, "a")
     bus.publish("a", b"1")
@@ -53,7 +53,7 @@ def test_one_hears_oneself(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("key", ["a/*", "**", "", "a//b", "/a", "a/", "a/@b", "a b", "a/b?c", "ä"])
-def test_what_is_no_key_is_refused(fleet: Fleet, key: str) -> None:
+def test_invalid_keys_are_refused(fleet: Fleet, key: str) -> None:
     bus = fleet.join()
     with pytest.raises(InvalidValue):
         bus.publish(key, b"")
@@ -73,7 +73,7 @@ def test_messages_of_one_sender_keep_their_order(fleet: Fleet) -> None:
     assert [int.from_bytes(s.payload, "big") for s in got] == list(range(200))
 
 
-def test_nobody_to_ask(fleet: Fleet) -> None:
+def test_no_server_to_ask(fleet: Fleet) -> None:
     bus = fleet.join()
     begin = time.monotonic()
     assert bus.ask("nobody/here", b"?", 60.0) == []
@@ -105,7 +105,7 @@ def test_two_servers_under_the_same_key_both_answer(fleet: Fleet) -> None:
     assert sorted(reply.payload for reply in asker.ask("ask", b"", 3.0)) == [b"one", b"two"]
 
 
-def test_one_service_for_a_pattern_knows_which_key_was_asked(fleet: Fleet) -> None:
+def test_a_service_for_a_pattern_gets_the_key(fleet: Fleet) -> None:
     asker, server = fleet.join(), fleet.join()
     server.serve("agent/r0/log/*", lambda request: request.reply(request.key.encode()))
     settle(asker, "agent/r0/log/1")
@@ -140,7 +140,7 @@ def test_handlers_that_raise(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> 
         assert asker.ask("unexpected", b"", 3.0) == [Reply(error="internal error: ZeroDivisionError")]
 
 
-def test_a_busy_server_says_when_to_ask_again(fleet: Fleet) -> None:
+def test_a_busy_server_gives_a_retry_time(fleet: Fleet) -> None:
     asker, server = fleet.join(), fleet.join()
 
     def raises(request: Request) -> None:

@@ -13,7 +13,7 @@ from tests.waiting import eventually
 from tests.wire.fleets import Fleet, settle, subscribe
 
 
-def test_who_is_alive_before_and_after(fleet: Fleet) -> None:
+def test_liveliness_before_and_after(fleet: Fleet) -> None:
     watcher, others = fleet.join(), fleet.join()
     others.announce("agent/r0/alive")
     news: list[tuple[str, bool]] = []
@@ -31,7 +31,7 @@ def test_who_is_alive_before_and_after(fleet: Fleet) -> None:
     watching.close()
 
 
-def test_what_is_closed_is_not_called_any_more(fleet: Fleet) -> None:
+def test_closed_handlers_are_not_called(fleet: Fleet) -> None:
     asker, server = fleet.join(), fleet.join()
     got: list[Sample] = []
     subscription = server.subscribe("a", got.append)
@@ -48,7 +48,7 @@ def test_what_is_closed_is_not_called_any_more(fleet: Fleet) -> None:
     assert not got
 
 
-def test_closing_twice_and_using_what_is_closed(fleet: Fleet) -> None:
+def test_closing_twice_and_use_after_close(fleet: Fleet) -> None:
     bus = fleet.join()
     closing = bus.subscribe("a", lambda _: None)
     bus.close()
@@ -62,7 +62,7 @@ def test_closing_twice_and_using_what_is_closed(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("who", ["the asker", "the server"])
-def test_a_question_to_or_of_one_who_closes_does_not_wait_for_the_time_out(fleet: Fleet, who: str) -> None:
+def test_a_question_during_closing_does_not_wait_for_the_timeout(fleet: Fleet, who: str) -> None:
     asker, server = fleet.join(), fleet.join()
     kept: list[Request] = []
     answer: list[list[Reply]] = []

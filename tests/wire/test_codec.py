@@ -29,7 +29,7 @@ def test_an_edge_of_60_shared_landmarks_is_small(some: SimpleNamespace) -> None:
 
 
 @given(data)
-def test_encoding_what_was_decoded_gives_the_same_bytes(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_encoding_a_decoded_value_gives_the_same_bytes(some: SimpleNamespace, data: st.DataObject) -> None:
     encoded = encode_body(data.draw(some.bodies))
     assert encode_body(decode_body(encoded)) == encoded
 
@@ -126,7 +126,7 @@ def test_a_second_decoder_reads_an_edge(some: SimpleNamespace) -> None:
     assert fields["x"] == {"inliers": 43, "rms_px": pytest.approx(0.613)}
 
 
-def test_what_is_not_there_costs_nothing_and_comes_back_empty(some: SimpleNamespace) -> None:
+def test_empty_values_cost_nothing_and_come_back_empty(some: SimpleNamespace) -> None:
     edge: Edge = some.edge(0)
     bare = Edge(edge.id, edge.a, edge.b, edge.a_from_b, edge.kind)
     encoded = encode_body(EdgePut(bare))
@@ -195,7 +195,7 @@ def bad_landmarks(count: int = 1, pixel: float = 10.0, depth: float = 1.0, sigma
         {"camera": Camera(320, 240, 1e300, 277, 160, 120, 0.2)},
     ],
 )
-def test_what_cannot_be_sent_is_refused_before(some: SimpleNamespace, new: dict[str, Any]) -> None:
+def test_values_out_of_range_are_refused_before_sending(some: SimpleNamespace, new: dict[str, Any]) -> None:
     with pytest.raises(InvalidValue):
         encode_body(NodePut(replaced(some.node(), **new)))
 
@@ -313,7 +313,7 @@ def test_forgeries_are_refused_with_a_reason(
 
 
 @pytest.mark.parametrize("name", ["v", "k", "i", "t", "p", "c", "m"])
-def test_what_is_missing_is_named(some: SimpleNamespace, name: str) -> None:
+def test_missing_parts_are_named(some: SimpleNamespace, name: str) -> None:
     fields = msgpack.unpackb(encode_body(NodePut(some.node(3))))
     del fields[name]
     with pytest.raises(InvalidMessage, match=f"{name} is missing"):
@@ -328,7 +328,7 @@ def test_unknown_fields_are_ignored(some: SimpleNamespace) -> None:
 
 @settings(max_examples=30)
 @given(data)
-def test_whatever_a_camera_sees_fits(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_any_view_of_a_camera_fits(some: SimpleNamespace, data: st.DataObject) -> None:
     """Every pixel from half an image outside on one side to half an image outside on the other."""
     camera: Camera = data.draw(some.cameras)
     far = np.array([[-0.5, -0.5], [1.5, 1.5], [1.5, -0.5]]) * [camera.width, camera.height]

@@ -108,7 +108,7 @@ def test_maps_come_back(told: tuple[MapsExplanation, ...]) -> None:
 
 
 @given(rulings)
-def test_rulings_and_questions_come_back(ruling: ManualConstraint) -> None:
+def test_constraints_and_questions_round_trip(ruling: ManualConstraint) -> None:
     assert decode_ruling(encode_ruling(ruling)) == ruling
     request = ExplainRequest(ruling.ends)
     assert decode_explain_request(encode_explain_request(request)) == request
@@ -123,7 +123,7 @@ def test_rulings_and_questions_come_back(ruling: ManualConstraint) -> None:
         ("a", b"no node"), ("c", [7]),
     ],
 )  # fmt: skip
-def test_a_damaged_explanation_is_refused_with_one_line(field: str, value: Any) -> None:
+def test_a_damaged_explanation_is_refused_in_one_line(field: str, value: Any) -> None:
     fields = msgpack.unpackb(encode_pair(explanation()))
     with pytest.raises(InvalidMessage) as refused:
         decode_pair(msgpack.packb({**fields, field: value}))
@@ -133,17 +133,17 @@ def test_a_damaged_explanation_is_refused_with_one_line(field: str, value: Any) 
 @pytest.mark.parametrize(
     "value", [[["a", 1, 2], ["a", 1, 2], True, "x", 0, ""], [["a", 1], ["b", 1, 2], True, "x", 0, ""]]
 )
-def test_a_ruling_on_nothing_is_refused(value: list[Any]) -> None:
+def test_a_constraint_without_effect_is_refused(value: list[Any]) -> None:
     with pytest.raises(InvalidMessage):
         decode_ruling(msgpack.packb({"v": 1, "r": value}))
 
 
-def test_a_ruling_on_one_map_retires_it() -> None:
+def test_a_constraint_on_one_map_retires_it() -> None:
     ruling = decode_ruling(msgpack.packb({"v": 1, "r": [["a", 1], ["a", 1], True, "x", 0, ""]}))
     assert ruling.retires == MapId("a", 1)
 
 
-def test_what_would_not_decode_is_not_encoded() -> None:
+def test_undecodable_values_are_not_encoded() -> None:
     with pytest.raises(InvalidValue):
         encode_pair(
             PairExplanation(*nodes(), Standing.LINKED, "x" * 5000, *[np.zeros((0, 2), int)] * 2, np.zeros(0))

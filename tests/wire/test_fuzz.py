@@ -277,7 +277,7 @@ def test_values_are_counted_as_they_are(value: object) -> None:
     assert _exceeds(data, values - 1) or values == 1
 
 
-def test_too_long_is_refused_before_it_is_looked_at(some: SimpleNamespace) -> None:
+def test_too_long_input_is_refused_before_decoding(some: SimpleNamespace) -> None:
     for decode in (decode_change, decode_body, decode_view, Head.decode, Ack.decode, decode_record):
         with pytest.raises(InvalidMessage, match="at most"):
             decode(b"\x80" + b"\0" * 200_000)

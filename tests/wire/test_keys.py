@@ -19,7 +19,7 @@ names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,31}", fullmatch=True)
 maps = st.builds(MapId, names, st.integers(0, 2**53))
 
 
-def test_the_layout_is_the_one_that_access_rules_are_written_for() -> None:
+def test_the_key_layout_matches_the_access_rules() -> None:
     one = MapId("r0", 3)
     assert KEYS.change(one) == "mapweave/1/warehouse/agent/r0/change/3"
     assert KEYS.head(one) == "mapweave/1/warehouse/agent/r0/head/3"
@@ -58,7 +58,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
 
 
 @given(maps, names)
-def test_what_a_key_says(one: MapId, server: str) -> None:
+def test_a_key_is_parsed(one: MapId, server: str) -> None:
     assert KEYS.parse_change(KEYS.change(one)) == one
     assert KEYS.parse_head(KEYS.head(one)) == one
     assert KEYS.parse_log(KEYS.log(one)) == one
@@ -118,7 +118,7 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
         lambda: KEYS.relocalize("x" * 33),
     ],
 )
-def test_names_that_cannot_stand_in_a_key_are_refused(make: Callable[[], object]) -> None:
+def test_names_that_cannot_be_in_a_key_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises(InvalidValue):
         make()
 

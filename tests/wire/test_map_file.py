@@ -27,7 +27,7 @@ def content(some: SimpleNamespace) -> MapFile:
     return MapFile("merged", "three rooms", bodies, {node.id: (4, here)})
 
 
-def test_what_is_written_is_read(tmp_path: Path, content: MapFile) -> None:
+def test_written_values_are_read(tmp_path: Path, content: MapFile) -> None:
     path = tmp_path / "a.mapweave"
     write_map_file(path, content)
     back = read_map_file(path)
@@ -116,7 +116,7 @@ def test_a_file_of_the_other_kind_can_be_refused(tmp_path: Path, content: MapFil
         read_map_file(path, "agent")
 
 
-def test_a_kind_that_nobody_knows(content: MapFile) -> None:
+def test_an_unknown_kind(content: MapFile) -> None:
     with pytest.raises(InvalidValue, match="kind 'odd' is unknown"):
         pack_map_file(MapFile("odd", "", ()))  # type: ignore[arg-type]
 

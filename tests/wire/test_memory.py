@@ -37,7 +37,7 @@ def test_without_faults_all_arrives_in_order() -> None:
     assert run(Faults()) == list(range(300))
 
 
-def test_one_bus_may_be_disturbed_alone() -> None:
+def test_one_bus_can_be_disturbed_alone() -> None:
     hub = MemoryHub()
     bad, good, receiver = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
     got: list[bytes] = []

@@ -89,7 +89,7 @@ def test_small_messages() -> None:
         (Ack.decode, Ack(MapId("a/b", 1), 1, 1).encode()),
     ],
 )
-def test_what_makes_no_sense_is_refused(decode: object, data: bytes) -> None:
+def test_nonsense_is_refused(decode: object, data: bytes) -> None:
     assert callable(decode)
     with pytest.raises(InvalidMessage):
         decode(data)
@@ -187,7 +187,7 @@ def test_a_route(some: SimpleNamespace) -> None:
     assert (nothing.legs, nothing.reason) == ((), "no way")
 
 
-def test_what_is_known() -> None:
+def test_the_cache_returns_its_entries() -> None:
     request = KnownRequest(MapId("r0", 3), 1.25, -2.5, 8.7)
     assert decode_known_request(encode_known_request(request)) == request
     views = np.random.default_rng(1).uniform([-50, -50, -3, 0.1], [50, 50, 3, 1.2], (MAX_KNOWN, 4))
@@ -204,12 +204,12 @@ def test_what_is_known() -> None:
 @pytest.mark.parametrize(
     "view", [[np.nan, 0, 0, 0.5], [0, np.inf, 0, 0.5], [2e6, 0, 0, 0.5], [0, 0, 9, 0.5], [0, 0, 0, -0.1]]
 )
-def test_what_nobody_can_have_mapped_is_not_told(view: list[float]) -> None:
+def test_impossible_views_are_not_returned(view: list[float]) -> None:
     with pytest.raises(InvalidValue, match="out of range"):
         encode_known_answer(KnownAnswer(np.array([view]), ""))
 
 
-def test_more_than_is_told_at_once_is_refused() -> None:
+def test_more_than_the_announced_size_is_refused() -> None:
     with pytest.raises(InvalidValue, match="at most"):
         encode_known_answer(KnownAnswer(np.zeros((MAX_KNOWN + 1, 4)), ""))
     with pytest.raises(InvalidValue, match="position"):

@@ -32,7 +32,7 @@ def test_sixteen_sensors_cost_fifty_bytes():
     assert np.abs(turned).max() < 1e-4
 
 
-def test_a_robot_without_sensors_says_nothing():
+def test_a_robot_without_sensors_is_no_evidence():
     assert len(Ranges.around(np.zeros(0), (), 0.0, 0.16)) == 0
     assert len(Ranges.around(np.zeros(3), (0.0,), 1.0, 0.16)) == 0
 
@@ -43,13 +43,13 @@ def test_a_robot_without_sensors_says_nothing():
      ([np.nan], [0.5], 1.0), ([0.0], [np.nan], 1.0),
      ([0.0], [0.5], 1e3), ([[0.0]], [[0.5]], 1.0)],
 )  # fmt: skip
-def test_what_does_not_belong_together_is_refused(bearings, distances, reach):
+def test_mismatched_arrays_are_refused(bearings, distances, reach):
     with pytest.raises(InvalidValue):
         Ranges(np.array(bearings), np.array(distances), reach)
 
 
 @given(st.integers(1, 60_000), st.lists(st.tuples(st.floats(-10, 10), st.floats(0, 1)), max_size=20))
-def test_what_was_decoded_encodes_to_the_same_bytes(reach_mm, sensors):
+def test_decoded_values_encode_to_the_same_bytes(reach_mm, sensors):
     """Things at the very end of the reach and sensors that look straight back once did not."""
     reach = reach_mm / 1000
     bearings, shares = np.array([*sensors, (np.pi, 0.999), (-np.pi, 1.0), (3.14159, 0.9999)]).T

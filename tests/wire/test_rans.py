@@ -23,7 +23,7 @@ def some_column(random: np.random.Generator, symbols: int) -> Column:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 30), st.integers(1, 12), st.integers(12, 18))
-def test_what_is_pushed_comes_back(seed: int, lanes: int, steps: int, size: int) -> None:
+def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int) -> None:
     random = np.random.default_rng(seed)
     columns = [some_column(random, int(random.integers(1, 60))) for _ in range(steps)]
     symbols = [random.integers(0, len(c.frequencies), lanes) for c in columns]
@@ -46,7 +46,7 @@ def test_what_is_pushed_comes_back(seed: int, lanes: int, steps: int, size: int)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_many_columns_at_once_are_the_same_as_one_by_one(seed: int) -> None:
+def test_many_columns_at_once_equal_one_by_one(seed: int) -> None:
     random = np.random.default_rng(seed)
     lanes, size = int(random.integers(0, 200)), int(random.integers(12, 32))
     columns = [some_column(random, int(random.integers(1, 60))) for _ in range(9)]
@@ -67,7 +67,7 @@ def test_many_columns_at_once_are_the_same_as_one_by_one(seed: int) -> None:
             LaneReader(short, lanes, size).pop(Columns.of(columns))
 
 
-def test_a_symbol_costs_what_its_frequency_is_worth() -> None:
+def test_a_symbol_costs_its_entropy() -> None:
     random = np.random.default_rng(1)
     shares = np.array([0.7, 0.15, 0.1, 0.04, 0.01])
     column = Column(np.array([2867, 614, 410, 164, 41]))
@@ -81,7 +81,7 @@ def test_a_symbol_costs_what_its_frequency_is_worth() -> None:
     assert bits / (lanes * steps) == pytest.approx(entropy + 15 / steps, rel=0.01)
 
 
-def test_one_lane_in_plain_python() -> None:
+def test_one_rans_lane_in_plain_python() -> None:
     """The definition with whole numbers of any length and a string of bits."""
     random = np.random.default_rng(2)
     column, size = some_column(random, 20), 14

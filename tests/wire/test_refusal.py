@@ -30,7 +30,7 @@ def test_as_bytes() -> None:
 
 
 @given(st.binary(max_size=40))
-def test_whatever_comes_is_a_refusal_or_none(data: bytes) -> None:
+def test_any_input_is_a_refusal_or_none(data: bytes) -> None:
     assert decode_refusal(data) is None or data.startswith(MARK)
     reply = decode_refusal(MARK + data)
     assert isinstance(reply, Reply)

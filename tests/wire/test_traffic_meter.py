@@ -21,7 +21,7 @@ def pair() -> Iterator[tuple[MemoryHub, TrafficMeter, MemoryBus]]:
     other.close()
 
 
-def test_what_is_published_and_heard(pair) -> None:
+def test_published_messages_are_received(pair) -> None:
     _, metered, other = pair
     heard, seen = [], []
     other.subscribe("to/other", heard.append)

@@ -20,7 +20,7 @@ TWO = Ranges(np.array([0.0, 1.0]), np.array([2.0, 0.5]), 2.0)
 
 @given(st.binary(max_size=80), st.sampled_from([TWO, Ranges()]))
 @example(bytes(6) + struct.pack("<h", 31488) + bytes(2), TWO)  # a heading beyond half a turn
-def test_any_bytes_are_a_wake_or_refused_and_encode_to_themselves(data, ranges):
+def test_any_bytes_are_a_trajectory_or_refused_and_encode_to_themselves(data, ranges):
     try:
         wake = unpack_trajectory(data, ranges)
     except InvalidMessage:
@@ -32,7 +32,7 @@ def test_any_bytes_are_a_wake_or_refused_and_encode_to_themselves(data, ranges):
     assert (wake.distances <= ranges.reach).all()
 
 
-def test_the_layout_is_the_one_that_is_written_down():
+def test_the_layout_matches_the_documentation():
     """Columns of little-endian numbers, read by struct."""
     wake = TrajectorySegment(
         np.array([-1.5, 2.25]),
@@ -62,13 +62,13 @@ def test_other_lengths_are_refused(size):
      ([0.0], [[0.0, 0.0, np.inf]], [[]]),
      (range(MOST + 1), np.zeros((MOST + 1, 3)), np.zeros((MOST + 1, 0)))],
 )  # fmt: skip
-def test_what_does_not_belong_together_is_refused(ages, poses, distances):
+def test_mismatched_arrays_are_refused(ages, poses, distances):
     with pytest.raises(InvalidValue, match="wake"):
         TrajectorySegment(np.array(ages, float), np.array(poses, float), np.array(distances, float))
 
 
 @pytest.mark.parametrize("distances", [[[1.0]], [[1.0, 3.0]], [[1.0, -0.1]], [[1.0, np.nan]]])
-def test_a_node_takes_no_wake_of_other_sensors(some, distances):
+def test_a_node_refuses_a_trajectory_of_other_sensors(some, distances):
     node = replace(some.node(), ranges=TWO)
     with pytest.raises(InvalidValue, match="wake"):
         replace(node, wake=TrajectorySegment(np.zeros(1), np.zeros((1, 3)), np.array(distances)))

@@ -43,7 +43,7 @@ def test_a_client_that_never_connects_closes_at_once() -> None:
     assert time.monotonic() - begin < 5
 
 
-def test_a_taken_port_is_one_clear_line() -> None:
+def test_a_taken_port_is_reported_in_one_line() -> None:
     endpoints = (f"tcp/127.0.0.1:{free_port()}",)
     first = ZenohBus(BusSettings(mode="router", listen=endpoints))
     try:
@@ -55,7 +55,7 @@ def test_a_taken_port_is_one_clear_line() -> None:
         first.close()
 
 
-def test_idle_connections_keep_nobody_out() -> None:
+def test_idle_connections_block_no_other() -> None:
     port = free_port()
     endpoints = (f"tcp/127.0.0.1:{port}",)
     router = ZenohBus(BusSettings(mode="router", listen=endpoints))

@@ -47,7 +47,7 @@ class Notebook:
         return edge
 
 
-def test_drives_both_ways_are_one_edge_that_counts_them():
+def test_drives_both_ways_make_one_edge_with_counts():
     book = Notebook()
     there, back = measured(A, B, TRUE, 12), measured(B, A, TRUE.inverse(), 8)
     edge = book.note(there, back, there)
@@ -65,7 +65,7 @@ def test_an_edge_between_nodes_of_others_has_an_id_of_the_own_map():
     assert encode_body(decode_body(encode_body(EdgePut(edge)))) == encode_body(EdgePut(edge))
 
 
-def test_many_drives_err_less_and_never_claim_more_than_one_of_them_knows():
+def test_many_drives_err_less_without_overconfidence():
     """Half of each drive's error is the landmarks', and so the same in all drives."""
     rng, nees, ratio = np.random.default_rng(5), [], []
     for _ in range(200):

@@ -90,7 +90,7 @@ def test_four_drives_make_depths_better_and_never_too_sure():
     assert all(np.mean(one) < 1.0 for one in nees)
 
 
-def test_kept_one_by_one_depths_are_no_surer_than_together():
+def test_independent_depth_errors_are_no_smaller_than_joint_ones():
     """Their covariance less the joint one of the filter is positive: for any weights of the landmarks."""
     rng = np.random.default_rng(1)
     root = rng.normal(size=(33, 33))
@@ -118,7 +118,7 @@ def test_depths_that_are_known_no_better_are_left_as_they_are():
 
 
 @pytest.mark.parametrize("trouble", ["few", "elsewhere", "nothing"])
-def test_what_teaches_too_little_or_contradicts_the_map_is_not_told(trouble):
+def test_too_small_or_contradicting_refinements_are_not_sent(trouble):
     mapped, sigmas, depths = landmarks(DEPTHS, 0.1 * DEPTHS), np.full(20, 0.02), DEPTHS.copy()
     if trouble == "few":
         depths[4:] = sigmas[4:] = np.nan
@@ -143,7 +143,7 @@ class Teacher(NodeLocalizer):
         return DEPTHS.copy(), np.full(len(DEPTHS), 0.02)
 
 
-def test_a_node_is_told_once_a_drive_when_the_robot_leaves_it():
+def test_a_node_is_refined_once_a_drive_when_the_robot_leaves_it():
     nodes = [Node(one, 7, HERE, CAMERA, landmarks(DEPTHS * 1.05, 0.1 * DEPTHS)) for one in (A, B)]
     foreign = replace(nodes[0], id=NodeId("r1", 1, 1))
     refinement = LandmarkRefinement(HybridMap(map(NodePut, nodes)))

@@ -72,7 +72,7 @@ class Drive:
         return [(traverse.start, traverse.end) for traverse in self.measured]
 
 
-def test_a_passage_is_told_when_the_next_node_is_reached():
+def test_a_traverse_is_reported_when_the_next_node_is_reached():
     drive = Drive()
     drive.by(A, 20)
     drive.by(B, 10)
@@ -81,7 +81,7 @@ def test_a_passage_is_told_when_the_next_node_is_reached():
     assert drive.told == [(A, B)]
 
 
-def test_what_is_measured_is_as_good_as_it_says():
+def test_traverse_errors_match_the_covariance():
     """The mean over 60 drives: no surer than it is right, and not much less sure either."""
     nees = []
     for seed in range(60):
@@ -104,7 +104,7 @@ def test_a_node_that_was_not_come_near_is_passed_over():
     assert traverse.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[C]) < CERTAIN
 
 
-def test_where_no_node_was_come_near_nothing_begins():
+def test_without_a_node_nearby_no_traverse_begins():
     drive = Drive()
     drive.pose = Pose2(-0.8)
     drive.by(A, 10)
@@ -130,7 +130,7 @@ def test_a_node_that_was_glimpsed_is_no_node():
     assert drive.measured[0].start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[C]) < CERTAIN
 
 
-def test_whoever_was_lost_in_between_may_have_been_carried():
+def test_a_robot_lost_in_between_may_have_been_carried():
     drive = Drive()
     drive.by(A, 10)
     drive.see(None)
@@ -141,7 +141,7 @@ def test_whoever_was_lost_in_between_may_have_been_carried():
     assert drive.told == [(B, C)], "from there on it measures again"
 
 
-def test_a_roundabout_way_says_nothing_of_the_straight_one():
+def test_a_detour_does_not_measure_the_straight_way():
     drive = Drive()
     drive.by(A, 10)
     drive.by(B, 60, Odometry(0.05, 2 * math.pi / 60))
@@ -149,7 +149,7 @@ def test_a_roundabout_way_says_nothing_of_the_straight_one():
     assert not drive.told
 
 
-def test_what_is_known_badly_is_not_told():
+def test_imprecise_traverses_are_not_reported():
     drive = Drive(settings=TraverseSettings(widest=0.015))
     drive.by(A, 20)
     drive.by(B, 60)

@@ -89,7 +89,7 @@ def run(request: pytest.FixtureRequest) -> MappingRun:
         (scrambled, Health.DISAGREEMENT, 0.9, 1.5),
     ],
 )
-def test_without_sight_the_doubt_grows_and_is_named(
+def test_without_landmarks_the_uncertainty_grows_and_is_reported(
     run: MappingRun, fault: Fault, named: Health, share: float, growth: float
 ) -> None:
     filter_, health, traces, distances = drive(run, fault)
@@ -123,7 +123,7 @@ def test_wheels_that_lie_are_named_and_the_image_holds_the_pose(run: MappingRun,
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.02])
-def test_standing_or_turning_on_the_spot_is_told_until_the_robot_drives(turn: float) -> None:
+def test_standing_or_turning_is_reported_until_the_robot_drives(turn: float) -> None:
     run = draw_run(np.random.default_rng(5), "line", 100)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))
     ids, rng = np.arange(30), np.random.default_rng(6)
@@ -155,7 +155,7 @@ def test_a_blind_filter_is_lost_slowly_and_found_again() -> None:
     assert filter_.converged().mean() > 0.5
 
 
-def test_pixels_that_are_worse_than_said_are_found_out() -> None:
+def test_pixels_worse_than_nominal_are_detected() -> None:
     """The image is blurred: pixels err three times as much as the tracker knows."""
     apart = []
     for seed in range(8):

@@ -45,7 +45,7 @@ def test_the_base_stays_where_it_is_under_a_new_anchor() -> None:
     assert "40 mm" in watch.health(lambda: False)[1]
 
 
-def test_images_that_do_not_come_are_told_first() -> None:
+def test_missing_images_are_reported_first() -> None:
     watch = FilterHealth(SETTINGS, focal=250.0)
     watch.saw(Health.FEW, "2 are left")
     watch.moved(np.zeros(3))
@@ -54,7 +54,7 @@ def test_images_that_do_not_come_are_told_first() -> None:
     assert watch.health(lambda: True) == (Health.NO_IMAGE, "no image for 2 steps")
 
 
-def test_refuted_wheels_are_doubted_for_a_while() -> None:
+def test_refuted_wheels_get_more_noise_for_a_while() -> None:
     noise = WheelNoise(0.24, 0.02)
     trust = AdaptiveOdometryNoise(noise, FilterSettings(distrust=3, slip=(0.1, 0.2)))
     step, stands = Odometry(0.1, 0.0), Odometry(0.0, 0.0)

@@ -79,7 +79,7 @@ def test_consensus_is_that_of_the_best_single_landmark() -> None:
     assert one_point_consensus(innovations, s, gate).sum() == best
 
 
-def test_nothing_plausible_means_nothing_believed() -> None:
+def test_nothing_plausible_means_nothing_accepted() -> None:
     innovations = np.full((4, 2), 100.0) * np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
     accepted, whitening, _ = believe(innovations, np.eye(8), pixel_gate(0.999))
     assert not accepted.any()

@@ -105,7 +105,7 @@ def test_a_step_is_linearised_where_it_is_asked(
 @example((12, 8437))
 @example((40, 5))
 @example((70, 5))
-def test_update_is_the_textbook_one(size: tuple[int, int]) -> None:
+def test_the_update_agrees_with_the_textbook(size: tuple[int, int]) -> None:
     n, _ = size
     rng, state = scene(*size)
     covariance = state.covariance
@@ -137,7 +137,7 @@ def test_update_is_the_textbook_one(size: tuple[int, int]) -> None:
 
 @settings(deadline=None)
 @given(sizes)
-def test_what_an_image_says_of_the_wheels(size: tuple[int, int]) -> None:
+def test_the_wheels_errors_are_estimated_from_an_image(size: tuple[int, int]) -> None:
     """Against the posterior of the errors as two more states of a textbook filter."""
     n, _ = size
     rng, state = scene(*size)
@@ -209,7 +209,7 @@ def test_a_scattered_vote_counts_as_much_as_its_variance_allows() -> None:
 
 @settings(deadline=None)
 @given(sizes, st.booleans())
-def test_what_is_in_sight(size: tuple[int, int], in_order: bool) -> None:
+def test_visible_landmarks(size: tuple[int, int], in_order: bool) -> None:
     """Against dictionaries: which landmarks are held and seen, and what is reported of all that was given."""
     n, _ = size
     rng, _ = scene(*size)
@@ -239,7 +239,7 @@ def test_what_is_in_sight(size: tuple[int, int], in_order: bool) -> None:
 
 @settings(deadline=None)
 @given(sizes)
-def test_a_first_look_turns_the_step_as_the_image_votes(size: tuple[int, int]) -> None:
+def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]) -> None:
     n, _ = size
     rng, state = scene(*size)
     slots, root = some_slots(rng, n), rng.normal(size=(2, 2)) * 0.01
@@ -267,7 +267,7 @@ def test_whitening_of_any_size(size: int) -> None:
     assert not np.triu(whitening, 1).any()
 
 
-def test_what_is_no_covariance_is_refused() -> None:
+def test_invalid_covariances_are_refused() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         whiten(np.zeros((4, 4)))
     with pytest.raises(np.linalg.LinAlgError):

@@ -27,7 +27,7 @@ def derivative(function, at: np.ndarray, h: float = 1e-6) -> np.ndarray:  # type
 
 
 @given(poses, mounts, seeds)
-def test_sees_what_the_camera_projects(pose_vector: np.ndarray, mount: float, seed: int) -> None:
+def test_predictions_agree_with_the_camera(pose_vector: np.ndarray, mount: float, seed: int) -> None:
     camera = Camera(320, 240, 277.0, 250.0, 160.0, 120.0, 0.3, mount)
     points = some_points(seed)
     rays, _ = rays_of_points(points, mount, 0.3)
@@ -42,7 +42,7 @@ def test_sees_what_the_camera_projects(pose_vector: np.ndarray, mount: float, se
 
 
 @given(poses, mounts, seeds)
-def test_jacobians_of_sight(pose_vector: np.ndarray, mount: float, seed: int) -> None:
+def test_jacobians_of_the_projection(pose_vector: np.ndarray, mount: float, seed: int) -> None:
     rays, _ = rays_of_points(some_points(seed), mount, 0.3)
     sight = project_anchored(pose_vector, rays, mount)
     clear = sight.scale > 0.1

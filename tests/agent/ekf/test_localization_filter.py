@@ -265,7 +265,7 @@ def test_prior_keeps_its_convention() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.25])
-def test_wheels_tell_the_scale_of_a_photograph(scale):
+def test_wheels_give_the_scale_of_a_photograph(scale):
     """All points, and the prior's way, are off together; a drive later the pose is right, and knows it."""
     squared = []
     for seed in range(8):

@@ -54,7 +54,7 @@ def test_prediction_is_the_dense_form(camera: Camera) -> None:
     np.testing.assert_allclose(filter_.state.pose_vector, pose_vector)
 
 
-def test_slip_aside_moves_robot_and_landmarks_alike() -> None:
+def test_side_slip_moves_robot_and_landmarks_together() -> None:
     """Against samples: robots that slip aside by chance, each with the landmarks as it then sees them."""
     run, step, share = a_run(), Odometry(0.05, 0.1), 0.2
     filter_ = start(run, side_slip=share)
@@ -162,7 +162,7 @@ def test_landmark_covariances_are_those_of_samples() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.02])
-def test_standing_or_turning_on_the_spot_tells_no_depth(turn: float) -> None:
+def test_standing_or_turning_gives_no_depth(turn: float) -> None:
     run = a_run()
     filter_ = start(run)
     prior = filter_.landmarks().depth_sigmas
@@ -205,7 +205,7 @@ def test_predicts_where_landmarks_will_be_seen() -> None:
     np.testing.assert_array_equal(filter_.predict_pixels()[filter_.ids == 5][0], expected[0])
 
 
-def test_report_speaks_of_the_ids_that_were_given() -> None:
+def test_the_report_is_about_the_given_ids() -> None:
     run = a_run()
     filter_ = start(run)
     filter_.predict(STILL)
@@ -260,7 +260,7 @@ def test_removed_between_wheels_and_image() -> None:
     np.testing.assert_allclose(one.state.rays, other.state.rays, atol=1e-12)
 
 
-def test_a_few_that_agree_among_many_that_do_not_are_not_believed() -> None:
+def test_few_consistent_among_many_inconsistent_are_rejected() -> None:
     run = a_run("line", steps=100)
     filter_ = start(run)
     drive(filter_, run)

@@ -39,14 +39,14 @@ def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) ->
     assert max(ratios) < 1.25
 
 
-def test_pose_is_as_far_off_as_it_says(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+def test_pose_errors_match_the_covariance(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     """Average NEES in its interval; with each step linearised only where the wheels say, it is 8 to 10."""
     nees = [filter_.pose.mahalanobis2(run.poses[-1]) for run, filter_ in runs]
     low, high = INTERVAL
     assert low < np.mean(nees) < high
 
 
-def test_landmarks_are_as_far_off_as_they_say(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+def test_landmark_errors_match_their_covariances(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
     low, high = INTERVAL
     assert low < np.mean([landmark_nees(run, filter_) for run, filter_ in runs]) < high
 
@@ -91,7 +91,7 @@ def assert_covariance(covariance: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_covariance_stays_one_for_ten_thousand_steps() -> None:
+def test_the_covariance_stays_valid_for_ten_thousand_steps() -> None:
     """Symmetric to the last bit and positive, twenty times the paper's run."""
     run = draw_run(np.random.default_rng(4), "arc", 335, landmarks=8)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))

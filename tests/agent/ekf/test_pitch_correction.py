@@ -53,7 +53,7 @@ def error(run: MappingRun, filter_: MappingFilter) -> float:
 
 
 @pytest.mark.parametrize("pitch", [0.004, 0.02, -0.02])
-def test_a_nod_is_what_pitching_the_camera_does(pitch: float) -> None:
+def test_the_pitch_correction_agrees_with_a_pitched_camera(pitch: float) -> None:
     rng = np.random.default_rng(1)
     run = draw_run(rng, steps=1)
     still, nods = (seen_pitched(CAMERA, Pose2(), run.points, one) for one in (0.0, pitch))
@@ -66,7 +66,7 @@ def test_a_nod_is_what_pitching_the_camera_does(pitch: float) -> None:
     np.testing.assert_allclose(found, innovations, atol=0.5 * abs(pitch) * abs(pitch) + 2e-3 * abs(pitch))
 
 
-def test_what_the_filter_takes_to_be_possible_is_no_nod() -> None:
+def test_offsets_within_the_filters_covariance_are_no_pitch() -> None:
     slopes = np.random.default_rng(2).uniform(-0.4, 0.4, (20, 2))
     together = np.tile([0.0, 0.01], (20, 1))
     sure, unsure = 1e-6 * np.eye(40), 1e-6 * np.eye(40) + 0.01**2
@@ -99,7 +99,7 @@ def test_a_filter_lives_through_nods(shape: str, monkeypatch: pytest.MonkeyPatch
     assert rms["nods"] < 1.5 * rms["without"] + 0.005
 
 
-def test_where_nothing_nods_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pitch_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = [draw_run(np.random.default_rng(seed), "arc", 120) for seed in range(6)]
     with_nods = [mapped(run)[0].pose.mean.vector for run in runs]
     monkeypatch.setattr(mapping_filter, "pitch_offset", lambda *_: None)

@@ -63,7 +63,7 @@ def test_a_track_that_moves_shows_in_chi2() -> None:
     assert (np.delete(found.chi2, 3) < 2).all()
 
 
-def test_pure_rotation_tells_no_depth() -> None:
+def test_pure_rotation_gives_no_depth() -> None:
     poses = np.column_stack([np.zeros((30, 2)), np.linspace(-0.2, 0.2, 30)])
     points = np.array([[3.0, 0.2, 0.4], [2.0, -0.3, 0.1]])
     rng = np.random.default_rng(0)

@@ -79,7 +79,7 @@ def test_without_an_image_it_waits():
     assert not stage.finished
 
 
-def test_it_says_what_is_wrong_with_the_view():
+def test_problems_of_the_view_are_reported():
     passenger = CarriedMapping(Stage(anchor_features=3, anchored=2))
     passenger.step(TICK)
     assert passenger.detail == "only 3 features in view"
@@ -118,7 +118,7 @@ def test_a_robot_that_stands_still_makes_no_node(walls, description):
     assert mapper.started
 
 
-def test_a_blank_wall_makes_no_node_and_says_so(walls, description):
+def test_a_blank_wall_makes_no_node_and_is_reported(walls, description):
     poses = [Pose2(-x, 0, np.pi) for x in np.arange(0.0, 0.8, 0.05)]
     changes, _, passenger = carried(walls, description, poses)
     assert changes == []

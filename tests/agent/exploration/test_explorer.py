@@ -68,7 +68,7 @@ def test_no_answer_changes_nothing(walls, error):
     ]
 
 
-def test_where_others_have_looked_around_it_does_not(walls):
+def test_it_does_not_map_places_that_others_have_covered(walls):
     alone = doings(live(walls, ExplorerSettings(), 12, {}))
     assert alone[:2] == [Phase.LOOKING, Phase.DRIVING]
     told = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND, ""))})
@@ -104,7 +104,7 @@ def test_the_papers_way_turns_to_a_side_by_chance_and_goes_on_by_chance(walls):
     assert commands[:150] != [step.command for step in live(walls, by_chance, 150, {}, seed=1)]
 
 
-def test_ours_turns_all_the_way_around(walls):
+def test_our_exploration_turns_all_the_way_around(walls):
     sides = turns(live(walls, ExplorerSettings(), 250, {}))
     assert len(sides) >= 3
     assert len(set(sides)) == 1

@@ -33,7 +33,7 @@ directions = st.sampled_from(BEARINGS)
 
 @settings(max_examples=200, deadline=None)
 @given(readings, directions)
-def test_the_footprint_may_move_as_far_as_room_says(proximity, direction):
+def test_the_footprint_moves_freely_within_the_clearance(proximity, direction):
     """Moved step by step it comes no nearer to what the rangers hit than room promises."""
     angles = np.array(BEARINGS)
     hits = (proximity + BODY.radius)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -48,13 +48,13 @@ def test_the_footprint_may_move_as_far_as_room_says(proximity, direction):
 
 @settings(max_examples=100, deadline=None)
 @given(readings, directions, st.integers(0, 15), st.floats(0.0, 1.0))
-def test_what_comes_nearer_leaves_less_room(proximity, direction, which, share):
+def test_approaching_obstacles_reduce_the_clearance(proximity, direction, which, share):
     nearer = proximity.copy()
     nearer[which] *= share
     assert clearance(BODY, nearer, direction) <= clearance(BODY, proximity, direction) + 1e-9
 
 
-def test_without_rangers_nobody_knows():
+def test_without_rangers_clearance_is_unknown():
     assert clearance(BODY, np.zeros(0), 0.0) == math.inf
     assert clearance(BODY, np.zeros(0), 0.0, 0.6) == 0.6
     one = RobotDescription(CAMERA, ranger_bearings=(math.pi,), ranger_reach=3.0)
@@ -71,7 +71,7 @@ def a_map(*poses: Pose2) -> HybridMap:
     )
 
 
-def test_a_place_is_seen_as_far_as_its_nodes_look():
+def test_a_place_is_covered_by_its_nodes_fields_of_view():
     here = np.array([1.0, 2.0])
     share = 2 * CAMERA.semi_aperture / math.tau
     assert seen_around(views_of(HybridMap()), here, 0.7) == 0.0
@@ -99,7 +99,7 @@ def looks(x: float, y: float, headings: np.ndarray) -> np.ndarray:
 ALL_AROUND = np.arange(0.0, math.tau, 0.9)
 
 
-def test_it_does_not_matter_who_looked_around_at_a_place():
+def test_any_robots_views_cover_a_place():
     hearsay = FleetCoverage(MAP, 8.7)
     assert hearsay.question(np.array([1.0, 2.0])) == WhatIsKnown(-1, MAP, 1.0, 2.0, 8.7)
     theirs = np.concatenate([looks(3.0, 0.0, ALL_AROUND), looks(6.0, 0.0, ALL_AROUND[:4])])
@@ -130,7 +130,7 @@ def corridor() -> OccupancyGrid:
     return floor
 
 
-def test_the_next_place_is_where_nobody_has_been():
+def test_the_next_viewpoint_is_at_an_unvisited_place():
     floor, here = corridor(), np.zeros(2)
     been = here[None]
 
@@ -147,7 +147,7 @@ def test_the_next_place_is_where_nobody_has_been():
     assert next_viewpoint(floor, here, everywhere, NOBODY, ExplorerSettings()) == []
 
 
-def test_what_walls_hide_makes_no_place_worth_a_way():
+def test_floor_behind_walls_attracts_no_exploration():
     """Along a corridor everything behind its walls is unknown for ever; a wide unknown end is worth more."""
     floor = corridor()
     middle, end = floor.unknown_in_sight(np.array([[0.0, 0.0], [2.5, 0.0]]), NOBODY, 1.6, 3.0)
@@ -159,7 +159,7 @@ def test_what_walls_hide_makes_no_place_worth_a_way():
     assert told[0] < end
 
 
-def test_floor_in_sight_against_looking_at_each_cell():
+def test_visible_floor_agrees_with_a_test_of_each_cell():
     """Every cell is looked at along a line of its own, in steps of a centimetre."""
     floor, here, reach = corridor(), np.array([2.05, 0.35]), 2.5
     unknown = floor.unknown_around(0.0, NOBODY) > 0.5

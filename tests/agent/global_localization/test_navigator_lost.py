@@ -66,13 +66,13 @@ def test_it_drives_elsewhere_to_tell_two_places_apart(home):
     trial = Trial(navigator(eyes, NOWHERE, C), eyes, fleet)
     trial.run(60.0, lambda: trial.navigator.fix is not None)
     assert trial.navigator.fix is not None and trial.navigator.fix.node == A
-    assert any("driving on to look from elsewhere" in detail for _, detail in trial.said)
+    assert any("driving on to search from elsewhere" in detail for _, detail in trial.said)
     assert trial.navigator.tally == DriveStatistics(relocalizations=1)
     turned = sum(abs(command.turn) for command in trial.commands) * BODY.tick
     assert turned > math.tau, "first it looked all around"
 
 
-def test_without_room_it_stays_and_looks_on(home):
+def test_without_room_it_stays_and_searches_on(home):
     eyes = Eyes(home, Pose2(2.5, 2.0))
     trial = Trial(
         navigator(eyes, NOWHERE, C), eyes,
@@ -83,7 +83,7 @@ def test_without_room_it_stays_and_looks_on(home):
     assert trial.navigator.fix is None
 
 
-def test_two_own_nodes_that_look_the_same_are_not_told_apart_by_guessing(home):
+def test_two_similar_own_nodes_are_ambiguous(home):
     """The same view hangs in two rooms of the own map: the fleet is asked, and knows no better."""
     nodes, _ = take_map(home, MapId("r0", 1), [TOUR[0]] * 2, np.random.default_rng(4), sigma_xy=0.002)
     first = nodes[0]
@@ -100,7 +100,7 @@ def test_two_own_nodes_that_look_the_same_are_not_told_apart_by_guessing(home):
     assert any(isinstance(question, WhereAmI) for question in trial.asked)
 
 
-def test_a_place_that_another_robot_knows_a_twin_of_is_not_taken_either(home, own_map):
+def test_a_place_with_a_twin_in_another_robots_map_is_not_accepted(home, own_map):
     """The own map alone would be sure; the fleet knows another room that looks the same."""
     eyes = Eyes(home, TOUR[0])
     trial = Trial(
@@ -111,7 +111,7 @@ def test_a_place_that_another_robot_knows_a_twin_of_is_not_taken_either(home, ow
     assert not trial.navigator.tally.relocalizations
 
 
-def test_the_fleet_is_believed_where_it_contradicts_the_own_map(home, own_map):
+def test_the_fleet_has_priority_over_the_own_map(home, own_map):
     eyes = Eyes(home, TOUR[0])
     trial = Trial(
         navigator(eyes, own_map, C), eyes, lambda question: found(question, here(B, Pose2(0.1, 0.0, 0.2)))
@@ -120,7 +120,7 @@ def test_the_fleet_is_believed_where_it_contradicts_the_own_map(home, own_map):
     assert trial.navigator.fix is not None and trial.navigator.fix.node == B
 
 
-def test_a_silent_fleet_is_not_waited_for_at_each_look(home):
+def test_a_silent_fleet_is_not_asked_at_each_view(home):
     eyes = Eyes(home, Pose2(2.5, 2.0))
     navigator_ = navigator(eyes, NOWHERE, C)
     trial = Trial(navigator_, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
@@ -130,7 +130,7 @@ def test_a_silent_fleet_is_not_waited_for_at_each_look(home):
     assert len(trial.asked) == 2
 
 
-def test_a_robot_that_has_lost_sight_of_everything_looks_where_nodes_nearby_have_looked(home, own_map):
+def test_a_robot_that_has_lost_all_landmarks_turns_to_headings_of_nearby_nodes(home, own_map):
     """It stands at a node, turned away from what that shows: one turn finds it, not a turn all around."""
     turned = 2.4
     eyes = Eyes(home, TOUR[1] @ Pose2(0.05, 0.0, turned))

@@ -167,7 +167,7 @@ def test_a_twin_of_one_wall_is_not_enough(home, elsewhere, own_map):
     assert body.said[-1] == ("cannot find itself on its own map of 7 nodes: no two views agreed at 2 places")
 
 
-def test_where_nothing_is_recognised_it_looks_elsewhere_and_gives_up(elsewhere, own_map):
+def test_without_recognition_it_searches_elsewhere_and_gives_up(elsewhere, own_map):
     body = Body(elsewhere, PLACE)
     resumption = search(own_map, body)
     assert resumption.lost
@@ -176,7 +176,7 @@ def test_where_nothing_is_recognised_it_looks_elsewhere_and_gives_up(elsewhere, 
         "cannot find itself on its own map of 7 nodes: nothing was recognised at 2 places"
     )
     assert "none of 7 nodes is recognised" in body.said
-    assert "nothing here is known: driving on to look from elsewhere" in body.said
+    assert "nothing here is known: driving on to search from elsewhere" in body.said
     assert turned(body) > 2 * math.tau
     assert sum(c.forward for c in body.commands) * BODY.tick == pytest.approx(MOVE, abs=0.05)
 
@@ -187,7 +187,7 @@ def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
     readings[1:8] = 2.0
     body = Body(elsewhere, PLACE)
     assert search(own_map, body, proximity=readings).lost
-    assert "nothing here is known: driving on to look from elsewhere" in body.said
+    assert "nothing here is known: driving on to search from elsewhere" in body.said
     to_the_way = -sum(min(command.turn, 0.0) for command in body.commands) * BODY.tick
     assert to_the_way == pytest.approx(-BEARINGS[4], abs=0.1)
     assert all(command.forward == 0.0 for command in body.commands)
@@ -226,7 +226,7 @@ def test_a_carried_robot_waits_until_it_has_seen_two_views(home, own_map):
     assert body.said[0].startswith("waiting to recognise a place of its own map: node")
 
 
-def test_nor_must_it_turn_if_it_is_carried_far_enough(home):
+def test_a_carried_robot_need_not_turn(home):
     tour = [Pose2(1.0 + 0.4 * k, 2.0) for k in range(5)]
     path = [Pose2(1.0 + 0.05 * k, 2.1) for k in range(50)]
     body = Body(home, path[0])
@@ -244,7 +244,7 @@ def test_a_carried_robot_gives_up_in_the_end(elsewhere, own_map):
 
 
 @pytest.mark.parametrize(("apart", "counts"), [(9.0, False), (0.1, True)])
-def test_two_places_that_look_the_same_are_neither(home, own_map, apart, counts):
+def test_neither_of_two_similar_places_is_accepted(home, own_map, apart, counts):
     """Each of two nodes knows every second landmark; only where they are differs."""
     node = next(iter(own_map.nodes.values()))
     every = np.arange(len(node.landmarks))
@@ -270,7 +270,7 @@ def test_a_recognition_that_is_not_exact_does_not_count(home, own_map):
 
 
 @pytest.mark.parametrize(("scale", "believed"), [(1.03, True), (0.97, True), (1.4, False), (0.5, False)])
-def test_views_agree_by_what_the_wheels_did_in_between(home, own_map, scale, believed):
+def test_views_agree_by_the_odometry_in_between(home, own_map, scale, believed):
     body = Body(home, PLACE)
     path = [PLACE @ Pose2(0.0, 0.0, 0.05 * k) for k in range(80)]
     resumption = search(own_map, body, ticks=80, drives=False, carry=path, scale=scale)

@@ -39,7 +39,7 @@ STARTS = [Pose2(0.25, -0.1, 0.08), Pose2(-0.3, 0.15, -0.12), Pose2(0.1, 0.3, -0.
 
 
 @pytest.mark.parametrize("start", STARTS)
-def test_where_the_robot_stands(walls, description, node, start):
+def test_the_robots_pose(walls, description, node, start):
     localizer = located(walls, description, node, start)
     distance, angle = off(localizer, start)
     assert distance < CENTIMETRES_3
@@ -53,7 +53,7 @@ def test_where_the_robot_stands(walls, description, node, start):
 
 @pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize("slip", [0.0, 0.03])
-def test_where_it_stands_after_a_drive(walls, description, node, start, slip):
+def test_the_pose_after_a_drive(walls, description, node, start, slip):
     """20 frames of curves; with slip the wheels say 3 % too much, which the landmarks must mend."""
     localizer = located(walls, description, node, start)
     pose = start
@@ -86,7 +86,7 @@ def test_frames_without_an_image_are_driven_by_the_wheels(walls, description, no
 
 
 @pytest.mark.parametrize("what", ["turned away", "lights out", "covered"])
-def test_it_knows_when_nothing_is_in_sight(walls, description, node, what):
+def test_it_reports_when_no_landmark_is_visible(walls, description, node, what):
     localizer = located(walls, description, node, STARTS[0])
     pose = STARTS[0]
     for tick in range(12):
@@ -104,7 +104,7 @@ def test_it_knows_when_nothing_is_in_sight(walls, description, node, what):
     assert len(localizer.visible) < 4
 
 
-def test_what_moves_by_itself_is_given_up(walls, description, node):
+def test_moving_landmarks_are_dropped(walls, description, node):
     """The picture that shows less is carried away: its landmarks are dropped, and the pose stays."""
     pose = STARTS[0]
     localizer = located(walls, description, node, pose)

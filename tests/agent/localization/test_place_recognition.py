@@ -112,7 +112,7 @@ def test_the_same_chance_gives_the_same_answer(world, own_map):
     assert one[1].node_from_robot.mean == two[1].node_from_robot.mean
 
 
-def test_two_places_that_look_alike_are_told_and_neighbours_are_not(world, own_map):
+def test_two_similar_places_are_reported_and_neighbours_are_not(world, own_map):
     """One node knows two landmarks of three, the other, a little aside or in another room, the third."""
     view, _ = take_view(world, Pose2(2.5, 2.0), np.random.default_rng(0))
     whole = next(iter(own_map.nodes.values()))

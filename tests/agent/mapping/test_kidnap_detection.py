@@ -60,7 +60,7 @@ def test_a_robot_that_was_carried_off_does_not(walls, continuity, elsewhere):
     assert continuity.compare(elsewhere, seen, 0.0, NOTHING, NOTHING) is FrameOverlap.STRANGE
 
 
-def test_nor_does_one_that_looked_at_a_blank_wall(walls, continuity):
+def test_a_camera_that_faced_a_blank_wall_has_not_failed(walls, continuity):
     blank = np.full((240, 320), 128, np.uint8)
     assert continuity.compare(blank, walls.render(HERE), 0.0, NOTHING, NOTHING) is FrameOverlap.STRANGE
 
@@ -72,7 +72,7 @@ def test_in_the_dark_there_is_nothing(walls, continuity):
     assert continuity.compare(seen, relit(dark, seen), 0.0, NOTHING, NOTHING) is not FrameOverlap.SAME
 
 
-def test_nor_is_there_in_a_dazzled_camera(walls, continuity):
+def test_a_dazzled_camera_has_no_features(walls, continuity):
     seen = walls.render(HERE)
     dazzled = np.clip(seen.astype(int) * 8, 0, 255).astype(np.uint8)
     assert len(np.unique(dazzled)) > 10, "there is still something in it"
@@ -94,13 +94,13 @@ def test_the_same_wall_from_further_back_is_not_the_same(walls, continuity):
     )
 
 
-def test_between_two_blank_walls_nothing_can_be_told(continuity):
+def test_two_blank_walls_cannot_be_told_apart(continuity):
     rng = np.random.default_rng(0)
     one, two = (np.clip(rng.normal(128, 2, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2))
     assert continuity.compare(one, two, 0.0, NOTHING, NOTHING) is FrameOverlap.SAME
 
 
-def test_tracks_have_the_first_say(walls, continuity, elsewhere):
+def test_tracks_decide_first(walls, continuity, elsewhere):
     """Where enough tracks should be in the image the corners are not asked."""
     expected = np.random.default_rng(0).uniform([20, 20], [300, 220], (40, 2))
     found = expected + 3.0
@@ -154,7 +154,7 @@ def mapper(walls, description) -> Mapper:
 
 
 @pytest.mark.parametrize("what", ["dark", "somebody", "grey", "missing", "dimmed"])
-def test_what_passes_leaves_the_tracks_alone(walls, mapper, elsewhere, what):
+def test_passing_objects_leave_the_tracks_alone(walls, mapper, elsewhere, what):
     seen = walls.render(HERE)
     between = {
         "dark": (seen * 0.02).astype(np.uint8),
@@ -192,7 +192,7 @@ def test_a_camera_that_hangs_stops_the_robot_and_not_its_wheels(walls, mapper, f
     assert mapper.anchor_from_robot.distance(Pose2(0.05)) < 0.01
 
 
-def test_what_stays_means_that_the_robot_is_elsewhere(mapper, elsewhere):
+def test_a_lasting_change_means_that_the_robot_was_moved(mapper, elsewhere):
     watch(mapper, [elsewhere] * 9)
     assert mapper.started
     watch(mapper, [elsewhere] * 3)

@@ -25,7 +25,7 @@ steps = st.lists(st.builds(Odometry, st.floats(-0.03, 0.03), st.floats(-0.08, 0.
 
 
 @given(steps, st.floats(-0.03, 0.03), st.floats(-0.03, 0.03))
-def test_wheels_that_are_a_little_wrong_are_believed(moves, longer, wider):
+def test_slightly_wrong_wheels_are_accepted(moves, longer, wider):
     """3 % in the way and in the turns: far worse than any wheel of the simulator."""
     dispute, true = drive(moves, lambda m: Odometry(m.forward * (1 + longer), m.turn * (1 + wider)))
     assert not dispute.with_filter(true)

@@ -7,7 +7,7 @@ import numpy as np
 from mapweave.agent.mapping.prediction_offset import PredictionOffset
 
 
-def test_what_was_noted_comes_back_in_any_order_and_nothing_else():
+def test_recorded_observations_come_back_in_any_order():
     unheld, ids = PredictionOffset(), np.array([9, 2, 5])
     pixels = np.array([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]])
     expected = np.array([[11.0, 18.0], [np.nan, np.nan], [50.0, 57.0]])

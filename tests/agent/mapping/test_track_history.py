@@ -26,7 +26,7 @@ def test_standing_still_adds_nothing():
     assert len(history.sightings(np.array([1]))[0]) == 4
 
 
-def test_what_is_kept_does_not_change_with_the_callers_arrays():
+def test_the_history_keeps_its_own_arrays():
     history = TrackHistory()
     ids, pixels = seen(1, 2)
     history.record(Pose2(), ids, pixels)
@@ -40,7 +40,7 @@ def test_what_is_kept_does_not_change_with_the_callers_arrays():
     st.lists(st.sets(st.integers(0, 12)), min_size=1, max_size=12),
     st.lists(st.integers(0, 15), unique=True, max_size=10),
 )
-def test_sightings_are_those_that_were_recorded(frames, wanted):
+def test_the_history_returns_the_recorded_observations(frames, wanted):
     history = TrackHistory()
     table: list[dict[int, list[float]]] = []
     for k, frame in enumerate(frames):

@@ -110,7 +110,7 @@ def past(image: np.ndarray, tick: int) -> np.ndarray:
     return shown
 
 
-def test_landmarks_that_somebody_hides_are_found_again(walls, description):
+def test_landmarks_occluded_by_a_person_are_found_again(walls, description):
     tracking, pose = begun(walls, description), Pose2()
     for tick in range(1, 12):
         before, pose = pose, Pose2(0.02 * tick)

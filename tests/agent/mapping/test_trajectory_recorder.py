@@ -30,7 +30,7 @@ def seen(tick: int, proximity: tuple[float, ...] = (1.0, 3.0)) -> Observation:
     return Observation(tick * 100_000_000, STILL, None, np.array(proximity))
 
 
-def test_a_moment_a_second_with_what_the_sensors_read(clocked):
+def test_one_moment_a_second_with_the_readings(clocked):
     wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
     wayside.clear(0)
     for tick in range(1, 46):
@@ -41,7 +41,7 @@ def test_a_moment_a_second_with_what_the_sensors_read(clocked):
     assert wake.distances == pytest.approx(np.tile([1.0 + clocked.radius, 3.0 + clocked.radius], (4, 1)))
 
 
-def test_a_reading_that_is_missing_says_nothing(clocked):
+def test_a_missing_reading_carries_no_information(clocked):
     wayside = TrajectoryRecorder(clocked, TrajectoryRecorderSettings())
     wayside.clear(0)
     for tick, proximity in ((10, (2.0, 2.0)), (20, ()), (30, (2.0, 2.0))):
@@ -86,7 +86,7 @@ def test_moments_before_a_view_that_became_no_node_belong_to_the_next(clocked):
     )  # fmt: skip
 
 
-def test_a_mapped_drive_leaves_a_wake_where_the_robot_was(walls, clocked):
+def test_a_mapped_drive_records_the_trajectory(walls, clocked):
     """Forward and back before photographs: one node, whose wake is the true way."""
     mapper = Mapper(MapId("r0", 1), clocked)
     way = [*np.arange(0.0, 0.6, 0.025), *np.arange(0.6, 0.2, -0.025)]

@@ -116,7 +116,7 @@ def drawn_drive(rng: np.random.Generator) -> tuple[Scene, Pose2, np.ndarray]:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_wherever_there_is_a_way_it_gets_there(seed):
+def test_it_arrives_if_there_is_a_way(seed):
     rng = np.random.default_rng([seed, 77])
     arrived, room = drive(*drawn_drive(rng), rng)
     assert arrived
@@ -144,7 +144,7 @@ def test_as_near_as_it_can_get_to_what_is_walled_in():
     assert room > 0.03
 
 
-def test_steering_looks_where_it_goes():
+def test_steering_faces_the_direction_of_motion():
     """Nothing ahead: straight on. A wall ahead: it turns, though that leads nowhere yet."""
     arcs = DynamicWindow(ROBOT)
     free = arcs.toward(np.array([1.0, 0.0]), np.zeros((0, 2)), 0.26, 0.6)
@@ -157,7 +157,7 @@ def test_steering_looks_where_it_goes():
     assert held.forward <= 0.0
 
 
-def test_the_clearance_of_drawn_scenes_is_what_a_distance_transform_says():
+def test_clearance_agrees_with_a_distance_transform():
     """The test's own geometry, against another."""
     scene = drawn_scene(np.random.default_rng(8))
     solid = scene.room(GRID) <= -ROBOT.radius + 1e-9
@@ -165,7 +165,7 @@ def test_the_clearance_of_drawn_scenes_is_what_a_distance_transform_says():
     assert np.abs(other - scene.room(GRID))[~solid].max() < 1.5 * STEP
 
 
-def test_a_target_far_beyond_the_grid_costs_no_more_than_one_at_its_border():
+def test_a_target_beyond_the_grid_costs_no_more_than_at_its_border():
     """A leg of a million metres once made a line of forty million points: 15 s and 2.8 GB."""
     scene, rng = Scene([[1.0, -0.6, 1.2, 0.6]], []), np.random.default_rng(0)
     for wanted in (Pose2(3.2, 0.0, 0.0), Pose2(1e6, 0.0, 0.0), Pose2(1e6, -1e6, 0.0)):

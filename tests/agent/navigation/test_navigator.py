@@ -61,7 +61,7 @@ def blocked_trial(home: World, forget: float = 15.0) -> tuple[Trial, list[tuple[
     return trial, routes
 
 
-def test_a_blocked_robot_says_what_blocks_it_reports_it_and_waits(home):
+def test_a_blocked_robot_reports_the_obstacle_and_waits(home):
     trial, routes = blocked_trial(home)
     trial.run(40.0, lambda: len(routes) >= 2)
     assert routes[0][1].blocked == ()
@@ -105,7 +105,7 @@ def test_it_goes_around_by_another_way(home):
     assert nav.tally.edges == 1 and nav.tally.skipped == 0, "it drove to the node in between"
 
 
-def test_parking_that_comes_to_no_end_is_tried_anew_before_it_is_a_block(home):
+def test_endless_parking_is_retried_before_it_is_a_block(home):
     """Almost at the goal, held there by nothing that anybody else could meet."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
     follower = RouteFollowerSettings(blind=1e9, parking_patience=3.0)
@@ -157,7 +157,7 @@ def test_without_a_server_its_own_map_leads_the_way(home, own_map):
     assert "not in the map" in onboard_route(own_map, nodes[0], C).reason
 
 
-def test_a_goal_that_shows_nothing_is_reached_by_its_neighbours_and_said_to_be(home):
+def test_a_goal_without_features_is_reached_by_its_neighbours(home):
     """The goal has no landmarks: the robot stands there by what it knows of A, looks again, has arrived."""
     eyes = Eyes(home, Pose2(2.0, 2.0))
     start = eyes.pose
@@ -199,7 +199,7 @@ def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_pose_is_not(h
     assert fixed == [True, False]
 
 
-def test_where_it_sees_nothing_it_knows_it_drives_on_a_little_before_it_counts_as_lost(home):
+def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
     """A long way without a view: by wheels as far as `blind`, twice `further`, and only then it is lost."""
     eyes = Eyes(home, Pose2(0.5, 2.0))
     settings = NavigatorSettings(follower=RouteFollowerSettings(blind=1.0), further=0.5, looks=2)

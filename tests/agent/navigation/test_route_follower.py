@@ -9,7 +9,7 @@ from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_detector import Expected, NodeDetector, NodeDetectorSettings
 from mapweave.agent.navigation.local_planner import LocalPlanner
 from mapweave.agent.navigation.progress_monitor import ProgressMonitor
-from mapweave.agent.navigation.route_follower import MOST_LOOKED_FOR, RouteFollower, RouteProgress
+from mapweave.agent.navigation.route_follower import MOST_CANDIDATES, RouteFollower, RouteProgress
 from mapweave.agent.navigation.route_follower_settings import RouteFollowerSettings
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.servo.servo_step import ServoStep
@@ -56,7 +56,7 @@ def follower_at_the_goal(node: Node) -> RouteFollower:
 @pytest.mark.parametrize(
     "begin", [Pose2(-0.03, 0.0, 0.0), Pose2(-0.01, 0.02, -0.015), Pose2(0.02, -0.02, 0.02)]
 )
-def test_slid_tracks_do_not_park_the_robot_beside_the_goal(walls, node, begin):
+def test_drifted_tracks_do_not_park_the_robot_next_to_the_goal(walls, node, begin):
     """The robot believes to be parked, 2 to 3 cm off. It looks afresh, and drives the rest."""
     follower, pose = follower_at_the_goal(node), begin
     odometry = Odometry(0.0, 0.0)
@@ -96,7 +96,7 @@ def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch
     assert abs(pose.heading) < np.radians(1.0)
 
 
-def test_who_sees_nothing_of_the_goal_is_not_there(walls, node):
+def test_a_robot_that_sees_nothing_of_the_goal_has_not_arrived(walls, node):
     follower = follower_at_the_goal(node)
     dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
     seen = []
@@ -109,7 +109,7 @@ def test_who_sees_nothing_of_the_goal_is_not_there(walls, node):
     assert seen[-1] is RouteProgress.UNSURE
 
 
-def test_a_fresh_look_takes_over_only_for_many_more_landmarks(walls, node):
+def test_a_new_detection_replaces_tracks_only_with_many_more_landmarks(walls, node):
     """Tracks have been filtered for a while; a look that knows hardly more has not."""
     lens, pose = Lens(ROBOT.camera, ROBOT.distortion), Pose2(-0.3, 0.1, -0.1)
     image = walls.render(pose)
@@ -162,7 +162,7 @@ def test_headway_counts_since_the_robot_came_nearer(distances):
         assert headway.best == best
 
 
-def test_a_route_with_a_thousand_nodes_in_one_place_costs_a_few_looks(node, monkeypatch):
+def test_a_route_with_a_thousand_nodes_in_one_place_needs_few_detections(node, monkeypatch):
     tried = []
     monkeypatch.setattr(NodeDetector, "find", lambda self, image, wanted: tried.append(len(wanted)))
     lens = Lens(ROBOT.camera, ROBOT.distortion)
@@ -175,4 +175,4 @@ def test_a_route_with_a_thousand_nodes_in_one_place_costs_a_few_looks(node, monk
     for tick in range(8):
         follower.step(Observation(tick, Odometry(0.0, 0.0), np.zeros((240, 320), np.uint8)))
     assert tried
-    assert max(tried) <= MOST_LOOKED_FOR + 1
+    assert max(tried) <= MOST_CANDIDATES + 1

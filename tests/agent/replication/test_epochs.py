@@ -60,9 +60,7 @@ def bus(hub: MemoryHub) -> Iterator[MemoryBus]:
     made.close()
 
 
-def test_a_server_tells_the_newest_map_that_is_on_its_disk(
-    hub: MemoryHub, bus: MemoryBus, tmp_path: Path
-) -> None:
+def test_a_server_reports_the_newest_map_on_its_disk(hub: MemoryHub, bus: MemoryBus, tmp_path: Path) -> None:
     with ExitStack() as stack:
         store = Store(tmp_path / "s0.sqlite")
         stack.callback(store.close)
@@ -78,7 +76,7 @@ def test_a_server_tells_the_newest_map_that_is_on_its_disk(
         assert newest_on_server(bus, KEYS, "s1", "r0", 0.0) is None
 
 
-def test_who_answers_nonsense_is_not_believed(hub: MemoryHub, bus: MemoryBus) -> None:
+def test_nonsense_answers_are_ignored(hub: MemoryHub, bus: MemoryBus) -> None:
     said = [b"\x00", NewestMap(LARGEST + 1).encode()]
     liar = MemoryBus(hub)
 

@@ -53,7 +53,7 @@ def as_bytes(changes: list[Change]) -> list[bytes]:
     return [encode_change(change) for change in changes]
 
 
-def test_what_was_appended_comes_back_after_a_restart(path: Path) -> None:
+def test_appended_changes_come_back_after_a_restart(path: Path) -> None:
     journal = Journal(path, "r0")
     map_id = journal.open_map(None)
     assert map_id == MAP

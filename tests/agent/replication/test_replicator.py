@@ -147,7 +147,7 @@ def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent) -> Non
     assert agent.journal.head(MAP) == 0
 
 
-def test_a_full_disk_is_said_once_and_tried_again(
+def test_a_full_disk_is_logged_once_and_retried(
     agent: Agent, server: HandServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     tries: list[int] = []
@@ -178,7 +178,7 @@ def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path) -> None:
     journal.close()
 
 
-def test_the_beacon_says_how_long_the_log_is_and_what_is_known(agent: Agent, server: HandServer) -> None:
+def test_the_beacon_has_the_length_of_the_log_and_the_watermarks(agent: Agent, server: HandServer) -> None:
     eventually(lambda: server.heads)
     assert server.heads[0] == Head(agent.log_id, 0, {})
     agent.replicator.submit(bodies(1, 3), 0)
@@ -266,7 +266,7 @@ def test_a_server_that_has_more_than_the_disk(
     assert agent.replicator.status().unacknowledged == 3
 
 
-def test_refusals_are_said_once(agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture) -> None:
+def test_refusals_are_logged_once(agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture) -> None:
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     with caplog.at_level(logging.WARNING):

@@ -97,7 +97,7 @@ def test_retired_numbers_are_not_given_again(tmp_path: Path) -> None:
     assert kept.next_number == 8
 
 
-def test_a_damaged_node_is_missing_with_its_edges_and_this_is_said(tmp_path: Path) -> None:
+def test_a_damaged_node_is_missing_with_its_edges_and_reported(tmp_path: Path) -> None:
     kept = kept_of(tmp_path / "j", [node(1), node(2), edge(3, 1, 2), node(4), edge(5, 1, 4)], damage=(4,))
     assert numbers(kept) == [1, 2, 3]
     assert kept.next_number == 6
@@ -118,7 +118,7 @@ def test_a_damaged_retirement_still_retires(tmp_path: Path) -> None:
     assert numbers(kept_of(tmp_path / "j", log, damage=(4, 5))) == [1]
 
 
-def test_an_older_state_stands_where_the_newer_one_is_damaged(tmp_path: Path) -> None:
+def test_an_older_state_is_used_where_the_newer_is_damaged(tmp_path: Path) -> None:
     kept = kept_of(tmp_path / "j", [node(1, 1.0), node(1, 2.0)], damage=(2,))
     (put,) = kept.contents
     assert isinstance(put, NodePut)

@@ -24,7 +24,7 @@ poses = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3.1, 3.1))
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(pose_vector=poses, seed=st.integers(0, 10_000), forward=st.sampled_from([0.0, 0.1]))
-def test_slack_says_how_many_landmarks_the_camera_sees(
+def test_the_margin_counts_visible_landmarks(
     pose_vector: tuple[float, float, float], seed: int, forward: float, robot: RobotDescription, seen: Seen
 ) -> None:
     rng = np.random.default_rng(seed)

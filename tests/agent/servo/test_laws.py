@@ -38,7 +38,7 @@ def test_polar_coordinates_round_trip(rho: float, phi: float, beta: float) -> No
 
 
 @given(rho_, phi_, beta_, st.floats(0.3, 6.0), st.floats(-1.0, 1.0))
-def test_bearing_is_what_the_camera_measures(
+def test_the_bearing_agrees_with_the_camera(
     rho: float, phi: float, beta: float, depth: float, gamma: float
 ) -> None:
     camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, 0.2)

@@ -77,7 +77,9 @@ def test_a_post_in_the_way_is_not_touched(robot: RobotDescription, simulate: Cal
     assert run.parked
 
 
-def test_walled_in_it_says_that_it_is_stuck(robot: RobotDescription, simulate: Callable[..., Any]) -> None:
+def test_a_walled_in_robot_reports_that_it_is_stuck(
+    robot: RobotDescription, simulate: Callable[..., Any]
+) -> None:
     angles = np.linspace(0, 2 * math.pi, 80)
     ring = np.column_stack([-1.6 + 0.35 * np.cos(angles), 0.35 * np.sin(angles)])
     rng = np.random.default_rng(7)

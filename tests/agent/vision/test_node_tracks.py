@@ -52,7 +52,7 @@ def test_they_go_where_the_landmarks_go(walls, description, node, tracks, pairs)
     assert np.median(np.linalg.norm(there - tracks.pixels, axis=1)[known]) < 1.0
 
 
-def test_who_is_refused_twice_in_a_row_is_given_up(tracks):
+def test_a_track_rejected_twice_in_a_row_is_dropped(tracks):
     ids = tracks.ids.copy()
     bad, wavering = ids[0], ids[1]
     assert not len(tracks.judge(~np.isin(ids, [bad, wavering])))
@@ -63,7 +63,7 @@ def test_who_is_refused_twice_in_a_row_is_given_up(tracks):
     assert len(tracks.pixels) == len(ids) - 1
 
 
-def test_a_fresh_look_brings_all_back_and_forgets_the_strikes(walls, tracks, features, pairs):
+def test_a_new_detection_restores_all_tracks_and_resets_the_rejections(walls, tracks, features, pairs):
     ids = tracks.ids.copy()
     tracks.judge(ids != ids[0])
     tracks.follow(np.full_like(walls.render(HERE), 3), np.full((len(ids), 2), np.nan))

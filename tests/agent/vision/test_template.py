@@ -117,7 +117,7 @@ def test_growth_and_light_are_seen_through(pictures, scale, light):
     assert np.median(np.abs(match.templates.scales[match.held] - scale)) < 0.02
 
 
-def test_what_looks_different_is_not_held(pictures):
+def test_different_patches_are_not_held(pictures):
     image, other = pictures.photograph("camera"), pictures.photograph("brick")
     matcher = TemplateMatcher()
     templates = matcher.cut(image, SPOTS)
@@ -129,7 +129,7 @@ def test_what_looks_different_is_not_held(pictures):
     assert not (np.linalg.norm(far.raw - SPOTS, axis=1) < 1.0).any(), "nothing is pulled from far away"
 
 
-def test_a_blank_patch_has_no_looks_and_does_no_harm():
+def test_a_blank_patch_is_harmless():
     blank = np.full((240, 320), 100, np.uint8)
     matcher = TemplateMatcher()
     match = matcher.match(matcher.cut(blank, SPOTS), blank, SPOTS)
@@ -146,7 +146,7 @@ def test_patches_at_the_border_are_left_alone(pictures):
     assert np.array_equal(match.raw, at)
 
 
-def test_a_patch_that_has_grown_too_much_is_cut_anew(pictures):
+def test_a_patch_that_has_grown_too_much_is_cut_again(pictures):
     image = pictures.photograph("camera")
     matcher = TemplateMatcher()
     spots = 159.5 + np.array([[-20.0, -60], [10, -45], [15, -20], [-10, -35], [25, -60], [-30, -40]])

@@ -158,7 +158,7 @@ def test_errors_do_not_add_up(pictures, name):
     assert worst < 0.6 * drifted_worst
 
 
-def test_age_and_hold_are_told(pictures):
+def test_age_and_hold_are_returned(pictures):
     image = pictures.photograph("camera")
     tracker = followed(image)
     assert not tracker.ages.any()

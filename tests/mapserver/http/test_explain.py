@@ -77,12 +77,12 @@ def test_maps_and_nodes_are_explained(served: Web) -> None:
         ("?a=r0.1.1&b=r9.1.1", "there is no map r9.1; known are: r0.1, r1.1"),
     ],
 )
-def test_what_cannot_be_explained_is_one_line(served: Web, query: str, words: str) -> None:
+def test_unknown_nodes_are_reported_in_one_line(served: Web, query: str, words: str) -> None:
     status, told = ask(served, query)
     assert status == 400 and words in told["error"] and "\n" not in told["error"]
 
 
-def test_a_busy_server_says_when(served: Web, desk: Desk) -> None:
+def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
     desk.refusal = Busy(0.5)
     status, told = ask(served, "")
     assert status == 503 and told["retry_after"] == 0.5
@@ -118,7 +118,7 @@ def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: py
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_the_page_tells_the_way_from_its_form_and_from_its_address(
+def test_the_page_shows_the_route_of_its_form_and_of_its_address(
     served: Web, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
@@ -141,7 +141,7 @@ def test_the_page_tells_the_way_from_its_form_and_from_its_address(
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_what_has_happened_is_told_newest_first(
+def test_the_history_is_listed_newest_first(
     served: Web, desk: Desk, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     shown = "return [...document.querySelectorAll('#past li')].map(one => one.textContent)"
@@ -162,7 +162,7 @@ def test_what_has_happened_is_told_newest_first(
         ]
 
 
-def test_what_has_happened_is_told_with_its_time(served: Web, desk: Desk) -> None:
+def test_the_history_is_listed_with_times(served: Web, desk: Desk) -> None:
     desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no"),)
     with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
         (one,) = json.load(reply)["history"]

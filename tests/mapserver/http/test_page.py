@@ -60,14 +60,14 @@ def test_a_picture_is_answered_on_the_page(page: Browser, desk: Desk, image: Pat
     assert desk.views[-1].camera.fx == pytest.approx(80.0)
 
 
-def test_no_distance_is_shown_that_nobody_knows(page: Browser, desk: Desk, image: Path) -> None:
+def test_no_unknown_distance_is_shown(page: Browser, desk: Desk, image: Path) -> None:
     desk.answer = PLACE
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "place")
     assert page.run(ROWS)[1] == ["r0.1.7", "not known", "not known", "6°", "90 %"]
 
 
-def test_what_goes_wrong_is_said_on_the_page(page: Browser, desk: Desk, image: Path) -> None:
+def test_errors_are_shown_on_the_page(page: Browser, desk: Desk, image: Path) -> None:
     desk.refusal = InvalidValue("<b>this</b> is no place")
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "failed")

@@ -70,7 +70,7 @@ def test_an_image_in_and_json_out(served: Web, desk: Desk) -> None:
     assert all(len(view) > 20 for view in desk.views)
 
 
-def test_the_camera_as_it_is_said(served: Web, desk: Desk) -> None:
+def test_the_camera_as_it_is_given(served: Web, desk: Desk) -> None:
     assert post(served, "?hfov=90&height_m=0.3&forward_m=0.1")[0] == 200
     camera = desk.views[-1].camera
     assert (camera.width, camera.height) == (160, 120)
@@ -284,14 +284,14 @@ def test_own_pages_ask_by_any_name_of_this_machine(served: Web, host: str) -> No
         assert post(served, **headers)[0] == 200
 
 
-def test_a_busy_server_says_when_to_come_again(served: Web, desk: Desk) -> None:
+def test_a_busy_server_gives_a_retry_time(served: Web, desk: Desk) -> None:
     desk.refusal = Busy(1.26)
     status, headers, content = ask(served, "POST", "/relocalize", picture())
     assert (status, headers["Retry-After"]) == (503, "2")
     assert json.loads(content) == {"error": "busy, retry after 1.3 s", "retry_after": 1.26}
 
 
-def test_a_defect_is_told_and_logged(served: Web, desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_defect_is_answered_and_logged(served: Web, desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
     desk.refusal = ZeroDivisionError("a defect")
     assert post(served) == (500, {"error": "the server failed: a defect"})
     assert "ZeroDivisionError" in caplog.text
@@ -329,7 +329,7 @@ def test_the_page_and_the_status(served: Web) -> None:
         ("POST", "/static/why.js", 405),
     ],
 )
-def test_what_is_not_there(served: Web, method: str, path: str, status: int) -> None:
+def test_missing_pages(served: Web, method: str, path: str, status: int) -> None:
     got, headers, content = ask(served, method, path, b"x" if method == "POST" else None)
     assert (got, headers["Content-Type"]) == (status, "application/json")
     assert json.loads(content)["error"]
@@ -365,7 +365,7 @@ def test_lengths_that_are_refused_before_anything_is_read(served: Web, head: byt
     assert got.count(b"HTTP/1.1") == 1
 
 
-def test_a_body_that_is_too_long_gets_its_answer_all_the_same(served: Web) -> None:
+def test_a_too_long_request_gets_an_answer(served: Web) -> None:
     status, answer = post(served, body=bytes(MOST_BYTES + 1))
     assert (status, answer) == (413, {"error": "at most 16 MiB are taken"})
 
@@ -373,7 +373,7 @@ def test_a_body_that_is_too_long_gets_its_answer_all_the_same(served: Web) -> No
 HALF = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nabc"
 
 
-def test_who_hangs_up_or_dawdles_holds_up_nobody(desk: Desk) -> None:
+def test_closed_or_slow_connections_block_no_other(desk: Desk) -> None:
     with Web(("127.0.0.1", 0), desk, patience=0.5) as served:
         # Nobody is left who would read an answer.
         assert raw(served, HALF, close=True) == b""
@@ -409,7 +409,7 @@ def test_a_head_that_never_ends_is_dropped(desk: Desk) -> None:
         assert drip(slow, b"x") == b""
 
 
-def test_who_takes_nothing_of_an_answer_is_dropped(desk: Desk) -> None:
+def test_a_client_that_reads_nothing_is_dropped(desk: Desk) -> None:
     desk.happenings = (MapEvent(10**18, MapEventKind.RULED, "no" * 2000),) * 3000
     with (
         Web(("127.0.0.1", 0), desk, limits=Limits(stall=0.5)) as served,
@@ -438,7 +438,7 @@ def drip(connection: socket.socket, piece: bytes) -> bytes:
     raise AssertionError("it may go on for ever")
 
 
-def test_thousands_of_half_open_connections_keep_nobody_out(served: Web) -> None:
+def test_thousands_of_half_open_connections_block_no_other(served: Web) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
     half = []
@@ -471,7 +471,7 @@ def test_thousands_of_half_open_connections_keep_nobody_out(served: Web) -> None
         (b"X: a\x00b\r\nContent-Length: 3\r\n", b"400"),
     ],
 )
-def test_requests_that_say_two_things_are_answered_once(served: Web, head: bytes, status: bytes) -> None:
+def test_ambiguous_requests_are_answered_once(served: Web, head: bytes, status: bytes) -> None:
     """What stands behind the first request is never taken for a second one."""
     got = raw(
         served,

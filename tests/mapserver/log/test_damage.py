@@ -248,7 +248,7 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_a_flipped_bit_anywhere_is_healed_or_said_in_one_line(
+def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
     whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     logs, maps = truth(whole)
@@ -277,9 +277,7 @@ def test_a_flipped_bit_anywhere_is_healed_or_said_in_one_line(
     assert fleet.served() == maps
 
 
-def test_what_is_known_of_a_log_may_be_lost(
-    whole: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_state_of_a_log_may_be_lost(whole: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
     """Its robot may not be there: its map is served all the same, and its log goes on when it comes."""
     logs, maps = truth(whole)
     disk = sqlite3.connect(fleet.path)
@@ -309,7 +307,7 @@ def test_damage_is_remembered_until_the_robot_comes(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("bit", range(8))
-def test_a_damaged_key_misleads_nobody(whole: Path, fleet: Fleet, bit: int) -> None:
+def test_a_damaged_key_misleads_no_reader(whole: Path, fleet: Fleet, bit: int) -> None:
     """A row that claims to be of another map: what it was stands between its neighbours."""
     logs, maps = truth(whole)
     one = MapId("r1", 1)
@@ -345,7 +343,7 @@ def test_a_change_that_this_program_cannot_read_costs_only_itself(
     fleet.stop_server()
 
 
-def test_a_damaged_ruling_costs_only_itself(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
     disk = sqlite3.connect(fleet.path)
     disk.execute("UPDATE ruling SET body = body || x'00' WHERE number = 2")
     disk.commit()
@@ -356,14 +354,14 @@ def test_a_damaged_ruling_costs_only_itself(fleet: Fleet, caplog: pytest.LogCapt
     store.close()
 
 
-def test_rulings_are_no_more_than_can_be_read_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store_module, "MAX_RULINGS", 7)
     store = Store(fleet.path)
     book = RulingBook(store)
     ruling = book.rulings.made[0]
     for k in range(2):
         book.add(replace(ruling, stamp_ns=100 + k))
-    with pytest.raises(InvalidValue, match="the record of rulings is full: 7"):
+    with pytest.raises(InvalidValue, match="the record of manual constraints is full: 7"):
         book.add(ruling)
     assert len(book.rulings.made) == 7
     store.close()

@@ -22,7 +22,7 @@ def test_changes_are_applied_and_acknowledged(server: Server, agent: HandAgent) 
     assert server.store.watermark(MAP) == 3
 
 
-def test_a_change_is_on_the_disk_before_anybody_hears_of_it(server: Server, agent: HandAgent) -> None:
+def test_a_change_is_on_the_disk_before_it_is_acknowledged(server: Server, agent: HandAgent) -> None:
     stored: list[int] = []
     server.on_change = lambda change: stored.append(server.store.watermark(MAP) - change.sequence)
     agent.publish(1)
@@ -78,7 +78,7 @@ def test_changes_that_the_agent_has_pruned_leave_holes(server: Server, agent: Ha
     assert server.store.watermark(MAP) == 8
 
 
-def test_a_beacon_that_knows_less_is_told_again(server: Server, agent: HandAgent) -> None:
+def test_a_beacon_with_a_low_watermark_gets_another_acknowledgement(server: Server, agent: HandAgent) -> None:
     agent.publish(1)
     eventually(lambda: len(agent.acks) == 1)
     agent.beacon(1, s0=1)
@@ -144,7 +144,7 @@ def test_the_pause_doubles_and_a_sign_of_life_ends_it() -> None:
     assert one.pull_at - now == 1.0
 
 
-def test_memory_for_what_is_ahead_is_bounded() -> None:
+def test_memory_for_changes_ahead_is_bounded() -> None:
     one = AgentLog(MAP, 1, PullSettings(ahead=10))
     for sequence in range(2, 100):
         one.offer(Entry(sequence, b"", "x"))
@@ -155,7 +155,7 @@ def test_memory_for_what_is_ahead_is_bounded() -> None:
     assert min(one.ahead) == 6
 
 
-def test_what_comes_while_closing_is_no_error(server: Server, agent: HandAgent) -> None:
+def test_messages_while_closing_are_no_error(server: Server, agent: HandAgent) -> None:
     for sequence in range(1, 50):
         agent.publish(sequence)
     server.ingest.close()

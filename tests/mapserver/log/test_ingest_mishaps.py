@@ -99,7 +99,7 @@ def test_a_silent_agent_does_not_hold_up_another(hub: MemoryHub, server: Server,
     other.bus.close()
 
 
-def test_another_log_under_the_same_name_is_told_so(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+def test_another_log_under_the_same_name_is_refused(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
     agent.publish(1)
     eventually(lambda: server.sequences == [1])
     impostor = HandAgent(hub, MAP, LOG_ID + 1)
@@ -125,7 +125,7 @@ def test_messages_that_are_none_are_counted_and_change_nothing(server: Server, a
     eventually(lambda: server.sequences == [1])
 
 
-def test_one_who_chokes_on_a_change_gets_the_next(
+def test_a_consumer_that_fails_on_a_change_gets_the_next(
     server: Server, agent: HandAgent, caplog: pytest.LogCaptureFixture
 ) -> None:
     def choke(change: Change) -> None:

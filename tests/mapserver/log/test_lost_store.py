@@ -58,7 +58,7 @@ def test_a_store_that_was_moved_takes_changes_when_it_is_put_back(tmp_path: Path
     again.close()
 
 
-def test_a_server_whose_store_is_deleted_says_so_and_gets_everything_again(tmp_path: Path) -> None:
+def test_a_server_with_a_deleted_store_reports_it_and_gets_everything_again(tmp_path: Path) -> None:
     hub, path = MemoryHub(), tmp_path / "s0.sqlite"
     bus, journal = MemoryBus(hub), Journal(tmp_path / "journal.sqlite", "r0")
     robot = Replicator(

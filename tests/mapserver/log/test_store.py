@@ -119,7 +119,7 @@ def test_only_the_newest_refusals_are_given(store: Store) -> None:
 @pytest.mark.parametrize(
     ("claimed", "sequence"), [(MapId("r1", 1), 1), (MapId("r0", 2), 1), (MapId("r0", 1), 2)]
 )
-def test_a_change_must_be_what_its_sender_says(claimed: MapId, sequence: int) -> None:
+def test_a_change_must_match_its_log(claimed: MapId, sequence: int) -> None:
     message = encode_change(Change(MAP, 1, 0, NodeRetired(NodeId(*MAP, 1))))
     read = Entry.read(claimed, sequence, message)
     assert isinstance(read.change, str)
@@ -152,9 +152,7 @@ def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.lists(st.integers(1, 12), max_size=8), max_size=12))
-def test_whatever_comes_it_is_a_log(
-    tmp_path_factory: pytest.TempPathFactory, batches: list[list[int]]
-) -> None:
+def test_any_input_makes_a_log(tmp_path_factory: pytest.TempPathFactory, batches: list[list[int]]) -> None:
     """Against the plain meaning: a set of what came, and the longest run from one."""
     store = Store(tmp_path_factory.mktemp("store") / "s")
     expected = 0
@@ -183,7 +181,7 @@ def test_a_transaction_that_fails_leaves_nothing(path: Path, store: Store) -> No
     assert store.apply(MAP, 5, [entry(2), broken(3), entry(4)]).watermark == 4
 
 
-def test_what_the_maps_cost_on_the_wire(store: Store) -> None:
+def test_the_wire_bytes_of_the_maps(store: Store) -> None:
     assert math.isnan(store.traffic().bytes_per_node)
     bodies: list[ChangeBody] = [node_put(1, 100), node_put(1, 120), node_put(2, 50), edge_put(11, 1, 2)]
     entries = [entry(k, body) for k, body in enumerate(bodies, 1)]

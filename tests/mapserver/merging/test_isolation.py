@@ -34,7 +34,7 @@ pairs = st.lists(st.lists(st.integers(0, 9), min_size=1, max_size=3, unique=True
 
 
 @given(pairs, st.permutations(range(10)))
-def test_what_is_kept_works_and_nothing_more_could_be(bad: list[list[int]], order: list[int]) -> None:
+def test_the_good_rows_are_kept_and_usable(bad: list[list[int]], order: list[int]) -> None:
     """Against all sets that fail: no number that was left out could be added."""
 
     def attempt(some: Collection[int]) -> set[int]:
@@ -62,7 +62,7 @@ def test_one_bad_map_of_many_is_found_in_few_attempts() -> None:
     assert attempts <= 2 * 10 + 1
 
 
-def test_what_fails_with_no_map_at_all_is_nobodys_fault() -> None:
+def test_a_failure_without_any_map_sets_no_map_apart() -> None:
     def attempt(some: Collection[int]) -> None:
         raise KeyError("always")
 
@@ -175,7 +175,7 @@ def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
     assert merger.merged().set_apart.keys() == {R1}
 
 
-def test_one_that_was_set_apart_is_tried_again_when_it_has_changed(
+def test_a_map_set_apart_is_tried_again_after_a_change(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     merger = merger_of(told, R0, R1, WORSE)
@@ -199,7 +199,7 @@ def test_one_that_was_set_apart_is_tried_again_when_it_has_changed(
     assert said(merged, R0, R1, WORSE) == said(merger_of(told, R0, R1, WORSE).merged(), R0, R1, WORSE)
 
 
-def test_what_use_is_made_of_the_merged_map_must_work_too(told: dict[MapId, Log]) -> None:
+def test_a_merged_map_that_breaks_its_users_is_set_apart(told: dict[MapId, Log]) -> None:
     merger = merger_of(told, R0, R1, BAD)
 
     def use(merged: MergedMap) -> None:
@@ -227,7 +227,7 @@ def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
     assert merger.merged().set_apart.keys() == {BAD}
 
 
-def test_before_maps_are_compared_the_bad_one_is_left_out(
+def test_a_bad_map_is_left_out_before_comparing(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone_fails(monkeypatch, BAD)
@@ -256,7 +256,7 @@ def test_nodes_that_cannot_be_compared_are_not_linked(
     assert "cannot be compared" in caplog.text and caplog.records[0].levelno == logging.ERROR
 
 
-def test_a_node_of_which_nobody_can_say_what_is_like_it_holds_up_nobody(
+def test_a_node_whose_search_fails_holds_up_no_other(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     merger = merger_of(told, BAD, R0, R1)

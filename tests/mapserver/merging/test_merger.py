@@ -140,7 +140,7 @@ def test_a_map_that_only_others_are_compared_with_is_not_copied(scene: Scene) ->
     assert merger.merged().maps[B] is not after.maps[B]
 
 
-def test_reading_a_store_gives_the_same_as_living_through_it(scene: Scene, merger: Merger) -> None:
+def test_reading_a_store_gives_the_same_as_merging_live(scene: Scene, merger: Merger) -> None:
     other = Merger()
     for map_id, body in scene.logs[B] + scene.logs[A]:
         other.apply(map_id, body)
@@ -236,7 +236,7 @@ def test_elsewhere_is_unknown_with_a_reason(scene: Scene, merger: Merger) -> Non
     assert "3 features" in service.answer(nothing).reason
 
 
-def test_two_rooms_that_look_alike_are_ambiguous() -> None:
+def test_two_similar_rooms_are_ambiguous() -> None:
     rng = np.random.default_rng(7)
     one = room(0, 0, 5, 4, 500, rng)
     # Walls of points hide nothing: what lies far enough off is not seen from the room between.
@@ -335,7 +335,7 @@ def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
     assert legs[0].previous_from_node.mean.distance(scene.truth[start].inverse() @ first) < 0.2
 
 
-def test_long_links_that_nobody_has_driven_are_avoided(scene: Scene, merger: Merger) -> None:
+def test_long_undriven_links_are_avoided(scene: Scene, merger: Merger) -> None:
     merged = merger.merged()
     start, goal = min(scene.truth), max(scene.truth)
     bold = RouterSettings(route=RouteSettings(per_undriven=0.0))
@@ -351,7 +351,7 @@ def test_long_links_that_nobody_has_driven_are_avoided(scene: Scene, merger: Mer
     assert longest(Router(merged)) <= longest(Router(merged, bold))
 
 
-def test_routes_that_are_not_there_say_why(scene: Scene) -> None:
+def test_missing_routes_have_a_reason(scene: Scene) -> None:
     merger = scene.merger(scene.logs[A])
     merger.apply(B, scene.logs[B][13][1])
     router = Router(merger.merged())

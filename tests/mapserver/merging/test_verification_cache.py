@@ -91,7 +91,7 @@ def random_findings(rng: np.random.Generator) -> VerificationCache:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_is_read_is_what_was_saved(seed: int, tmp_path: Path) -> None:
+def test_loading_returns_what_was_saved(seed: int, tmp_path: Path) -> None:
     one = random_findings(np.random.default_rng(seed))
     save(tmp_path / "x", one, "me")
     two = load(tmp_path / "x", "me")
@@ -111,7 +111,7 @@ def test_what_is_read_is_what_was_saved(seed: int, tmp_path: Path) -> None:
         load(tmp_path / "x", "somebody else")
 
 
-def test_who_starts_again_compares_nothing_and_merges_the_same(logged: Log, tmp_path: Path) -> None:
+def test_a_restarted_server_compares_nothing_and_merges_the_same(logged: Log, tmp_path: Path) -> None:
     first = read(logged)
     merged = first.merged()
     assert first.counters.verified > 50 and len(merged.components) == 1
@@ -124,7 +124,7 @@ def test_who_starts_again_compares_nothing_and_merges_the_same(logged: Log, tmp_
     assert same(merged, read(logged, tmp_path / "store").merged())
 
 
-def test_what_came_later_is_compared_with_all(logged: Log, tmp_path: Path) -> None:
+def test_later_nodes_are_compared_with_all(logged: Log, tmp_path: Path) -> None:
     first = read(logged[:-20])
     first.merged()
     saved(first, tmp_path / "store")
@@ -150,7 +150,7 @@ def test_a_node_that_is_no_longer_just_so_is_compared_again(logged: Log, tmp_pat
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "other", "verification", "merging"])
-def test_what_is_damaged_is_made_anew(
+def test_a_damaged_index_is_built_again(
     logged: Log, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = saved_once(logged, tmp_path)
@@ -179,7 +179,7 @@ def test_what_is_damaged_is_made_anew(
 
 
 @pytest.mark.parametrize("fresh", [False, True])
-def test_nobody_is_told_that_nothing_is_known_of_a_new_store(
+def test_a_new_store_is_not_reported_as_unknown(
     tmp_path: Path, fresh: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO):
@@ -202,7 +202,7 @@ def test_a_server_that_ends_before_it_has_merged_leaves_the_file_as_it_is(
     assert path.read_bytes() == before
 
 
-def test_a_merge_before_the_store_is_read_leaves_what_is_known(logged: Log, tmp_path: Path) -> None:
+def test_a_merge_before_the_store_is_read_keeps_earlier_results(logged: Log, tmp_path: Path) -> None:
     """Rulings come first: on a busy machine they were merged alone, and all was compared again."""
     path = saved_once(logged, tmp_path)
     before = path.read_bytes()
@@ -216,9 +216,7 @@ def test_a_merge_before_the_store_is_read_leaves_what_is_known(logged: Log, tmp_
     assert len(merger.merged().components) == 1 and merger.counters.verified == 0
 
 
-def test_a_disk_that_takes_nothing_is_told_of(
-    logged: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_full_disk_is_reported(logged: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     merger = read(logged)
     merger.merged()
     VerificationCacheKeeper(tmp_path / "nowhere" / "store").save(merger, last=True)

@@ -30,7 +30,7 @@ def node(number: int, at: Pose2, seed: int):
     return take_node(WORLD, NodeId("r0", 1, number), at, HERE, np.random.default_rng(seed))
 
 
-def test_a_double_explains_what_both_have_and_is_found_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_aliased_node_explains_common_landmarks_and_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     first, twin = node(1, AT, 2), node(2, AT @ Pose2(0.1, -0.05, 0.1), 3)
     view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.05), np.random.default_rng(4))
     found = recognise(first, view, None, np.random.default_rng(0))
@@ -67,7 +67,7 @@ def nowhere_joined(places: list) -> MergedMap:
     return MergedMap({}, (), (), tuple(frozenset([one.id]) for one in places), poses, graphs)
 
 
-def test_a_place_whose_double_was_not_recognised_is_ambiguous() -> None:
+def test_a_place_whose_twin_was_not_recognised_is_ambiguous() -> None:
     first, twin = node(1, AT, 2), node(2, AT, 3)
     view, _ = take_view(WORLD, AT @ Pose2(0.05, 0.0, 0.02), np.random.default_rng(4))
     found = recognise(first, view, None, np.random.default_rng(0))
@@ -88,7 +88,7 @@ def test_a_place_whose_double_was_not_recognised_is_ambiguous() -> None:
     assert max(one.probability for one in both.candidates) < 0.9
 
 
-def test_what_the_map_has_in_one_place_is_no_double() -> None:
+def test_landmarks_at_one_place_are_not_aliased() -> None:
     first, twin = node(1, AT, 2), node(2, AT, 3)
     view, _ = take_view(WORLD, AT, np.random.default_rng(4))
     found = recognise(first, view, None, np.random.default_rng(0))
@@ -108,7 +108,7 @@ def test_matches_that_a_pose_explains() -> None:
     assert unexplained(one, pairs, pixels, one.camera, Pose2(), 12.0) == 5
 
 
-def test_what_rests_on_one_thing_is_lonely_only_if_the_rest_is_missing() -> None:
+def test_matches_on_one_thing_count_as_isolated_only_if_the_rest_is_missing() -> None:
     one = node(1, AT, 2)
     points = one.landmarks.points_in_robot(one.camera)
     known = np.flatnonzero(one.landmarks.has_depth)
@@ -142,7 +142,7 @@ def test_what_rests_on_one_thing_is_lonely_only_if_the_rest_is_missing() -> None
     assert resting_on(near, one.camera, clutter)
 
 
-def test_one_person_hides_what_lies_in_one_strip_where_hardly_anything_agrees() -> None:
+def test_a_person_occludes_one_strip() -> None:
     """Against all strips that begin at a missing landmark, feature by feature."""
     rng, counts = np.random.default_rng(6), set()
     found = recognise(node(1, AT, 2), take_view(WORLD, AT, np.random.default_rng(4))[0], None, rng)

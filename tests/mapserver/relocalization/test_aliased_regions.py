@@ -88,7 +88,7 @@ def asked(nodes: Sequence[Node], merged: MergedMap, **regions: float) -> Relocal
     return Relocalizer(OnlyTheFirst(nodes, VIEW), by_id.get, merged, settings)
 
 
-def test_neighbours_tell_that_a_room_is_there_twice() -> None:
+def test_neighbours_show_that_a_room_occurs_twice() -> None:
     nodes = here_and_there()
     merged = joined(nodes)
     assert asked(nodes, merged, least_nodes=0).answer(VIEW).certainty is Certainty.FOUND
@@ -107,7 +107,7 @@ AROUND = (Pose2(0.0, 0.05, 1.55), Pose2(0.05, 0.0, -0.95), Pose2(0.0, 0.0, 2.8),
 """From the stop: what shows nothing of what the view shows."""
 
 
-def test_where_nobody_has_looked_it_may_be_the_same() -> None:
+def test_unobserved_places_are_no_evidence() -> None:
     """The nodes around have doubles, all in one direction; where the view's own would be there is none."""
     here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate([SEEN, *AROUND])]
     there = [
@@ -135,12 +135,12 @@ def test_where_nobody_has_looked_it_may_be_the_same() -> None:
     assert asked(few, joined(few), least_nodes=1).answer(VIEW).certainty is Certainty.FOUND
 
 
-def test_what_is_there_once_is_told() -> None:
+def test_unique_landmarks_are_distinct() -> None:
     for nodes in (here_and_there(OTHER), here_and_there()[:3]):
         assert asked(nodes, joined(nodes)).answer(VIEW).certainty is Certainty.FOUND
 
 
-def test_how_many_nodes_must_say_so_and_of_how_much_is_a_setting() -> None:
+def test_the_needed_share_of_nodes_is_a_setting() -> None:
     nodes = here_and_there()[:4]
     merged = joined(nodes)
     # The node that was recognised and one neighbour have a double, the same one.
@@ -174,7 +174,7 @@ def test_maps_that_are_not_merged_have_their_own_frames() -> None:
     assert answer.candidates[1].node.agent == "r1" and answer.candidates[1].merged_from_robot is None
 
 
-def test_what_looks_alike_is_found_out_once_and_kept_true() -> None:
+def test_aliasing_is_cached_and_kept_up_to_date() -> None:
     nodes = here_and_there()
     merged, by_id = joined(nodes), {one.id: one for one in nodes}
     index, alike = OnlyTheFirst(nodes, VIEW), AliasCache(RecognitionSettings())
@@ -214,7 +214,7 @@ def test_a_merge_that_is_undone_is_noticed() -> None:
         assert (again.id in {one.other.id for one in found}) == (again.id in expected)
 
 
-def test_what_is_prepared_is_not_looked_for_when_somebody_asks() -> None:
+def test_prepared_results_are_not_computed_again() -> None:
     nodes = here_and_there()
     service = asked(nodes, joined(nodes))
     index = service._index
@@ -227,7 +227,7 @@ def test_what_is_prepared_is_not_looked_for_when_somebody_asks() -> None:
 
 
 @pytest.mark.parametrize("schedule", [LiveSchedule, LockstepSchedule])
-def test_a_server_finds_out_by_itself_what_nodes_look_like(
+def test_a_server_evaluates_the_aliasing_of_nodes_in_advance(
     schedule: type[Schedule], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes, looked = here_and_there(), list[int]()
@@ -248,7 +248,7 @@ def test_a_server_finds_out_by_itself_what_nodes_look_like(
     assert max(looked) == PREPARED_AT_ONCE
 
 
-def test_landmarks_without_depths_say_nothing_of_regions() -> None:
+def test_landmarks_without_depths_are_in_no_region() -> None:
     nodes = here_and_there()
     found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
     assert found is not None

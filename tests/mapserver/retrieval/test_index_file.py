@@ -59,7 +59,7 @@ def alike(one: PlaceIndex, two: PlaceIndex, views: list[View]) -> bool:
 
 
 @pytest.mark.parametrize("count", [5, 16])
-def test_what_is_read_answers_as_what_was_saved(
+def test_a_loaded_index_answers_as_the_saved_one(
     tmp_path: Path, mapped: tuple[list[Node], list[View]], count: int
 ) -> None:
     nodes, views = mapped
@@ -79,7 +79,7 @@ def test_what_is_read_answers_as_what_was_saved(
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
-def test_nodes_that_the_store_knows_better_are_replaced(
+def test_nodes_that_are_newer_in_the_store_are_replaced(
     tmp_path: Path, mapped: tuple[list[Node], list[View]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes, views = mapped
@@ -175,7 +175,7 @@ def test_it_is_saved_while_nodes_come_and_go(tmp_path: Path, mapped: tuple[list[
     thread.join()
 
 
-def test_a_fingerprint_tells_whatever_changes() -> None:
+def test_any_change_changes_the_fingerprint() -> None:
     rng = np.random.default_rng(3)
     codes = rng.integers(0, 64, (60, 32)).astype(np.uint8)
     whole, order = fingerprint(codes), rng.permutation(60)
@@ -237,7 +237,7 @@ def test_a_server_that_starts_again_has_its_places_at_once(
     store.close()
 
 
-def test_a_full_disk_is_told_and_nothing_half_is_left(
+def test_a_full_disk_is_reported_and_leaves_no_partial_file(
     tmp_path: Path, mapped: tuple[list[Node], list[View]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     index_file.save(tmp_path / "x", filled(mapped[0][:6]), LOGS)

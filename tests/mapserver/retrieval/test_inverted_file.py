@@ -64,7 +64,7 @@ def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes
     assert np.mean(squared[:, 0] < every.min(axis=1) + 1e-4) > 0.9
 
 
-def test_what_is_removed_is_gone_and_the_rest_is_kept(landmarks: tuple[Codes, Ids]) -> None:
+def test_removed_entries_are_gone_and_the_rest_is_kept(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
     cells = filled(codes[:2000], ids[:2000], 64)
     cells.add(codes[2000:], ids[2000:])
@@ -91,9 +91,7 @@ def test_fewer_landmarks_than_cells() -> None:
 
 
 @pytest.mark.parametrize("told", ["all", "others"])
-def test_what_is_forgotten_where_it_lies_is_gone_like_what_is_looked_for(
-    landmarks: tuple[Codes, Ids], told: str
-) -> None:
+def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids], told: str) -> None:
     codes, ids = landmarks
     ids = np.argsort(np.argsort(ids))
     cells, searched = filled(codes, ids, 64), filled(codes, ids, 64)

@@ -88,7 +88,7 @@ def test_overlaps_are_those_of_the_exhaustive_table(building: tuple[World, list[
             assert value == pytest.approx(expected[other], rel=1e-3)
 
 
-def test_nodes_whose_landmarks_are_all_alike_cost_no_more_than_others() -> None:
+def test_nodes_with_equal_landmarks_cost_no_more_than_others() -> None:
     """Pairs of them would grow by the square: 12 million for the third such node."""
     rng, index = np.random.default_rng(5), PlaceIndex()
     nodes = []
@@ -109,7 +109,7 @@ def test_nodes_whose_landmarks_are_all_alike_cost_no_more_than_others() -> None:
     assert len(index.landmarks) == 2 * MOST_LANDMARKS
 
 
-def test_overlaps_in_a_large_fleet_are_exact_of_those_that_are_compared(
+def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(
     building: tuple[World, list[Node], list[Pose2]],
 ) -> None:
     _, nodes, _ = building
@@ -170,7 +170,7 @@ def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[N
 
 
 @pytest.mark.parametrize("told", ["its own", "some of them", "another's", "none"])
-def test_a_node_is_gone_whatever_one_says_of_its_landmarks(
+def test_a_removed_node_stays_removed_despite_its_landmarks(
     building: tuple[World, list[Node], list[Pose2]], told: str
 ) -> None:
     nodes = building[1]
@@ -185,7 +185,7 @@ def test_a_node_is_gone_whatever_one_says_of_its_landmarks(
 
 
 @pytest.mark.parametrize("few", [0, 1000])
-def test_what_is_not_kept_is_gone_however_much_it_is(
+def test_dropped_landmarks_are_removed_at_any_number(
     building: tuple[World, list[Node], list[Pose2]], few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(place_index, "FEW_GONE", few)
@@ -242,7 +242,7 @@ def test_cells_of_which_all_are_searched_answer_like_no_cells(
         assert {node for node, _ in one[:3]} == {node for node, _ in two[:3]}
 
 
-def test_many_at_once_are_the_same_as_one_by_one(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_many_at_once_equal_one_by_one(building: tuple[World, list[Node], list[Pose2]]) -> None:
     world, nodes, tour = building
     one, many = filled(nodes), PlaceIndex()
     many.extend([*nodes, nodes[2]])
@@ -250,7 +250,7 @@ def test_many_at_once_are_the_same_as_one_by_one(building: tuple[World, list[Nod
     assert one.query(view, 9) == many.query(view, 9) and len(many.landmarks) == len(one.landmarks)
 
 
-def test_cells_are_learned_beside_the_questions(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_cells_are_trained_in_the_background(building: tuple[World, list[Node], list[Pose2]]) -> None:
     """What comes and goes while new cells are learned is in them."""
     world, nodes, tour = building
     landmarks = LandmarkIndexSettings(small=300, exact=600, growth=2.0, patience=500, probes=10_000)
@@ -270,7 +270,7 @@ def test_cells_are_learned_beside_the_questions(building: tuple[World, list[Node
     assert set(ours) == set(theirs)
 
 
-def test_an_index_that_cannot_learn_says_so_and_goes_on(
+def test_an_index_that_cannot_be_trained_reports_it_and_goes_on(
     building: tuple[World, list[Node], list[Pose2]],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,

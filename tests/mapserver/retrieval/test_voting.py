@@ -25,13 +25,13 @@ def test_votes_against_plain_loops() -> None:
     )
 
 
-def test_nobody_votes_for_what_is_too_far() -> None:
+def test_distant_descriptors_get_no_votes() -> None:
     found, scores = voting.votes(np.full((3, 2), 1.0, np.float32), np.array([[1, 2]] * 3), 0.5)
     assert len(found) == len(scores) == 0
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_overlaps_against_one_node_at_a_time(seed: int) -> None:
+def test_overlaps_agree_with_one_node_at_a_time(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(0, 400))
     rows, columns = rng.integers(0, 30, n), rng.integers(0, 150, n)

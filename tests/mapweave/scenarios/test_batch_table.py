@@ -55,7 +55,7 @@ def test_median_and_worst_are_of_the_right_side(attempts):
     assert "map_hash" not in by_name
 
 
-def test_of_equals_the_first_seed_is_named_whatever_the_order():
+def test_the_first_seed_of_equals_is_named_in_any_order():
     same = [Attempt(seed, replace(FIGURES, merged_ate_m=0.1, link_recall=0.5)) for seed in (9, 4, 6)]
     for order in (same, same[::-1]):
         assert {s.worst_seed for s in summarise(order) if s.worst is not None} == {4}
@@ -72,7 +72,7 @@ def test_failures_are_named_with_their_reason(attempts):
     assert content["seeds"]["12"]["figures"] is None
 
 
-def test_the_table_says_the_same_to_people(attempts):
+def test_the_table_shows_the_same_numbers(attempts):
     out = io.StringIO()
     Console(file=out, width=120).print(batch_table(attempts, "office [kidnapped]"))
     text = out.getvalue()

@@ -58,7 +58,7 @@ def test_children_of_a_process_that_is_killed_end_by_themselves(tmp_path: Path, 
     assert "Traceback" not in said(tmp_path)
 
 
-def test_a_child_is_ended_and_one_that_failed_is_told(tmp_path: Path) -> None:
+def test_a_child_is_ended_and_a_failed_one_is_reported(tmp_path: Path) -> None:
     with Children(tmp_path) as children:
         children.start(
             "server", ["server", "--listen", f"tcp/127.0.0.1:{free_port()}", "--data", str(tmp_path)]

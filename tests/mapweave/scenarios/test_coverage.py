@@ -70,7 +70,7 @@ def square_drive() -> Trajectory:
     return Trajectory(stamps, np.column_stack([xy, np.zeros(len(xy))]))
 
 
-def test_the_way_of_a_loop_is_what_was_driven():
+def test_the_odometry_of_a_loop_is_that_of_the_drive():
     drive = square_drive()
     start, middle, end = (NodeId("r0", 1, n) for n in (1, 2, 3))
     stamps = {start: 0, middle: int(drive.stamps_ns[50]), end: int(drive.stamps_ns[-1])}

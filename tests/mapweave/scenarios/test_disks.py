@@ -64,7 +64,7 @@ def test_everything_is_there(disks):
     assert record.map_bytes == size
 
 
-def test_what_is_missing_is_counted(disks):
+def test_missing_changes_are_counted(disks):
     changes, _, compare = disks
     # Without the fourth change node 4 is missing; the retirement after it has not come either.
     record = compare(changes[:3])
@@ -76,7 +76,7 @@ def test_nothing_came(disks):
     assert compare([]).unsaved == 2  # nodes 2 and 4; node 1 is retired and its edge with it
 
 
-def test_the_hash_knows_content_and_not_order():
+def test_the_hash_depends_on_content_and_not_on_order():
     first = map_hash([(MAP, [node(1), node(2, 1.0)])])
     assert first == map_hash([(MAP, [node(2, 1.0), node(1)])])
     assert first != map_hash([(MAP, [node(1), node(2, 1.001)])])

@@ -25,7 +25,7 @@ def verdicts(toml: str, figures: Figures = FIGURES) -> dict[str, bool]:
     return {v.name: v.good for v in check(figures, parse_expectations(tomllib.loads(toml)))}
 
 
-def test_each_form_means_what_it_says():
+def test_each_form_is_parsed():
     assert verdicts("components = 1\nmaps = 2") == {"components": True, "maps": False}
     assert verdicts("found = true") == {"found": True}
     assert verdicts("found = false") == {"found": False}
@@ -45,7 +45,7 @@ def test_where_more_is_better_a_plain_number_is_the_least():
     }
 
 
-def test_what_was_not_measured_is_not_good():
+def test_unmeasured_figures_do_not_pass():
     toml = "goal_error_m = 0.05\nreached = false\nfound_s = {min = 0}"
     (first, *others) = check(FIGURES, parse_expectations(tomllib.loads(toml)))
     assert not any(v.good for v in (first, *others))
@@ -84,7 +84,7 @@ def test_bounds_are_included(name, value, low, high):
         ("found = {min = 1}", "is a true or false, it has no min and max"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_in_one_line(toml, words):
+def test_contradicting_options_are_refused_in_one_line(toml, words):
     with pytest.raises(SettingsError) as refusal:
         parse_expectations(tomllib.loads(toml), "a.toml: expect")
     assert words in str(refusal.value)

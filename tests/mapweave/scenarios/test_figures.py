@@ -37,7 +37,7 @@ def test_json_gives_the_same_figures_back(error, found, seconds, ate):
     [({"nodes": "many"}, "nodes"), ({"noodles": 1}, "noodles"), ({"robots": [1]}, "no figures"),
      ({"robots": {"r0": {"nodes": 1}}}, "r0"), ({"components": None}, "components is missing")],
 )  # fmt: skip
-def test_what_is_no_figures_is_refused_in_one_line(change, word):
+def test_invalid_figures_are_refused_in_one_line(change, word):
     with pytest.raises(InvalidFile, match=word) as refusal:
         Figures.from_dict(BARE.as_dict() | change)
     assert "\n" not in str(refusal.value)
@@ -68,7 +68,7 @@ def test_the_page_has_every_figure_once():
 
 
 @given(st.floats())
-def test_what_json_cannot_say_is_none(value):
+def test_non_finite_numbers_are_none_in_json(value):
     assert measured(value) == (value if math.isfinite(value) else None)
 
 

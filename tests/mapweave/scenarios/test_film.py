@@ -85,7 +85,7 @@ def test_closing_twice_is_no_error(tmp_path):
         film.add(frames(1)[0])
 
 
-def test_what_cannot_be_filmed_is_one_line(tmp_path):
+def test_film_errors_are_reported_in_one_line(tmp_path):
     with pytest.raises(InvalidFile, match=r"must end in \.webm"):
         Film(tmp_path / "film.mp4")
     (tmp_path / "file").write_text("in the way")
@@ -105,7 +105,7 @@ def test_a_long_film_waits_for_the_encoder_and_misses_nothing(tmp_path):
     assert len(read(tmp_path / "film.webm")[0]) == 80
 
 
-def test_an_encoder_that_fails_is_one_line_and_holds_nobody_up(tmp_path, monkeypatch):
+def test_a_failing_encoder_is_reported_in_one_line_and_blocks_no_other(tmp_path, monkeypatch):
     writer = cv2.VideoWriter
 
     class Failing:

@@ -105,7 +105,7 @@ def test_robots_have_the_colours_of_the_map(tmp_path):
     assert len(set(colours.values())) == 16
 
 
-def test_trails_grow_fade_out_and_end_where_a_robot_is_carried():
+def test_trajectories_grow_fade_out_and_end_where_a_robot_is_carried():
     scene = FilmFrame(PLAN, ["r0"])
     for tick in range(100):
         frame = scene.draw(snapshot(tick, {"r0": Pose2(1.0 + 0.03 * tick, 1.0)}))
@@ -118,7 +118,7 @@ def test_trails_grow_fade_out_and_end_where_a_robot_is_carried():
     assert at(scene, frame, 4.0, 3.0) not in (FLOOR, PAPER)
 
 
-def test_a_robot_that_is_seen_seldom_has_a_trail_too():
+def test_a_robot_with_rare_poses_has_a_trajectory_too():
     scene = FilmFrame(PLAN, ["r0"])
     for tick in range(0, 100, 20):
         frame = scene.draw(snapshot(tick, {"r0": Pose2(1.0 + 0.03 * tick, 1.0)}))
@@ -171,7 +171,7 @@ def test_layouts_fit_and_nothing_overlaps(robots, length, width, size):
 
 
 @pytest.mark.parametrize(("robots", "size"), [([], (1280, 720)), (["r0"], (100, 720))])
-def test_what_cannot_be_shown_is_refused(robots, size):
+def test_impossible_kidnappings_are_refused(robots, size):
     with pytest.raises(InvalidValue, match="a scene needs"):
         FilmFrame(PLAN, robots, size=size)
 

@@ -95,7 +95,7 @@ def test_seeds_choose_and_the_same_seed_chooses_the_same():
     assert plot(seed=7)[0] == plots[7]
 
 
-def test_with_two_robots_the_goal_may_be_ones_own():
+def test_with_two_robots_the_goal_may_be_its_own():
     where = {"r0": [(2, 3), (1, 1)], "r1": [(6, 3), (6, 1)]}
     goals = set()
     for seed in range(20):
@@ -125,12 +125,12 @@ def test_a_goal_in_the_corridor_is_the_last_resort():
     ],
     ids=["all in one room", "only in the corridor", "poor views", "maps that did not join", "alone"],
 )
-def test_what_cannot_be_shown_is_said(case):
+def test_impossible_kidnappings_are_reported(case):
     with pytest.raises(NothingToShow, match="no room is known to one robot alone"):
         plot(**case)
 
 
-def test_a_room_without_a_free_place_is_said():
+def test_a_room_without_a_free_place_is_reported():
     everywhere = [Pose2(x, y) for x in np.arange(0, 12.2, 0.5) for y in np.arange(2, 6.2, 0.5)]
     with pytest.raises(NothingToShow, match="no free place near the nodes of such a room"):
         plot(occupied=everywhere)
@@ -163,7 +163,7 @@ def test_a_goal_that_the_others_cut_off_is_none():
         plan_kidnapping(merged, components, truth, hall, robots, in_the_gap, 3)
 
 
-def test_a_goal_whose_only_mapped_way_is_taken_is_none():
+def test_a_goal_whose_only_mapped_way_is_blocked_is_not_chosen():
     """There is room to drive around a robot that stands on the way, but nobody has mapped it."""
     hall = FloorPlan((Rectangle.spanning(0, 0, 4, 6, "room 0"), Rectangle.spanning(4, 0, 8, 6, "room 1")), ())
     merged, components, truth = a_map({"r0": [(1, 3)], "r1": [(5, 3), (7, 3)]})

@@ -86,7 +86,7 @@ def test_the_page_shows_the_stream_and_one_frame_can_be_had(live):
     assert get(live, "/other")[0] == 404
 
 
-def test_several_viewers_see_what_comes(live):
+def test_several_viewers_get_the_frames(live):
     live.show(frame(50))
     viewers = [watch(live) for _ in range(3)]
     for viewer in viewers:
@@ -139,7 +139,7 @@ def test_viewers_that_go_away_leave_no_word_behind(live, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_port_in_use_is_one_line(live):
+def test_a_port_in_use_is_reported_in_one_line(live):
     port = urlsplit(live.url).port
     for bad, words in ((port, "the port is taken"), (70000, "must be 0-65535")):
         with pytest.raises(SettingsError) as refusal:
@@ -181,7 +181,7 @@ def test_pages_of_other_sites_cannot_watch(live):
     connection.close()
 
 
-def test_without_what_serves_pages_it_says_which_extra_is_missing(monkeypatch):
+def test_without_the_http_extra_its_name_is_printed(monkeypatch):
     for name in [
         name for name in sys.modules if name.startswith(("mapweave.mapserver.http", "uvicorn", "starlette"))
     ]:
@@ -194,7 +194,7 @@ def test_without_what_serves_pages_it_says_which_extra_is_missing(monkeypatch):
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_a_browser_shows_what_comes_and_says_when_it_is_over(live, tmp_path_factory):
+def test_a_browser_shows_the_frames_and_the_end(live, tmp_path_factory):
     size = "const i = document.querySelector('img'); return i && i.naturalWidth"
     with Browser(tmp_path_factory.mktemp("profile")) as page:
         live.show(frame(9))

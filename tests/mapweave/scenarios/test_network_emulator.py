@@ -62,7 +62,7 @@ def test_it_carries_bytes_both_ways_and_counts_them(cable):
     assert cable.carried == 2 * len(data)
 
 
-def test_cut_it_breaks_and_takes_nobody_until_it_is_restored(cable):
+def test_a_cut_link_breaks_and_accepts_no_connection_until_restored(cable):
     with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
         assert talk(one, b"hello") == b"hello"
         cable.cut()
@@ -77,7 +77,7 @@ def test_cut_it_breaks_and_takes_nobody_until_it_is_restored(cable):
         assert talk(three, b"hello") == b"hello"
 
 
-def test_a_bad_one_is_slow_but_loses_nothing(cable):
+def test_a_bad_network_is_slow_but_loses_nothing(cable):
     cable.worsen(loss=0.5, delay=0.02)
     with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
         began = time.monotonic()

@@ -94,7 +94,7 @@ def test_places_are_aligned_with_the_world(written, eventful):
     assert (np.diff(rows[:, 0]) > 0).all()
 
 
-def test_the_page_says_what_happened(written):
+def test_the_page_shows_the_result(written):
     page = (written[0] / "report.md").read_text()
     assert page.startswith("# staged, seed 3: FAILED\n")
     assert "| link_recall | at least 0.99 |" in page
@@ -105,7 +105,7 @@ def test_the_page_says_what_happened(written):
         assert (written[0] / name).is_file()
 
 
-def test_pictures_show_what_they_should(written):
+def test_pictures_show_their_content(written):
     out, _, _ = written
     image = cv2.cvtColor(cv2.imread(str(out / "map.png")), cv2.COLOR_BGR2RGB).astype(int)
     for colour in ((0x1F, 0x77, 0xB4), (0xD9, 0x5F, 0x02), (0x2A, 0x9D, 0x4B), (0xFF, 0xD7, 0x00)):
@@ -121,7 +121,7 @@ def test_moments_that_are_near_share_a_label():
     assert _labels([]) == []
 
 
-def test_what_an_earlier_trial_left_is_gone_and_what_others_left_is_not(written):
+def test_files_of_an_earlier_trial_are_removed_and_others_are_kept(written):
     out, recording, figures = written
     (out / "r9.truth.tum").write_text("old")
     (out / "notes.txt").write_text("mine")
@@ -149,7 +149,7 @@ def test_a_crash_leaves_no_figures_and_no_halves(written, monkeypatch):
     assert not left & {"figures.json", "errors.png", "report.md"}
 
 
-def test_a_place_that_cannot_be_written_is_one_line(eventful, tmp_path):
+def test_an_unwritable_place_is_reported_in_one_line(eventful, tmp_path):
     recording = eventful.recording()
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InvalidFile, match="cannot be written"):
@@ -168,7 +168,7 @@ def test_an_empty_trial_has_a_folder(staged, tmp_path):
     assert not any("map-1" in name or "nodes" in name for name in names)
 
 
-def test_scoring_writes_nothing_at_home_and_says_nothing(tmp_path):
+def test_scoring_writes_no_file_at_home_and_prints_nothing(tmp_path):
     """The programs of evo keep settings in the home directory and speak; its core does not."""
     program = (
         "import logging, sys\n"

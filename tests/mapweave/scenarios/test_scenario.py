@@ -50,7 +50,7 @@ def refused(tmp_path: Path, text: str, overrides=()) -> str:
     return said
 
 
-def test_what_a_file_says_is_what_is_meant(tmp_path):
+def test_a_file_is_parsed_as_written(tmp_path):
     scenario = load(tmp_path, GOOD)
     assert [robot.name for robot in scenario.robots] == ["r0", "r1"]
     assert scenario.missions == {"r0": "explore", "r1": "explore"}
@@ -106,7 +106,7 @@ def test_robots_of_different_kinds(tmp_path):
         (("[expect]", "[expect"), "try.toml"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(tmp_path, change, said):
+def test_errors_are_reported_in_one_line(tmp_path, change, said):
     text = GOOD.replace(*change)
     assert text != GOOD
     if said is None:  # a world is built when it is needed
@@ -138,7 +138,7 @@ values = st.recursive(
     name=st.sampled_from(["robots", "robot", "world", "events", "expect", "seed", "name", "summary"]),
     value=values,
 )
-def test_whatever_stands_in_a_file_it_is_read_or_refused(tmp_path, monkeypatch, name, value):
+def test_any_file_is_read_or_refused(tmp_path, monkeypatch, name, value):
     path = tmp_path / "try.toml"
     path.write_text(GOOD, encoding="utf-8")
     table = {**tomllib.loads(GOOD), name: value}

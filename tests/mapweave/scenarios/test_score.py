@@ -122,7 +122,7 @@ def test_straight_and_short_ways_have_a_score_where_evo_alone_has_none(ticks):
     assert found.rpe_deg is None
 
 
-def test_times_that_the_truth_does_not_know():
+def test_times_outside_the_truth():
     truth, estimate = wandering(0)
     with pytest.raises(InvalidValue, match="knows no time"):
         score_trajectory(truth, Trajectory(estimate.stamps_ns + 10**12, estimate.poses))
@@ -230,7 +230,7 @@ def test_reached_means_five_centimetres_and_three_degrees(eventful, dx, turn_deg
     assert given_up.goal_s is None
 
 
-def test_a_robot_that_nobody_told_anything(eventful):
+def test_a_robot_without_answers(eventful):
     (lost,) = eventful.lost
     eventful.lost.append(copy.copy(lost))
     eventful.lost[1].fix = None
@@ -261,7 +261,7 @@ def test_a_photographs_truth_is_where_it_was_taken(eventful):
     assert not figures.reached
 
 
-def test_nobody_lost_and_nowhere_to_go(eventful):
+def test_no_lost_robot_and_no_goal(eventful):
     eventful.lost[0].goal = eventful.lost[0].arrived_ns = None
     figures = score(eventful.recording())
     assert figures.found is True
@@ -288,7 +288,7 @@ def test_an_empty_trial_is_scored_without_dividing_by_nothing(staged):
     assert "nan" not in str(figures.as_dict()).lower()
 
 
-def test_a_robot_that_began_anew_counts_by_its_worst_map(staged):
+def test_a_robot_with_several_maps_counts_by_its_worst(staged):
     recording = staged.recording()
     truth, estimate = recording.robots["r0"].truth, next(iter(recording.robots["r0"].estimates.values()))
     bad = Trajectory(

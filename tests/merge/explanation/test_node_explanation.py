@@ -152,7 +152,7 @@ def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap) -> 
     assert prior_odds(merged) > 1
 
 
-def test_witnesses_close_loops_as_poses_composed_one_by_one(merged: MergedMap) -> None:
+def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
     link = between(merged)[1]
     told = explain_nodes(merged, *link.pair)
     s = ConsistencySettings()
@@ -174,14 +174,14 @@ def test_witnesses_close_loops_as_poses_composed_one_by_one(merged: MergedMap) -
         assert witness.agrees == (distance2 < s.gate) and witness.kept
 
 
-def test_what_was_refused_says_what_it_lacks(merged: MergedMap) -> None:
+def test_refused_pairs_say_what_they_lack(merged: MergedMap) -> None:
     refused = next(r for r in merged.refused if r.link is None and r.edge is None)
     told = explain_nodes(merged, refused.a, refused.b)
     assert (told.standing, told.reason) == (Standing.REFUSED, refused.reason)
     assert told.probability is None and len(told.matches) > 0
 
 
-def test_too_few_that_agree_are_told_with_their_pose(merged: MergedMap) -> None:
+def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None:
     link = between(merged)[0]
     strict = VerificationSettings(RecognitionSettings(least_inliers=12))
     # One of the two nodes has kept eleven landmarks, all of which agree.
@@ -205,7 +205,7 @@ def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> Non
     assert told.standing is Standing.UNCOMPARED and "compared now: " in told.reason
 
 
-def test_a_robot_s_own_edge_is_told_with_its_pose(merged: MergedMap) -> None:
+def test_a_robots_own_edge_is_explained_with_its_pose(merged: MergedMap) -> None:
     edge = min(merged.maps[A].edges.values(), key=lambda edge: edge.id)
     told = explain_nodes(merged, edge.b, edge.a)
     assert told.standing is Standing.OWN and told.reason.endswith(f" (edge {edge.id})")
@@ -217,7 +217,7 @@ def test_a_robot_s_own_edge_is_told_with_its_pose(merged: MergedMap) -> None:
     assert np.allclose(told.misfit.off, off, atol=1e-9)
 
 
-def test_a_loop_of_the_robot_s_own_is_told_and_what_is_ruled_of_it() -> None:
+def test_a_robots_own_loop_closure_is_explained_with_its_constraints() -> None:
     merger = fleet()
     first, *_, last = sorted(merger.merged().maps[A].nodes)
     true = merger.merged().relative(first, last)
@@ -264,7 +264,7 @@ def test_two_maps(merged: MergedMap) -> None:
     )
 
 
-def test_what_people_ruled_is_told() -> None:
+def test_manual_constraints_are_listed() -> None:
     merger = fleet()
     link = between(merger.merged())[0]
     ruling = ManualConstraint(link.pair, True, "anna", 0, "no")
@@ -279,7 +279,7 @@ def test_what_people_ruled_is_told() -> None:
     assert not apart.joined and "undone" in apart.reason and len(apart.nearest) == 5
 
 
-def test_a_merge_that_loses_its_support_says_so() -> None:
+def test_a_merge_that_loses_its_support_is_reported() -> None:
     merger = fleet()
     alone = MergedMap.empty()
     before = merger.merged()
@@ -298,7 +298,7 @@ def test_a_merge_that_loses_its_support_says_so() -> None:
     assert partings(parts, before.links, merger.merged()) == ()  # a map without nodes is part of nothing
 
 
-def test_what_joins_at_once_is_told_map_by_map_and_each_link_once() -> None:
+def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
     """A server that starts again joins all maps with one merge; it told some links twice."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
@@ -320,7 +320,7 @@ def test_what_joins_at_once_is_told_map_by_map_and_each_link_once() -> None:
     assert count == sum(not link.within for link in merged.links)
 
 
-def test_of_many_maps_that_part_the_number_is_told() -> None:
+def test_the_number_of_many_separated_maps_is_given() -> None:
     one = MapId("a", 1)
     node = NodeId(*one, 1)
     sides = [[MapId(f"{side}{k}", 1) for k in range(count)] for side, count in (("x", 300), ("y", 2))]
@@ -331,7 +331,7 @@ def test_of_many_maps_that_part_the_number_is_told() -> None:
     assert words.startswith("300 maps with x0.1 and y0.1+y1.1 are no longer one map: ")
 
 
-def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
+def test_a_split_by_a_retired_map_names_the_person() -> None:
     """Two robots in two rooms, and one that has been in both."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng)
@@ -362,7 +362,7 @@ def test_what_parts_with_a_retired_map_says_who_retired_it() -> None:
         ),
     ],
 )
-def test_what_is_not_there_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str) -> None:
+def test_missing_nodes_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str) -> None:
     with pytest.raises(InvalidValue, match=words):
         explain_nodes(merged, a, b)
     with pytest.raises(InvalidValue, match="two maps"):

@@ -19,7 +19,7 @@ from mapweave.merge.map_maintenance.landmark_observations import LandmarkObserva
 from mapweave.merge.map_maintenance.landmark_removal import (
     LandmarkRemovalSettings,
     LandmarkRemover,
-    found_again,
+    detection_rate,
     presence,
     things,
 )
@@ -54,7 +54,7 @@ def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]
     """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
     looks = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(story)]
     weights = {True: 0.0, False: 0.0}
-    told = [(seen, found_again(ALONE, one, S)) for seen, one in zip(story, looks, strict=True)]
+    told = [(seen, detection_rate(ALONE, one, S)) for seen, one in zip(story, looks, strict=True)]
     told = [(seen, rate) for seen, rate in told if seen is not None]
     for states in product([True, False], repeat=len(told) + 1):
         for veils in product([True, False], repeat=len(told)):
@@ -98,7 +98,7 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     assert presence(together, nobody, S)[0] == S.at_first, "nobody could have seen it"
 
 
-def test_landmarks_near_each_other_may_be_of_one_thing() -> None:
+def test_near_landmarks_may_be_of_one_thing() -> None:
     together = things(NODE, 0.5)
     points = NODE.points_in_robot
     for i, j in product(range(len(points)), repeat=2):
@@ -107,7 +107,7 @@ def test_landmarks_near_each_other_may_be_of_one_thing() -> None:
     assert together.any(axis=1).all() and not together.all()
 
 
-def test_expected_is_what_is_in_view_near_enough_and_not_hidden() -> None:
+def test_expected_landmarks_are_visible_near_and_unoccluded() -> None:
     """One landmark after the other, from the definition."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 6, 4, 1200, rng)
@@ -196,7 +196,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     assert shares[-1][0].mean() < 0.2
 
 
-def test_only_what_is_new_is_looked_at_and_tells_what_all_would(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """From drive to drive, nodes that others stand for included, as a fader that sees the last map alone."""
     rng = np.random.default_rng(4)
     world = room(0, 0, 8, 4, 950, rng)

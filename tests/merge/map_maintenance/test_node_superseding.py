@@ -74,7 +74,7 @@ def living(merged: MergedMap) -> set[NodeId]:
     return set(merged.poses) - set(merged.superseded)
 
 
-def test_the_second_drive_stands_for_the_first(drives: Drives, merger: Merger) -> None:
+def test_the_second_drive_supersedes_the_first(drives: Drives, merger: Merger) -> None:
     merged, s = merger.merged(), NodeSupersedingSettings()
     assert len(merged.superseded) >= 3
     assert {node.map for node in merged.superseded} == {OLD}, "views the other way stand for themselves"
@@ -106,7 +106,7 @@ def test_nothing_that_could_be_reached_is_cut_off(merger: Merger) -> None:
     assert before - {frozenset()} == after
 
 
-def test_a_robot_that_stands_at_a_superseded_node_or_wants_to_is_led_all_the_same(merger: Merger) -> None:
+def test_routes_from_and_to_superseded_nodes_are_found(merger: Merger) -> None:
     merged = merger.merged()
     router, alive = Router(merged), living(merged)
     old = sorted(merged.superseded)
@@ -117,17 +117,17 @@ def test_a_robot_that_stands_at_a_superseded_node_or_wants_to_is_led_all_the_sam
         assert set(legs[1:-1]) <= alive, "on the way there are living nodes only"
 
 
-def test_a_file_tells_what_is_superseded_and_why(merger: Merger) -> None:
+def test_a_file_has_the_superseded_nodes_with_reasons(merger: Merger) -> None:
     merged = merger.merged()
     again = merged_of(unpack_map_file(pack_map_file(map_file_of(merged))))
     assert again.superseded == merged.superseded
     node, fate = next(iter(again.superseded.items()))
     told = explain_nodes(again, node, fate.by)
-    assert any(f"{node} is superseded: {fate.by} stands for it" in claim for claim in told.claims)
+    assert any(f"{node} is superseded: {fate.by} replaces it" in claim for claim in told.claims)
     assert any("stay in view" in claim for claim in told.claims)
 
 
-def test_questions_are_answered_by_living_nodes(drives: Drives, merger: Merger) -> None:
+def test_questions_are_answered_by_active_nodes(drives: Drives, merger: Merger) -> None:
     merged = merger.merged()
     places = ActiveNodes(merger.index, merger.node, merged)
     relocalizer = Relocalizer(places, places.node, merged)
@@ -140,7 +140,7 @@ def test_questions_are_answered_by_living_nodes(drives: Drives, merger: Merger) 
         assert there.distance(drives.truth[node]) < 0.25
 
 
-def test_what_is_taken_away_gives_life_back(drives: Drives) -> None:
+def test_removing_a_successor_makes_its_nodes_active(drives: Drives) -> None:
     merger = drives.merger(OLD, NEW, OTHER)
     superseded = merger.merged().superseded
     assert superseded
@@ -163,7 +163,7 @@ def test_views_of_one_visit_complete_each_other(drives: Drives) -> None:
     assert not drives.merger(NEW).merged().superseded
 
 
-def test_drive_after_drive_the_living_stay_few(drives: Drives) -> None:
+def test_the_active_nodes_stay_few_over_many_drives(drives: Drives) -> None:
     """Each drive as the one before, from the same places: the map holds one of them."""
     rng = np.random.default_rng(9)
     merger, counts = Merger(), []
@@ -178,7 +178,7 @@ def test_drive_after_drive_the_living_stay_few(drives: Drives) -> None:
     assert counts[0] == 4 and max(counts) <= 8, counts
 
 
-def test_superseded_nodes_are_looked_for_no_more_until_they_live_again(drives: Drives) -> None:
+def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) -> None:
     merger = drives.merger(OLD, NEW, OTHER)
     merged = merger.merged()
     assert merged.superseded
@@ -237,7 +237,7 @@ def covers(merged: MergedMap, one: NodeId, other: NodeId, s: NodeSupersedingSett
     return bool(depths and least_in_view(shared, a, b, between) >= s.found)
 
 
-def test_nodes_of_today_are_looked_for_superseded_or_not(drives: Drives) -> None:
+def test_nodes_of_today_are_searched_even_if_superseded(drives: Drives) -> None:
     """Another robot's view of the same hour is evidence; an hour later it is past."""
     rng = np.random.default_rng(8)
     merger = drives.merger(OLD)

@@ -144,7 +144,7 @@ def scarce(seed: int, late: float) -> tuple[Walk, Walk, np.random.Generator]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_where_nodes_are_scarce_their_wakes_tell(seed: int) -> None:
+def test_trajectory_segments_fill_gaps_between_nodes(seed: int) -> None:
     """Between nodes nobody knows where the robots were, unless the nodes' wakes do."""
     a, b, rng = scarce(seed, 0.7)
     whole = graph(a, b, rng)
@@ -154,7 +154,7 @@ def test_where_nodes_are_scarce_their_wakes_tell(seed: int) -> None:
     assert bare is None or bare.evidence < found.evidence / 2
 
 
-def test_moments_of_wakes_are_where_their_nodes_are_put() -> None:
+def test_moments_of_segments_move_with_their_nodes() -> None:
     """Against poses composed one by one; a view is a moment of its own, and times ascend."""
     rng = np.random.default_rng(6)
     nodes, means = [], rng.uniform(-3, 3, (5, 3))
@@ -182,7 +182,7 @@ def test_moments_of_wakes_are_where_their_nodes_are_put() -> None:
     )
 
 
-def test_nothing_is_said_without_a_clock_that_both_share() -> None:
+def test_no_evidence_without_a_common_clock() -> None:
     a, b, rng = twins(0)
     assert clash(a, b, rng, clocks=("net", "own")) is None
     assert trails(a, b, clocks=("", "")) == []
@@ -205,7 +205,7 @@ def test_a_moment_or_two_prove_nothing() -> None:
     assert clash(a, b, rng) is None
 
 
-def test_where_nobody_knows_where_the_robot_was_nothing_is_said() -> None:
+def test_unknown_poses_are_no_evidence() -> None:
     """Every other node is far away in time, so that the straight line between nodes means nothing."""
     a, b, rng = twins(0)
     a.times = 4.0 * a.times
@@ -233,7 +233,7 @@ def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma:
 
 
 @pytest.mark.parametrize("wakes", [False, True])
-def test_robots_that_nearly_touch_all_the_time_seldom_look_like_a_clash(wakes: bool) -> None:
+def test_robots_that_nearly_touch_rarely_count_as_collisions(wakes: bool) -> None:
     """The bound holds even where bodies are exactly as small as supposed: here at 0.2 m, with loose doubt."""
     s = ExclusionSettings(doubt=0.1, least_witnesses=1)
     refused = 0
@@ -247,7 +247,7 @@ def test_robots_that_nearly_touch_all_the_time_seldom_look_like_a_clash(wakes: b
     assert refused <= 10
 
 
-def test_robots_that_tell_how_large_they_are_are_kept_apart_by_that() -> None:
+def test_known_radii_decide_the_least_distance() -> None:
     """Two that pass at 0.25 m: small ones may, large ones cannot, and one that does not tell may be small."""
     rng = np.random.default_rng(8)
     a = Walk(rng)
@@ -263,7 +263,7 @@ def test_robots_that_tell_how_large_they_are_are_kept_apart_by_that() -> None:
     assert clash_of(whole, *trails(a, b), tiny) is not None
 
 
-def test_chances_against_many_draws() -> None:
+def test_probabilities_agree_with_monte_carlo() -> None:
     rng = np.random.default_rng(3)
     offsets = rng.uniform(-0.3, 0.3, (20, 2))
     roots = rng.normal(0, 0.07, (20, 2, 2))

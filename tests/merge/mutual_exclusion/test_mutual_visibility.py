@@ -92,7 +92,7 @@ def test_odds_against_rays_marched_step_by_step() -> None:
     ("length", "expected"), [(3.16, 8.0), (1.3, 8.0), (0.84, 0.22), (0.6, 1.0)],
     ids=["nothing", "a wall behind", "the robot", "something before"],
 )  # fmt: skip
-def test_what_one_ray_says(length: float, expected: float) -> None:
+def test_the_evidence_of_one_ray(length: float, expected: float) -> None:
     lengths = np.full((1, 16), 0.5)
     lengths[0, 0] = length
     assert np.isclose(odds(looks(np.array([[1.0, 0.0]]), lengths, 0.005))[0], expected, rtol=0.02)
@@ -107,9 +107,7 @@ def test_a_robot_between_two_rays_is_seen_by_none() -> None:
 @pytest.mark.parametrize("missed", [0.0, 0.05, 0.1])
 @pytest.mark.parametrize("spread", [0.01, 0.1])
 @pytest.mark.parametrize("clutter", [0.7, 3.0])
-def test_a_true_merge_has_odds_of_at_most_one_on_average(
-    missed: float, spread: float, clutter: float
-) -> None:
+def test_a_true_merge_has_mean_odds_of_at_most_one(missed: float, spread: float, clutter: float) -> None:
     """Robots at random, in random scenery: rays end at the first thing, and miss the robot now and then."""
     rng = np.random.default_rng(5)
     n, k = 6000, 16
@@ -138,7 +136,7 @@ def chain(share: float = 1.0, n: int = 8) -> PoseGraph:
 
 
 @pytest.mark.parametrize("on_the_way", [0.0, 1.0], ids=["at nodes", "on the way"])
-def test_errors_in_common_against_many_draws(on_the_way: float) -> None:
+def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
     """Both look at each other; what each would see is computed from poses that are drawn."""
     rng = np.random.default_rng(2)
     graph = chain()
@@ -183,7 +181,7 @@ def test_errors_in_common_against_many_draws(on_the_way: float) -> None:
         )
 
 
-def test_what_is_between_the_maps_is_seen_from_both_sides() -> None:
+def test_errors_between_maps_have_opposite_signs() -> None:
     """The floor: if the other is further east for the one, the one is further west for the other."""
     graph = chain(1e-6)
     observers, others = np.array([0, 8]), np.array([8, 0])

@@ -146,7 +146,7 @@ def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_robots_in_one_room_are_not_refused_for_what_they_saw_on_the_way(seed: int) -> None:
+def test_robots_in_one_room_are_not_refused_by_views_on_the_way(seed: int) -> None:
     """Neither where they meet, nor where the second is taken to be elsewhere by a few centimetres."""
     walks = Walks("arena", seed, (0, 0), 100, length=4.0, width=3.0)
     with_wakes(walks)
@@ -167,7 +167,7 @@ def test_robots_that_are_in_one_room_are_not_refused(kind: str, seed: int) -> No
 
 
 @pytest.mark.parametrize("fails", ["all for a while", "most for ever"])
-def test_broken_sensors_say_nothing(fails: str) -> None:
+def test_broken_sensors_are_no_evidence(fails: str) -> None:
     """Rangers that fail say that there is nothing, though the other robot stands there."""
     walks = Walks("arena", 3, (0, 0), 120, length=4.0, width=3.0)
     broken = slice(0, 16) if fails == "all for a while" else slice(0, 13)
@@ -180,7 +180,7 @@ def test_broken_sensors_say_nothing(fails: str) -> None:
     assert walks.clash() is None
 
 
-def test_who_does_not_tell_how_large_it_is_is_not_looked_for() -> None:
+def test_robots_without_a_radius_are_not_used_for_visibility() -> None:
     walks = Walks("twins", 0, (0, 1))
     walks.nodes = [replace(node, radius=0.0) for node in walks.nodes]
     blind = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
@@ -212,7 +212,7 @@ class Exploration:
 
 
 @pytest.mark.slow
-def test_twins_that_explore_are_told_apart_within_100_seconds() -> None:
+def test_exploring_twin_rooms_are_distinguished_within_100_seconds() -> None:
     """In most rooms; in some they are hardly in sight of each other."""
     found = []
     for seed in range(5, 9):

@@ -22,27 +22,27 @@ S = NegativeEvidenceSettings()
 NOTHING, SOMETHING = math.log((1 - S.alike) / S.missed), math.log(S.alike / (1 - S.missed))
 
 
-def test_the_same_room_speaks_for_a_merge() -> None:
+def test_the_same_room_is_evidence_for_a_merge() -> None:
     views = negative_evidence(*meeting(Room(), Room()))
     assert len(views.expected) == 24 and (views.found > 0.7 * views.expected).all()
     assert views.evidence(S) == pytest.approx(4 * SOMETHING)
 
 
 @pytest.mark.parametrize("changed", [(0,), (1, 3), (0, 1, 2, 3)])
-def test_walls_that_are_others_speak_against_it_once_each(changed: tuple[int, ...]) -> None:
+def test_walls_of_others_count_against_it_once_each(changed: tuple[int, ...]) -> None:
     views = negative_evidence(*meeting(Room(), Room(changed)))
     assert views.show_nothing(S).sum() == 6 * len(changed)
     expected = len(changed) * NOTHING + (4 - len(changed)) * SOMETHING
     assert views.evidence(S) == pytest.approx(min(expected, math.log(S.most)))
 
 
-def test_nothing_is_said_of_other_hours_or_of_poses_that_nobody_knows() -> None:
+def test_no_evidence_from_other_hours_or_unknown_poses() -> None:
     other = Room((0, 1, 2, 3))
     assert len(negative_evidence(*meeting(Room(), other, late=4000.0)).expected) == 0
     assert len(negative_evidence(*meeting(Room(), other, sigma=0.2)).expected) == 0
 
 
-def test_what_stands_before_hides_and_what_nobody_looked_at_is_not_missed() -> None:
+def test_occluded_and_unobserved_landmarks_are_not_missed() -> None:
     """Against rays that are marched: a board before half of the wall, and a view with half of its depths."""
     rng = np.random.default_rng(3)
     room = Room()
@@ -72,7 +72,7 @@ def test_what_stands_before_hides_and_what_nobody_looked_at_is_not_missed() -> N
 
 
 @pytest.mark.parametrize("missed", [0.0, 0.01, S.missed])
-def test_a_true_merge_has_odds_of_at_most_one_on_average(missed: float) -> None:
+def test_a_true_merge_has_mean_odds_of_at_most_one(missed: float) -> None:
     """Views miss as seldom as is allowed, all views of one place together or each by itself."""
     rng = np.random.default_rng(4)
     for together in (True, False):
@@ -85,7 +85,7 @@ def test_a_true_merge_has_odds_of_at_most_one_on_average(missed: float) -> None:
         assert np.mean(odds) < 1.0 + 3.0 * np.std(odds) / math.sqrt(len(odds))
 
 
-def test_it_tips_the_scales_and_never_decides_alone() -> None:
+def test_it_adds_evidence_and_never_decides_alone() -> None:
     """Three looks in which the sensors saw nothing are 500 to 1; 1000 are asked for."""
     twin = Room((0, 2))
     found = clash_of(*meeting(Room(), twin, looks=3))
@@ -100,11 +100,11 @@ def test_it_tips_the_scales_and_never_decides_alone() -> None:
     assert alone is not None and alone.blank == 0 and alone.reason.endswith("such moments")
 
 
-def test_places_and_not_the_order_of_views_make_witnesses() -> None:
+def test_places_count_and_not_the_order_of_views() -> None:
     rng = np.random.default_rng(5)
     places: Array = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]])[rng.integers(0, 3, 20)]
     views = Views(places + rng.uniform(-0.2, 0.2, (20, 2)), np.full(20, 30), rng.integers(0, 3, 20) * 10)
     order = rng.permutation(20)
     other = Views(views.places[order], views.expected[order], views.found[order])
-    assert len(set(views.witnesses(S))) == 3
+    assert len(set(views.place_numbers(S))) == 3
     assert views.evidence(S) == pytest.approx(other.evidence(S))

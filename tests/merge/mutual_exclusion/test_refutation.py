@@ -126,7 +126,7 @@ def test_closed_twins_stay_two(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("clock", "late"), [("", 0.0), ("net", 500.0)])
-def test_without_a_clock_or_at_other_times_nobody_can_tell(clock: str, late: float) -> None:
+def test_without_a_clock_or_at_other_times_there_is_no_evidence(clock: str, late: float) -> None:
     """A false story that nothing contradicts is believed; once the true one is told as well, neither is."""
     twins = Twins(1, clock, late)
     merged = merge_maps(twins.maps, twins.false)
@@ -136,7 +136,7 @@ def test_without_a_clock_or_at_other_times_nobody_can_tell(clock: str, late: flo
     assert "ambiguous" in merged.explain(*twins.false[0].pair)
 
 
-def test_clocks_that_are_not_the_same_say_nothing() -> None:
+def test_different_clocks_give_no_evidence() -> None:
     twins = Twins(1)
     for node in list(twins.b.nodes.values()):
         twins.b.apply(NodePut(replace(node, clock="own")))
@@ -155,7 +155,7 @@ def test_the_corridor_between_twins_joins_them(seed: int) -> None:
     assert all("same place at the same time" in merged.explain(*link.pair) for link in twins.false)
 
 
-def test_of_two_stories_that_are_supported_alike_the_possible_one_is_believed() -> None:
+def test_of_two_equal_sets_the_possible_one_is_kept() -> None:
     twins = Twins(1)
     true = twins.corridor(10, inliers=30)
     assert pairs(merge_maps(twins.maps, twins.false + true).links) == pairs(true)

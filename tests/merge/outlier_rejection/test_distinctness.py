@@ -107,7 +107,7 @@ def silent(links: Sequence[Link]) -> list[Link]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_is_in_one_bay_alone_is_counted(seed: int) -> None:
+def test_landmarks_of_one_bay_alone_are_counted(seed: int) -> None:
     aisle = Aisle(seed, signs=(1, 2))
     aisle.drive("a", [0, 1, 2])
     aisle.drive("b", [1, 2, 3])
@@ -120,7 +120,7 @@ def test_what_is_in_one_bay_alone_is_counted(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_maps_are_joined_where_they_share_what_is_nowhere_else(seed: int) -> None:
+def test_maps_are_joined_where_they_share_unique_landmarks(seed: int) -> None:
     aisle = Aisle(seed, signs=(2, 3))
     aisle.drive("a", [0, 1, 2, 3])
     aisle.drive("b", [2, 3, 4, 5, 6])
@@ -131,7 +131,7 @@ def test_maps_are_joined_where_they_share_what_is_nowhere_else(seed: int) -> Non
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_aisles_that_only_look_alike_stay_apart(seed: int) -> None:
+def test_aliased_aisles_are_not_joined(seed: int) -> None:
     aisle = Aisle(seed)
     aisle.drive("a", [0, 1])
     aisle.drive("b", [3, 4, 5])
@@ -141,7 +141,7 @@ def test_aisles_that_only_look_alike_stay_apart(seed: int) -> None:
     assert any("found at other places too" in refusal.reason for refusal in merged.refused)
 
 
-def test_who_has_seen_one_bay_only_cannot_know() -> None:
+def test_a_view_of_one_bay_alone_is_ambiguous() -> None:
     """One bay each, of another place: nothing shows that there are two of it. Then the merge is believed."""
     aisle = Aisle(5)
     aisle.drive("a", [0])
@@ -163,7 +163,7 @@ def test_without_landmarks_the_better_supported_of_two_bays_wins() -> None:
     assert wrong > 0
 
 
-def test_what_one_node_finds_out_its_neighbours_know() -> None:
+def test_aliasing_found_for_one_node_is_used_for_its_neighbours() -> None:
     """A second node of the bay was compared with one place only; that shows its landmarks too."""
     aisle = Aisle(7)
     aisle.drive("a", [0], views=2)
@@ -176,7 +176,7 @@ def test_what_one_node_finds_out_its_neighbours_know() -> None:
     assert [link.doubles for link in aisle.weighed(alone)] == [0]
 
 
-def test_where_nothing_is_alike_all_landmarks_count() -> None:
+def test_without_aliasing_all_landmarks_count() -> None:
     aisle = Aisle(8, signs=tuple(range(6)), cartons=0)
     aisle.drive("a", [0, 1, 2])
     aisle.drive("b", [1, 2, 3])
@@ -209,7 +209,7 @@ def test_a_way_that_is_hardly_known_contradicts_nothing() -> None:
         assert [link.doubles for link in aisle.weighed(links)] == [doubles] * 2
 
 
-def test_order_has_no_say() -> None:
+def test_order_does_not_matter() -> None:
     aisle = Aisle(10, signs=(1, 2))
     aisle.drive("a", [0, 1, 2])
     aisle.drive("b", [1, 2, 3])

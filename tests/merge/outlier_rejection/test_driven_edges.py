@@ -95,7 +95,7 @@ def test_a_drive_to_a_node_that_is_gone_is_left_out(scene: Scene) -> None:
     assert edge not in merged.union().edges
 
 
-def test_the_server_still_compares_nodes_between_which_somebody_has_driven(scene: Scene) -> None:
+def test_the_server_still_compares_nodes_connected_by_a_drive(scene: Scene) -> None:
     """Neighbours on a robot's way are not compared, for they share its tracks; ends of a drive do not."""
     merger = Merger()
     for map_id in (A, B):

@@ -35,7 +35,7 @@ def along(agent: str, places: list[tuple[float, float]]) -> Fragment:
     return Fragment(ids[0], solve_graph(ids[0], Pose2(*places[0]), steps), tuple(steps))
 
 
-def test_neighbours_at_both_ends_are_one_witness() -> None:
+def test_neighbours_at_both_ends_count_as_one_place() -> None:
     """Three links between two places, one from the same place to another, and one apart."""
     a = along("a", [(0.0, 0.0), (0.7, 0.0), (1.4, 0.0), (8.0, 0.0)])
     b = along("b", [(0.0, 0.0), (0.7, 0.0), (1.4, 0.0), (9.0, 0.0)])
@@ -45,12 +45,12 @@ def test_neighbours_at_both_ends_are_one_witness() -> None:
     assert crowds(np.ones((5, 5), bool), near).tolist() == [3, 3, 3, 1, 1]
     assert crowds(np.eye(5, dtype=bool), near).tolist() == [1] * 5
     found = support_of([0, 1, 2, 4], np.ones(5, bool), np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
-    assert found.witnesses == pytest.approx(2.0) and found.coincidence == pytest.approx(0.01)
+    assert found.places == pytest.approx(2.0) and found.coincidence == pytest.approx(0.01)
     assert found.others.tolist() == [1]
     # What is found at other places too is no witness, on either side.
     telling = np.array([True, True, True, False, False])
     found = support_of([0, 1, 2, 4], telling, np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
-    assert found.witnesses == pytest.approx(1.0) and found.others.tolist() == []
+    assert found.places == pytest.approx(1.0) and found.others.tolist() == []
 
 
 def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
@@ -68,7 +68,7 @@ def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
         assert told[0, 0] == pytest.approx((distances2 < reach2).mean(), rel=0.05)
 
 
-def test_sets_that_chance_makes_are_as_many_as_told() -> None:
+def test_the_number_of_chance_sets_agrees_with_the_prediction() -> None:
     """Pairs of false witnesses that agree, against drawing them."""
     rng = np.random.default_rng(2)
     n, coincidence = 12, 0.03
@@ -80,7 +80,7 @@ def test_sets_that_chance_makes_are_as_many_as_told() -> None:
     assert two.by_chance(false) == pytest.approx(count, rel=0.05)
 
 
-def test_links_that_witnesses_bring_in_all_against_draws() -> None:
+def test_links_of_false_places_agree_with_monte_carlo() -> None:
     """As if one more had been heard that brings one link, or with half the chance another one, and so on."""
     rng = np.random.default_rng(3)
     false = ChanceSupport(5.0, np.array([6.0, 3.0, 0.0, 1.0]))
@@ -89,17 +89,17 @@ def test_links_that_witnesses_bring_in_all_against_draws() -> None:
         rng.geometric(0.5, (200_000, 3)),
         rng.choice([1, 2, 4], p=[0.6, 0.3, 0.1], size=(200_000, 3)),
     )
-    for witnesses, links in ((1, 2), (1, 5), (2, 3), (2, 6), (3, 4), (3, 9), (3, 3), (2, 1)):
-        share = (brought[:, :witnesses].sum(axis=1) >= links).mean()
-        assert false.bringing(witnesses, links) == pytest.approx(share, abs=0.003)
+    for places, links in ((1, 2), (1, 5), (2, 3), (2, 6), (3, 4), (3, 9), (3, 3), (2, 1)):
+        share = (brought[:, :places].sum(axis=1) >= links).mean()
+        assert false.at_least_links(places, links) == pytest.approx(share, abs=0.003)
     # Two places that bring three links each are rarer than two that bring one each.
     pair = Support(np.array([1, 1]), np.ones(9, np.int64), 0.03)
     rich = Support(np.array([3, 3, 3, 3, 3, 3]), np.ones(9, np.int64), 0.03)
-    assert rich.witnesses == pytest.approx(pair.witnesses)
+    assert rich.places == pytest.approx(pair.places)
     assert rich.by_chance(false) < 0.2 * pair.by_chance(false)
 
 
-def test_who_is_judged_is_not_the_measure_of_it() -> None:
+def test_a_pair_is_not_judged_by_itself() -> None:
     one = Support(np.array([1, 1, 1]), np.array([2, 2]), 0.1)
     other = Support(np.array([1]), np.array([1, 1, 1, 4, 4, 4, 4]), 0.1)
     every = ChanceSupport.of([one, other])
@@ -111,7 +111,7 @@ def test_who_is_judged_is_not_the_measure_of_it() -> None:
 
 
 @pytest.mark.parametrize("alike", [1, 4])
-def test_fleets_with_nine_false_links_of_ten_become_one_map_or_stay_apart(alike: int) -> None:
+def test_fleets_with_90_percent_false_links_are_joined_correctly_or_not_at_all(alike: int) -> None:
     """Most are as good as with the true links known, and none is joined by false links alone."""
     good = 0
     for seed in range(3):

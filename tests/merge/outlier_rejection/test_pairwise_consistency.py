@@ -92,7 +92,7 @@ def test_loop_misclosures_are_calibrated() -> None:
     assert 2.0 < np.mean(values) < 4.2
 
 
-def test_alike_room_is_refused_when_the_right_one_is_better_supported() -> None:
+def test_an_aliased_room_is_refused_when_the_right_one_has_more_support() -> None:
     """Links between rooms that look alike agree with each other and are wrong."""
     two = Two(3)
     aliased = two.alike_room()
@@ -105,7 +105,7 @@ def test_alike_room_is_refused_when_the_right_one_is_better_supported() -> None:
     assert {one.pair for one in aliased} <= {one.pair for one in found.refused if "contradicts" in one.reason}
 
 
-def test_two_stories_that_are_supported_alike_are_both_refused() -> None:
+def test_two_sets_with_equal_support_are_both_refused() -> None:
     two = Two(4)
     aliased = two.alike_room()
     right = [two.true_link(k, k) for k in range(3)]
@@ -114,7 +114,7 @@ def test_two_stories_that_are_supported_alike_are_both_refused() -> None:
     assert len(found.refused) == 6 and all("ambiguous" in one.reason for one in found.refused)
 
 
-def test_one_place_is_not_believed_for_its_many_links_where_another_contradicts_it() -> None:
+def test_one_place_with_many_links_is_rejected_if_another_contradicts_it() -> None:
     """A corner like another gave five links, the corridor that both came by four of half the weight."""
     two = Two(8, n=16)
     shift = Pose2(-8.0, 0.0, 0.0)
@@ -135,14 +135,14 @@ def test_one_place_is_not_believed_for_its_many_links_where_another_contradicts_
     assert kept == {one.pair for one in [*true, *more]}
 
 
-def test_one_link_is_too_little_unless_overwhelming() -> None:
+def test_a_single_link_is_too_little_unless_overwhelming() -> None:
     two = Two(5)
     found = sort_links([two.true_link(2, 2)], two.a, two.b)
     assert not found.kept and "no 2 links that share no node agree" in found.refused[0].reason
     assert len(sort_links([two.true_link(2, 2, inliers=60)], two.a, two.b).kept) == 1
 
 
-def test_links_at_one_node_are_one_witness() -> None:
+def test_links_at_one_node_count_as_one_place() -> None:
     two = Two(6)
     found = sort_links([two.true_link(2, 2), two.true_link(2, 3)], two.a, two.b)
     assert not found.kept

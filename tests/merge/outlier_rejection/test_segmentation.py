@@ -77,7 +77,7 @@ GOOD = [(2, 26), (6, 30), (9, 33), (14, 38), (19, 43), (22, 46)]
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_loop_that_is_off_by_a_bay_is_left_out_and_said_so(seed: int) -> None:
+def test_a_loop_closure_off_by_a_bay_is_left_out_with_a_reason(seed: int) -> None:
     aisles = Aisles(seed)
     true = [aisles.loop(i, j) for i, j in GOOD]
     [clean] = fragments_of({A: aisles.map})
@@ -131,7 +131,7 @@ def test_a_loop_that_only_other_loops_contradict_is_left_out() -> None:
     assert "own loop contradicts 4 links" in piece.refused[0].reason
 
 
-def test_a_bridge_stays_whatever_it_says() -> None:
+def test_a_bridge_stays_up_after_any_message() -> None:
     aisles = Aisles(3, missing=24)
     assert len(fragments_of({A: aisles.map})) == 2
     aisles.loop(23, 24, shift=1.8, inliers=1)
@@ -179,7 +179,7 @@ def test_drives_bring_the_map_nearer_to_the_truth_as_loops_do() -> None:
 
 
 @pytest.mark.parametrize("driven_first", [True, False])
-def test_what_was_recognised_and_driven_alike_stands_as_both_and_counts_once(driven_first: bool) -> None:
+def test_an_edge_recognised_and_driven_counts_once(driven_first: bool) -> None:
     aisles = Aisles(1)
     put = [aisles.drive, aisles.loop] if driven_first else [aisles.loop, aisles.drive]
     both = {one(2, 26) for one in put}
@@ -195,12 +195,12 @@ def test_where_both_are_refused_both_are_named() -> None:
     assert {r.edge for r in piece.refused} == false
 
 
-def test_a_view_is_believed_where_a_drive_contradicts_it() -> None:
+def test_a_view_is_trusted_where_a_drive_contradicts_it() -> None:
     aisles = Aisles(1)
     seen, driven = aisles.loop(2, 26), aisles.drive(2, 26, shift=0.5)
     [piece] = fragments_of({A: aisles.map})
     [refusal] = piece.refused
-    assert refusal.edge == driven and refusal.reason == f"contradicts what was recognised, which {seen} tells"
+    assert refusal.edge == driven and refusal.reason == f"contradicts what was recognised, see {seen}"
     assert sum(m.robust for m in piece.measurements) == 1
 
 

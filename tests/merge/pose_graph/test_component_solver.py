@@ -50,7 +50,7 @@ def test_links_that_come_and_go_leave_the_batch_optimum(seed: int) -> None:
             assert off.max() < 2e-4
 
 
-def test_what_no_link_touches_is_the_same_object() -> None:
+def test_an_untouched_island_is_the_same_object() -> None:
     _, fragments, links = drawn(3)
     solver = ComponentSolver(fragments)
     names = [fragment.name for fragment in fragments]

@@ -12,7 +12,7 @@ STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_it_chooses_what_is_chosen_anew(seed: int) -> None:
+def test_it_agrees_with_a_fresh_choice(seed: int) -> None:
     """Nodes come, go and are known better, edges come and go; all that has changed is told once."""
     rng = np.random.default_rng(seed)
     settings = CandidateSettings(most_per_map=2, least_hops=int(rng.integers(1, 4)))
@@ -53,7 +53,7 @@ def test_it_chooses_what_is_chosen_anew(seed: int) -> None:
             known = wanted
 
 
-def test_a_node_that_is_known_better_has_its_pairs_told_again() -> None:
+def test_a_refined_node_is_compared_again() -> None:
     a, b = NodeId("a", 1, 1), NodeId("b", 1, 1)
     table = PairTable()
     table.put(a, {})

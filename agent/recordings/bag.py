@@ -1,0 +1,308 @@
+"""ROS 1 and ROS 2 bags (.bag, .mcap, .db3, or a bag's folder), read by `rosbags`, without ROS."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.recordings.bag_images import grey_of
+from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
+from mapweave.agent.recordings.pose_files import heading_of, read_poses
+from mapweave.agent.recordings.recording import Distortion, Images, Recording, StampedPoses, assembled
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
+from mapweave.hybridmap.pose import Array
+
+SUFFIXES = {".bag", ".mcap", ".db3"}
+IMAGE_TYPES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+POSE_TYPES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+ODOMETRY_TYPE, CAMERA_TYPE, TF_TYPE = POSE_TYPES[0], "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
+TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
+"""Parts of names of topics that are never taken for odometry."""
+BASES = ("base_footprint", "base_link")
+"""Frames of a robot on the floor, and above it (REP 105)."""
+CAMERA_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""(3, 3) from x right, y down, z forward to x forward, y left, z up (REP 103)."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One of a bag's.
+
+    Attributes:
+        name: of the topic.
+        kind: type of its messages.
+        count: how many there are.
+    """
+
+    name: str
+    kind: str
+    count: int
+
+
+class Bag:
+    """A bag that is open for reading."""
+
+    def __init__(self, path: Path) -> None:
+        """Open it.
+
+        Raises:
+            DeviceError: it cannot be read.
+        """
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        self.path = path
+        try:
+            self._reader = AnyReader(parts_of(path), default_typestore=get_typestore(Stores.ROS2_JAZZY))
+            self._reader.open()
+        except Exception as error:  # noqa: BLE001  # parsers raise whatever a damaged file leads them to
+            raise DeviceError(f"{path}: not a bag that can be read ({_line(error)})") from None
+        # Recordings are read as long as anybody holds them; the file is let go with the last one.
+        weakref.finalize(self, self._reader.close)
+        self.topics = tuple(
+            sorted(
+                (Topic(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections),
+                key=lambda topic: topic.name,
+            )
+        )
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Stamps, ns, and messages of a topic, in the order in which they were recorded.
+
+        The stamp is the header's where it is set: when it was measured, not when it arrived.
+
+        Raises:
+            DeviceError: the bag ends in the middle of a message, or one cannot be decoded.
+        """
+        connections = [c for c in self._reader.connections if c.topic == topic]
+        messages = self._reader.messages(connections)
+        count = 0
+        while True:
+            try:
+                connection, arrived, data = next(messages)
+                message = self._reader.deserialize(data, connection.msgtype)
+            except StopIteration:
+                return
+            except Exception as error:  # noqa: BLE001
+                raise DeviceError(
+                    f"{self.path}: {topic} ends after {count} messages ({_line(error)})"
+                ) from None
+            count += 1
+            header = getattr(message, "header", None)
+            stamp = 0 if header is None else header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+            yield stamp or arrived, message
+
+
+def parts_of(path: Path) -> list[Path]:
+    """The bags of a recording: itself, or those in its folder, in their order."""
+    inside = [p.parent for p in path.glob("*/metadata.yaml")] if path.is_dir() else []
+    return sorted(inside, key=lambda p: (len(p.name), p.name)) or [path]
+
+
+def bag(path: Path, options: RecordingOptions) -> Recording:
+    """Open a bag: its images and its odometry, by the topics' types where nobody names them.
+
+    Raises:
+        DeviceError: something is missing or wrong; one line says which topics there are.
+    """
+    opened = Bag(path)
+    image = _chosen(opened, options.image_topic, IMAGE_TYPES, "images", "--image-topic")
+    stamps: list[int] = []
+    damage = ""
+    try:
+        stamps.extend(stamp for stamp, _ in opened.messages(image.name))
+    except DeviceError as error:
+        damage = str(error)
+    if not stamps:
+        raise DeviceError(damage or f"{path}: {image.name} has no images")
+    notes = [f"images from {image.name}", *([f"{damage}; what came before is used"] if damage else [])]
+    order = np.argsort(np.array(stamps, np.int64), kind="stable")
+    if (np.diff(np.array(stamps)) <= 0).any():
+        raise DeviceError(f"{path}: the stamps of {image.name} do not ascend")
+    camera, distortion = _camera(opened, image.name, options, notes)
+    images = Images(np.array(stamps, np.int64)[order], _sequential(opened, image.name))
+    if options.odometry is not None:
+        odometry = read_poses(options.odometry)
+    else:
+        topic = _odometry_topic(opened, options)
+        notes.append(f"odometry from {topic.name}")
+        odometry = _poses(opened, topic.name)
+    return assembled(
+        path,
+        f"bag ({path.suffix.lstrip('.') or 'folder'})",
+        camera,
+        distortion,
+        images,
+        odometry,
+        tuple(notes),
+    )
+
+
+def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str, option: str) -> Topic:
+    """The topic that is wanted, else the one of the right type with most messages."""
+    fitting = [topic for topic in opened.topics if topic.kind in kinds and topic.count]
+    if wanted is not None:
+        for topic in opened.topics:
+            if topic.name == wanted:
+                if topic not in fitting:
+                    kind = f"{topic.count} messages of {topic.kind}"
+                    raise DeviceError(f"{opened.path}: {wanted} has {kind}; {what} are {' or '.join(kinds)}")
+                return topic
+        raise DeviceError(f"{opened.path}: no topic {wanted}; it has {_names(opened.topics)}")
+    if not fitting:
+        raise DeviceError(f"{opened.path}: no {what} ({' or '.join(kinds)}); it has {_names(opened.topics)}")
+    most = max(topic.count for topic in fitting)
+    # Raw and compressed forms of one camera have as many messages: the first name decides.
+    return next(topic for topic in fitting if topic.count == most)
+
+
+def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic:
+    if options.odometry_topic is not None:
+        return _chosen(opened, options.odometry_topic, POSE_TYPES, "poses", "--odometry-topic")
+    fitting = [topic for topic in opened.topics if topic.kind == ODOMETRY_TYPE and topic.count]
+    fitting = [topic for topic in fitting if not any(word in topic.name.lower() for word in TRUTH)]
+    if not fitting:
+        raise DeviceError(f"{opened.path}: {NO_ODOMETRY}; topics: {_names(opened.topics)}")
+    # Filtered odometry may hold other sensors' errors; the wheels' own is what the filters here expect.
+    return min(fitting, key=lambda topic: ("filter" in topic.name.lower(), -topic.count, topic.name))
+
+
+def _names(topics: Sequence[Topic]) -> str:
+    return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics if topic.count) or "no messages"
+
+
+def _poses(opened: Bag, topic: str) -> StampedPoses:
+    rows: list[tuple[int, float, float, float]] = []
+    for stamp, message in opened.messages(topic):
+        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        q = pose.orientation
+        rows.append((stamp, pose.position.x, pose.position.y, heading_of(q.x, q.y, q.z, q.w)))
+    stamps = np.array([row[0] for row in rows], np.int64)
+    poses = np.array([row[1:] for row in rows]).reshape(-1, 3)
+    kept = np.append(True, np.diff(stamps) > 0)[: len(stamps)]
+    if kept.sum() < 2 or not np.isfinite(poses).all():
+        raise DeviceError(
+            f"{opened.path}: {topic} has {int(kept.sum())} poses; there must be two, all finite"
+        )
+    return StampedPoses(stamps[kept], poses[kept])
+
+
+def _camera(
+    opened: Bag, image: str, options: RecordingOptions, notes: list[str]
+) -> tuple[Camera, Distortion]:
+    if options.camera is not None:
+        return options.camera_of(opened.path, None)
+    infos = [topic for topic in opened.topics if topic.kind == CAMERA_TYPE and topic.count]
+    near = [
+        topic for topic in infos if _namespace(topic.name) == _namespace(image.removesuffix("/compressed"))
+    ]
+    if not (near or len(infos) == 1):
+        raise DeviceError(f"{opened.path}: no camera_info beside {image}; give --camera FILE (a camera.toml)")
+    info = (near or infos)[0]
+    _, message = next(opened.messages(info.name))
+    model = str(message.distortion_model)
+    if model not in ("plumb_bob", "rational_polynomial", ""):
+        raise DeviceError(f"{opened.path}: {info.name}: lens model {model!r} is not supported; plumb_bob is")
+    # ROS 1 writes these in capitals.
+    k, d = (np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float) for name in "kd")
+    if len(d) > 5 and np.any(d[5:]):
+        raise DeviceError(f"{opened.path}: {info.name}: a lens of {len(d)} coefficients is not supported")
+    lens = [*d.tolist(), 0.0, 0.0, 0.0, 0.0, 0.0]
+    mount = _mount(opened, str(message.header.frame_id))
+    try:
+        camera = Camera(
+            int(message.width), int(message.height), k[0], k[4], k[2], k[5],
+            mount_height=0.0 if mount is None else mount[2],
+            mount_forward=0.0 if mount is None else mount[0],
+        )  # fmt: skip
+    except (InvalidValue, IndexError) as error:
+        raise DeviceError(f"{opened.path}: {info.name}: {error}") from None
+    if mount is not None:
+        notes.append(f"camera {mount[0]:.2f} m ahead of the axle and {mount[2]:.2f} m high, by tf")
+        if abs(mount[1]) > 0.05:
+            notes.append(f"the camera is {mount[1]:.2f} m to the left, which is not taken into account")
+        if abs(mount[3]) > math.radians(3.0):
+            notes.append(
+                f"the camera looks {math.degrees(mount[3]):.0f} deg to the left: it should look ahead"
+            )
+    distortion: Distortion = (lens[0], lens[1], lens[2], lens[3], lens[4])
+    return options.camera_of(opened.path, (camera, distortion), mount is not None)
+
+
+def _namespace(topic: str) -> str:
+    return topic.rsplit("/", 1)[0]
+
+
+def _mount(opened: Bag, frame: str) -> tuple[float, float, float, float] | None:
+    """Forward, left, up, m, and heading, rad, of a camera in the robot, by the fixed transforms."""
+    parents: dict[str, tuple[str, Array]] = {}
+    for topic in opened.topics:
+        if topic.kind == TF_TYPE and "static" in topic.name:
+            for _, message in opened.messages(topic.name):
+                for one in message.transforms:
+                    parents[one.child_frame_id.lstrip("/")] = (
+                        one.header.frame_id.lstrip("/"),
+                        _matrix(one.transform),
+                    )
+    at, chain = frame.lstrip("/"), np.eye(4)
+    above: tuple[float, float, float, float] | None = None
+    for _ in range(len(parents) + 1):
+        if at in BASES:
+            ahead = chain[:3, :3] @ np.linalg.inv(CAMERA_FROM_OPTICAL)[:, 0]
+            x, y, z = chain[:3, 3].tolist()
+            above = x, y, z, math.atan2(ahead[1], ahead[0])
+        if at not in parents:
+            break
+        at, step = parents[at]
+        chain = step @ chain
+    return above
+
+
+def _matrix(transform: Any) -> Array:
+    q, t = transform.rotation, transform.translation
+    x, y, z, w = np.array([q.x, q.y, q.z, q.w]) / max(math.hypot(q.x, q.y, q.z, q.w), 1e-12)
+    out = np.eye(4)
+    out[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    out[:3, 3] = t.x, t.y, t.z
+    return out
+
+
+def _sequential(opened: Bag, topic: str) -> Callable[[int], NDArray[np.uint8]]:
+    """Reads images in ascending order quickly; going back begins the bag again."""
+    messages: Iterator[tuple[int, Any]] | None = None
+    at = 0
+
+    def read(k: int) -> NDArray[np.uint8]:
+        nonlocal messages, at
+        if messages is None or k < at:
+            messages, at = opened.messages(topic), 0
+        for _, message in messages:
+            at += 1
+            if at == k + 1:
+                try:
+                    return grey_of(message)
+                except MapweaveError as error:
+                    raise DeviceError(f"{opened.path}: image {k} of {topic}: {error}") from None
+        raise DeviceError(f"{opened.path}: {topic} has no image {k}")
+
+    return read
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,191 @@
+"""Folders as benchmarks publish them: KITTI odometry, EuRoC, TUM RGB-D, 4Seasons. No ground truth is read."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mapweave.agent.recordings.camera_file import read_camera
+from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
+from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
+from mapweave.agent.recordings.pose_files import read_poses
+from mapweave.agent.recordings.recording import Distortion, Images, Recording, Stamps, assembled
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.storage.atomic_file import read_whole
+from mapweave.storage.image_file import image_size, read_grey
+
+NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy, px."""
+
+
+def kitti(folder: Path, options: RecordingOptions) -> Recording:
+    """A sequence of KITTI's odometry benchmark: image_0 (or image_2), calib.txt, times.txt.
+
+    Raises:
+        DeviceError: something is missing or wrong.
+    """
+    name = "image_0" if (folder / "image_0").is_dir() else "image_2"
+    paths = images_in(folder / name)
+    stamps = _seconds(folder / "times.txt", len(paths))
+    row = f"P{name[-1]}:"
+    lines = [line.split()[1:] for line in _lines(folder / "calib.txt") if line.startswith(row)]
+    if not lines or len(lines[0]) != 12:
+        raise DeviceError(f"{folder / 'calib.txt'}: no line {row} with twelve numbers")
+    p = _numbers(folder / "calib.txt", lines[0])
+    given = _camera(paths[0], (p[0], p[5], p[2], p[6])), NO_DISTORTION
+    return _folder(folder, "KITTI odometry", paths, stamps, given, options)
+
+
+def euroc(folder: Path, options: RecordingOptions) -> Recording:
+    """An EuRoC MAV sequence: mav0/cam0 with data.csv, data/ and sensor.yaml.
+
+    Raises:
+        DeviceError: something is missing or wrong.
+    """
+    cam = folder / "mav0" / "cam0"
+    rows = [line.split(",") for line in _lines(cam / "data.csv") if line.strip() and not line.startswith("#")]
+    paths = [cam / "data" / row[-1].strip() for row in rows]
+    try:
+        stamps = np.array([int(row[0]) for row in rows], np.int64)
+    except ValueError as error:
+        raise DeviceError(f"{cam / 'data.csv'}: {error}") from None
+    text = "\n".join(_lines(cam / "sensor.yaml"))
+    intrinsics, lens = (
+        _yaml_list(cam, text, "intrinsics", 4),
+        _yaml_list(cam, text, "distortion_coefficients", 4),
+    )
+    model = re.search(r"^distortion_model:\s*(\S+)", text, re.M)
+    if model is not None and model[1] != "radial-tangential":
+        raise DeviceError(
+            f"{cam / 'sensor.yaml'}: lens model {model[1]} is not supported; radial-tangential is"
+        )
+    if not paths:
+        raise DeviceError(f"{cam / 'data.csv'}: no images")
+    fx, fy, cx, cy = intrinsics
+    given = _camera(paths[0], (fx, fy, cx, cy)), (lens[0], lens[1], lens[2], lens[3], 0.0)
+    return _folder(folder, "EuRoC", paths, stamps, given, options)
+
+
+def tum_rgbd(folder: Path, options: RecordingOptions) -> Recording:
+    """A TUM RGB-D sequence: rgb.txt and rgb/. The depth images are not read.
+
+    Raises:
+        DeviceError: something is missing or wrong.
+    """
+    rows = [line.split() for line in _lines(folder / "rgb.txt") if line.strip() and not line.startswith("#")]
+    if not all(len(row) == 2 for row in rows) or not rows:
+        raise DeviceError(f"{folder / 'rgb.txt'}: lines are `stamp file`")
+    stamps = np.array(
+        [round(1e9 * t) for t in _numbers(folder / "rgb.txt", [row[0] for row in rows])], np.int64
+    )
+    return _folder(folder, "TUM RGB-D", [folder / row[1] for row in rows], stamps, None, options)
+
+
+def four_seasons(folder: Path, options: RecordingOptions) -> Recording:
+    """A sequence as 4Seasons has it: undistorted_images/cam0 and times.txt (frame, seconds, exposure).
+
+    Raises:
+        DeviceError: something is missing or wrong.
+    """
+    paths = images_in(folder / "undistorted_images" / "cam0")
+    rows = {row[0]: row[1] for line in _lines(folder / "times.txt") if len(row := line.split()) >= 2}
+    lost = [path for path in paths if path.stem not in rows]
+    if lost:
+        raise DeviceError(f"{folder / 'times.txt'}: no line for {lost[0].name}")
+    stamps = np.array(
+        [round(1e9 * t) for t in _numbers(folder / "times.txt", [rows[path.stem] for path in paths])],
+        np.int64,
+    )
+    return _folder(folder, "4Seasons", paths, stamps, None, options)
+
+
+def images_folder(folder: Path, options: RecordingOptions) -> Recording:
+    """images/, camera.toml, times.txt, and odometry.csv as increments or as stamped poses.
+
+    Raises:
+        DeviceError: something is missing or wrong.
+    """
+    paths = images_of(folder)
+    camera, distortion = read_camera(options.camera or folder / "camera.toml")
+    stamps = np.array([round(1e9 * t) for t in read_times(folder / "times.txt", len(paths))], np.int64)
+    path, images = folder / "odometry.csv", _images(paths, stamps, camera)
+    if options.odometry is not None or _is_poses(path):
+        poses = read_poses(options.odometry or path)
+        return assembled(folder, "folder of images", camera, distortion, images, poses)
+    increments = read_increments(path, len(paths))
+    return assembled(folder, "folder of images", camera, distortion, images, increments)
+
+
+def _is_poses(path: Path) -> bool:
+    """Whether an odometry.csv has stamped poses rather than increments."""
+    try:
+        with path.open(newline="") as file:
+            return "x_m" in next(csv.reader(file), [])
+    except (OSError, ValueError, csv.Error):
+        return False
+
+
+def _folder(
+    folder: Path,
+    kind: str,
+    paths: Sequence[Path],
+    stamps_ns: Stamps,
+    given: tuple[Camera, Distortion] | None,
+    options: RecordingOptions,
+) -> Recording:
+    camera, distortion = options.camera_of(folder, given)
+    beside = next((p for p in (folder / "odometry.csv", folder / "odometry.txt") if p.exists()), None)
+    odometry = options.odometry or beside
+    if odometry is None:
+        raise DeviceError(f"{folder}: {kind}, {len(paths)} images, but {NO_ODOMETRY}")
+    return assembled(folder, kind, camera, distortion, _images(paths, stamps_ns), read_poses(odometry))
+
+
+def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = None) -> Images:
+    return Images(stamps_ns, lambda k: read_grey(paths[k], camera, "camera.toml"))
+
+
+def _camera(image: Path, intrinsics: Intrinsics) -> Camera:
+    try:
+        width, height = image_size(read_whole(image))
+        return Camera(width, height, *intrinsics, mount_height=0.0)
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{image}: {error}") from None
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return read_whole(path).decode("utf-8").splitlines()
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{path}: {error}") from None
+
+
+def _numbers(path: Path, words: Sequence[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise DeviceError(f"{path}: {error}") from None
+
+
+def _seconds(path: Path, count: int) -> Stamps:
+    times = _numbers(path, "\n".join(_lines(path)).split())
+    if len(times) != count:
+        raise DeviceError(f"{path}: {len(times)} times for {count} images")
+    return np.array([round(1e9 * t) for t in times], np.int64)
+
+
+def _yaml_list(folder: Path, text: str, name: str, count: int) -> list[float]:
+    """A list of numbers in a flat YAML file."""
+    path, found = folder / "sensor.yaml", re.search(rf"^{name}:\s*\[([^\]]*)\]", text, re.M)
+    values = [] if found is None else _numbers(path, found[1].replace(",", " ").split())
+    if len(values) != count:
+        raise DeviceError(f"{path}: {name} must have {count} numbers")
+    return values

@@ -1,0 +1,119 @@
+"""The files of a folder of images: images/, times.txt, odometry.csv, splits.toml."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapweave.agent.recordings.camera_file import number, whole
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.storage.atomic_file import read_whole
+from mapweave.wire.packing import MAX_STAMP_NS
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
+
+
+def images_of(folder: Path) -> list[Path]:
+    """The images of a recording in the order of the numbers in their names.
+
+    Raises:
+        DeviceError: there are none.
+    """
+    return images_in(folder / "images")
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images in a folder in the order of the numbers in their names.
+
+    Raises:
+        DeviceError: there are none.
+    """
+    images = [p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        raise DeviceError(f"{folder}: no images there (png, jpg, pgm or bmp)")
+    return sorted(images, key=_natural_order)
+
+
+def _natural_order(path: Path) -> tuple[list[int], str]:
+    return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.name
+
+
+def read_times(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """(count,) s, ascending, of a times.txt; ten images a second without one.
+
+    Raises:
+        DeviceError: it is wrong.
+    """
+    if not path.exists():
+        return np.linspace(0.0, 0.1 * (count - 1), count)
+    try:
+        times = np.array([float(line) for line in read_whole(path).decode().split()])
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    if len(times) != count or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise DeviceError(f"{path}: {len(times)} times for {count} images; they must be one each and ascend")
+    if not 0.0 <= times[0] <= times[-1] <= MAX_STAMP_NS / 1e9:
+        raise DeviceError(f"{path}: times are seconds since 1970 or since the start, not {times[0]:g}")
+    return times
+
+
+def read_increments(path: Path, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """(count, 2) forward m and turn rad since the image before, of an odometry.csv.
+
+    Raises:
+        DeviceError: it is missing or wrong.
+    """
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            try:
+                rows = [(number(row, "forward_m"), number(row, "turn_rad")) for row in reader]
+            except ValueError as error:
+                raise DeviceError(f"{path}: line {reader.line_num}: {error}") from None
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file; without odometry the map has no scale") from None
+    except KeyError as missing:
+        raise DeviceError(f"{path}: no column {missing.args[0]!r}") from None
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    if len(rows) != count or not all(math.isfinite(v) for row in rows for v in row):
+        raise DeviceError(f"{path}: {len(rows)} rows for {count} images; there must be one finite row each")
+    return np.array(rows)
+
+
+def read_split(path: Path, robot: str | None, count: int) -> range:
+    """The images of one robot of a splits.toml; all without a robot.
+
+    Raises:
+        DeviceError: the file is missing or wrong, or has no such robot.
+    """
+    if robot is None:
+        return range(count)
+    try:
+        robots = {str(r["name"]): r for r in tomllib.loads(read_whole(path).decode("utf-8")).get("robot", [])}
+    except FileNotFoundError:
+        raise DeviceError(f"{path}: no such file; it must describe robot {robot!r}") from None
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{path}: {error}") from None
+    except (KeyError, TypeError):
+        raise DeviceError(f"{path}: write a [[robot]] table with a name for each robot") from None
+    if robot not in robots:
+        raise DeviceError(f"{path}: no robot {robot!r}; there are {', '.join(sorted(robots)) or 'none'}")
+    split = robots[robot]
+    try:
+        first, last, step = (whole(v) for v in (split["first"], split["last"], split.get("step", 1)))
+    except (KeyError, ValueError, TypeError) as error:
+        raise DeviceError(f"{path}: robot {robot!r}: {error}") from None
+    if step < 1:
+        raise DeviceError(f"{path}: robot {robot!r}: step {step} must be 1 or more")
+    if not 0 <= first <= last < count:
+        raise DeviceError(
+            f"{path}: robot {robot!r}: frames {first} to {last} are not within the {count} images"
+        )
+    return range(first, last + 1, step)

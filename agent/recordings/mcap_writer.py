@@ -1,0 +1,209 @@
+"""Recordings as MCAP with standard ROS 2 messages: Foxglove and rviz open them, `mapweave replay` too."""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.pose import Pose2
+
+PART_S = 60.0
+"""A recording is a row of files. One that the power fails in is lost, so none is longer, s."""
+WAITING = 200
+"""Observations that wait for the disk; more are dropped, and counted."""
+JPEG_QUALITY = 95
+BASE, OPTICAL, ODOM = "base_footprint", "camera_optical_frame", "odom"
+"""Frames of REP 105 and REP 103."""
+
+
+class McapWriter:
+    """Writes what a robot senses and what it is told to do, in a thread of its own.
+
+    Topics: /camera/image/compressed, /camera/camera_info, /odom, /tf_static, /cmd_vel, /bumper, /proximity/N.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        description: RobotDescription,
+        lossless: bool = False,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """Begin a recording.
+
+        Args:
+            folder: new or empty; gets a bag of at most `PART_S` each.
+            description: of the robot.
+            lossless: images as PNG instead of JPEG: three to four times as large.
+            say: takes lines for people.
+
+        Raises:
+            DeviceError: the folder cannot be made, or holds something.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if any(folder.iterdir()):
+                raise DeviceError(f"{folder}: not empty; a recording overwrites nothing, give another folder")
+        except OSError as error:
+            raise DeviceError(f"{folder}: {error.strerror}") from None
+        self._folder, self._description, self._lossless, self._say = folder, description, lossless, say
+        self._waiting: queue.Queue[tuple[Observation, Command, Pose2] | None] = queue.Queue(WAITING)
+        self._part: _Part | None = None
+        self._parts, self.written, self.dropped = 0, 0, 0
+        self._failed = ""
+        self._odom_from_robot = Pose2()
+        self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
+        self._thread.start()
+
+    def write(self, observation: Observation, command: Command) -> None:
+        """Take an observation, and the command that was applied before it. Never waits."""
+        self._odom_from_robot = self._odom_from_robot @ observation.odometry.motion()
+        try:
+            self._waiting.put_nowait((observation, command, self._odom_from_robot))
+        except queue.Full:
+            self.dropped += 1
+            if self.dropped == 1:
+                self._say(f"{self._folder}: the disk is too slow, observations are left out of the recording")
+
+    def close(self) -> None:
+        """Write what waits and finish the file."""
+        self._waiting.put(None)
+        self._thread.join()
+        if self.dropped:
+            self._say(
+                f"{self._folder}: {self.dropped} of {self.dropped + self.written} observations were left out"
+            )
+
+    def _write(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            if self._failed:
+                continue
+            observation, command, odom_from_robot = item
+            try:
+                if self._part is None or observation.stamp_ns - self._part.begun_ns > PART_S * 1e9:
+                    self._next_part(observation.stamp_ns)
+                assert self._part is not None
+                self._part.write(observation, command, odom_from_robot)
+                self.written += 1
+            except OSError as error:
+                self._failed = error.strerror or str(error)
+                self._say(f"{self._folder}: the recording ends here, {self._failed}")
+        if self._part is not None:
+            self._part.close()
+
+    def _next_part(self, stamp_ns: int) -> None:
+        if self._part is not None:
+            self._part.close()
+        path = self._folder / f"{self._folder.name}_{self._parts}"
+        self._part = _Part(path, self._description, stamp_ns, self._lossless)
+        self._parts += 1
+
+
+class _Part:
+    """One bag of a recording."""
+
+    def __init__(self, path: Path, description: RobotDescription, begun_ns: int, lossless: bool) -> None:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+
+        self.begun_ns, self._lossless = begun_ns, lossless
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._types = self._store.types
+        self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.open()
+        self._connections: dict[str, Any] = {}
+        self._description = description
+        self._info = self._camera_info()
+        self._put("/tf_static", "tf2_msgs/msg/TFMessage", begun_ns, transforms=[self._mount()])
+
+    def write(self, observation: Observation, command: Command, odom_from_robot: Pose2) -> None:
+        stamp = observation.stamp_ns
+        if observation.image is not None:
+            kind = ".png" if self._lossless else ".jpg"
+            quality = [] if self._lossless else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+            data = cv2.imencode(kind, observation.image, quality)[1].reshape(-1)
+            header = self._header(stamp, OPTICAL)
+            name = "sensor_msgs/msg/CompressedImage"
+            word = "png" if self._lossless else "jpeg"
+            self._put("/camera/image/compressed", name, stamp, header=header, format=word, data=data)
+            self._put("/camera/camera_info", "sensor_msgs/msg/CameraInfo", stamp, header=header, **self._info)
+        unknown = np.zeros(36)
+        pose = self._make(
+            "geometry_msgs/msg/PoseWithCovariance", pose=self._pose(odom_from_robot), covariance=unknown
+        )
+        twist = self._make(
+            "geometry_msgs/msg/TwistWithCovariance", twist=self._twist(Command()), covariance=unknown
+        )
+        header, name = self._header(stamp, ODOM), "nav_msgs/msg/Odometry"
+        self._put("/odom", name, stamp, header=header, child_frame_id=BASE, pose=pose, twist=twist)
+        name = "geometry_msgs/msg/TwistStamped"
+        self._put("/cmd_vel", name, stamp, header=self._header(stamp, BASE), twist=self._twist(command))
+        if observation.bumped:
+            self._put("/bumper", "std_msgs/msg/Bool", stamp, data=True)
+        d = self._description
+        for k, (distance, _) in enumerate(zip(observation.proximity, d.ranger_bearings, strict=True)):
+            self._put(
+                f"/proximity/{k}", "sensor_msgs/msg/Range", stamp,
+                header=self._header(stamp, f"proximity_{k}"), radiation_type=1, field_of_view=0.1,
+                min_range=0.0, max_range=d.ranger_reach, range=float(distance), variance=0.0,
+            )  # fmt: skip
+
+    def close(self) -> None:
+        self._writer.close()
+
+    def _put(self, topic: str, name: str, stamp_ns: int, **fields: Any) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, name, typestore=self._store)
+        data = self._store.serialize_cdr(self._make(name, **fields), name)
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def _make(self, name: str, **fields: Any) -> Any:
+        return self._types[name](**fields)
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+        stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def _pose(self, pose: Pose2) -> Any:
+        position = self._make("geometry_msgs/msg/Point", x=pose.x, y=pose.y, z=0.0)
+        half = pose.heading / 2
+        turn = self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+        return self._make("geometry_msgs/msg/Pose", position=position, orientation=turn)
+
+    def _twist(self, command: Command) -> Any:
+        linear = self._make("geometry_msgs/msg/Vector3", x=command.forward, y=0.0, z=0.0)
+        angular = self._make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=command.turn)
+        return self._make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+
+    def _camera_info(self) -> dict[str, Any]:
+        c = self._description.camera
+        region = self._make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        k = np.array([c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0])
+        p = np.array([c.fx, 0.0, c.cx, 0.0, 0.0, c.fy, c.cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+        return {
+            "height": c.height, "width": c.width, "distortion_model": "plumb_bob", "k": k, "p": p,
+            "d": np.array(self._description.distortion), "r": np.eye(3).ravel(),
+            "binning_x": 0, "binning_y": 0, "roi": region,
+        }  # fmt: skip
+
+    def _mount(self) -> Any:
+        """The camera in the robot: it looks ahead, turned into the optical axes."""
+        c = self._description.camera
+        at = self._make("geometry_msgs/msg/Vector3", x=c.mount_forward, y=0.0, z=c.mount_height)
+        turn = self._make("geometry_msgs/msg/Quaternion", x=-0.5, y=0.5, z=-0.5, w=0.5)
+        transform = self._make("geometry_msgs/msg/Transform", translation=at, rotation=turn)
+        name = "geometry_msgs/msg/TransformStamped"
+        header = self._header(self.begun_ns, BASE)
+        return self._make(name, header=header, child_frame_id=OPTICAL, transform=transform)

@@ -1,0 +1,44 @@
+"""Which format a recording has, and the way to open it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mapweave.agent.recordings import bag as bags
+from mapweave.agent.recordings import video as videos
+from mapweave.agent.recordings.folders import euroc, four_seasons, images_folder, kitti, tum_rgbd
+from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.agent.recordings.recording import Recording
+from mapweave.hybridmap.errors import DeviceError
+
+FORMATS = (
+    "a folder with images/ and camera.toml, a bag (.mcap, .bag, .db3 or its folder), a video, or a sequence "
+    "of KITTI odometry, EuRoC, TUM RGB-D or 4Seasons"
+)
+
+
+def open_recording(path: Path, options: RecordingOptions | None = None) -> Recording:
+    """Open a recording of any known format.
+
+    Raises:
+        DeviceError: it is none, or something in it is missing or wrong; one line says what.
+    """
+    options = options or RecordingOptions()
+    if path.is_file():
+        if path.suffix.lower() in bags.SUFFIXES:
+            return bags.bag(path, options)
+        if path.suffix.lower() in videos.SUFFIXES:
+            return videos.video(path, options)
+        raise DeviceError(f"{path}: not a recording; one is {FORMATS}")
+    if not path.is_dir():
+        raise DeviceError(f"{path}: no such folder or file; a recording is {FORMATS}")
+    marks = {
+        "images": images_folder, "camera.toml": images_folder, "metadata.yaml": bags.bag, "mav0": euroc,
+        "rgb.txt": tum_rgbd, "undistorted_images": four_seasons, "calib.txt": kitti,
+    }  # fmt: skip
+    for mark, opened in marks.items():
+        if (path / mark).exists():
+            return opened(path, options)
+    if any(path.glob("*/metadata.yaml")):
+        return bags.bag(path, options)
+    raise DeviceError(f"{path}: not a recording; one is {FORMATS}")

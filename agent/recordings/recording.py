@@ -1,0 +1,219 @@
+"""What every format of a recording is read as: images with stamps, and the wheels' way between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.pose import Array
+
+Distortion = tuple[float, float, float, float, float]
+"""(k1, k2, p1, p2, k3) of the lens, OpenCV's order."""
+Stamps = NDArray[np.int64]
+
+MOST_WIDTH = 800
+"""px; wider images are reduced. SIFT takes time in proportion to the area."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A drive.
+
+    Attributes:
+        path: where it is.
+        kind: of its format, in words.
+        camera: of the images that `read` gives.
+        distortion: of its lens.
+        stamps_ns: (N,) of the images, ascending.
+        read: gives an image by its number, (H, W) grey of the camera's size. Raises DeviceError.
+        increments: (N, 2) way of the middle of the axle, m, and turn, rad, since the image before.
+        notes: what was guessed or left out, a line each.
+    """
+
+    path: Path
+    kind: str
+    camera: Camera
+    distortion: Distortion
+    stamps_ns: Stamps
+    read: Callable[[int], NDArray[np.uint8]]
+    increments: Array
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """How many images there are."""
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The camera's side of a recording.
+
+    Attributes:
+        stamps_ns: (N,) ascending.
+        read: gives an image by its number, (H, W) grey.
+    """
+
+    stamps_ns: Stamps
+    read: Callable[[int], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, eq=False)
+class StampedPoses:
+    """Odometry as poses with stamps of their own.
+
+    Attributes:
+        stamps_ns: (M,) ascending, by the images' clock.
+        poses: (M, 3) x m, y m, heading rad, in a frame that drifts.
+    """
+
+    stamps_ns: Stamps
+    poses: Array
+
+
+def increments_between(odometry: StampedPoses, stamps_ns: Stamps) -> tuple[NDArray[np.bool_], Array]:
+    """What the wheels did between images.
+
+    Poses are interpolated linearly. Images before the first pose or after the last one get none.
+
+    Args:
+        odometry: poses over time.
+        stamps_ns: (N,) of images, ascending.
+
+    Returns:
+        (N,) which images have odometry, and (K, 2) forward m and turn rad of each of these since the one
+        before; the first row is zero.
+
+    Raises:
+        DeviceError: the stamps do not overlap.
+    """
+    times = odometry.stamps_ns
+    inside = (stamps_ns >= times[0]) & (stamps_ns <= times[-1]) if len(times) else np.zeros(0, np.bool_)
+    if not inside.any():
+        raise DeviceError(
+            f"the images' stamps ({_span(stamps_ns)}) and the odometry's ({_span(times)}) do not overlap: "
+            "they must be of one clock"
+        )
+    # Nanoseconds since 1970 exceed what a float64 holds exactly.
+    at, known = stamps_ns[inside] - times[0], times - times[0]
+    x, y, heading = odometry.poses.T
+    poses = np.stack([np.interp(at, known, column) for column in (x, y, np.unwrap(heading))], axis=1)
+    return inside, chords(poses)
+
+
+def chords(poses: Array) -> Array:
+    """(N, 3) poses to (N, 2) forward, m, and turn, rad, since the pose before; see `Odometry.motion`."""
+    steps = np.diff(poses, axis=0)
+    turns = (steps[:, 2] + math.pi) % math.tau - math.pi
+    middle = poses[:-1, 2] + turns / 2
+    forward = steps[:, 0] * np.cos(middle) + steps[:, 1] * np.sin(middle)
+    return np.concatenate([np.zeros((1, 2)), np.stack([forward, turns], axis=1)])
+
+
+def assembled(
+    path: Path,
+    kind: str,
+    camera: Camera,
+    distortion: Distortion,
+    images: Images,
+    odometry: StampedPoses | Array,
+    notes: tuple[str, ...] = (),
+) -> Recording:
+    """Put images and odometry together; large images are reduced.
+
+    Args:
+        path: where it is.
+        kind: in words.
+        camera: that took the images.
+        distortion: of its lens.
+        images: all of them.
+        odometry: poses with stamps, or (N, 2) increments since the image before.
+        notes: for people.
+
+    Raises:
+        DeviceError: they do not fit together.
+    """
+    stamps, read = images.stamps_ns, images.read
+    if len(stamps) < 2:
+        raise DeviceError(f"{path}: {len(stamps)} images are no drive")
+    if (np.diff(stamps) <= 0).any():
+        raise DeviceError(f"{path}: the images' stamps do not ascend")
+    if isinstance(odometry, StampedPoses):
+        try:
+            inside, increments = increments_between(odometry, stamps)
+        except DeviceError as error:
+            raise DeviceError(f"{path}: {error}") from None
+        if not inside.all():
+            notes = (*notes, f"{int((~inside).sum())} of {len(stamps)} images have no odometry: left out")
+        numbers = np.flatnonzero(inside)
+        stamps, whole = stamps[inside], read
+
+        def read(k: int) -> NDArray[np.uint8]:
+            return whole(int(numbers[k]))
+
+    else:
+        increments = odometry
+    if len(increments) != len(stamps) or not np.isfinite(increments).all():
+        raise DeviceError(f"{path}: {len(increments)} rows of odometry for {len(stamps)} images")
+    factor = math.ceil(camera.width / MOST_WIDTH)
+    if factor > 1:
+        notes = (*notes, f"images are reduced {factor} times")
+    return Recording(
+        path,
+        kind,
+        reduced(camera, factor),
+        distortion,
+        stamps,
+        _reader(path, read, camera, factor),
+        increments,
+        notes,
+    )
+
+
+def reduced(camera: Camera, factor: int) -> Camera:
+    """The camera of images that are reduced by a whole factor; what is left over at the edges is cut off."""
+    if factor == 1:
+        return camera
+    return replace(
+        camera,
+        width=camera.width // factor,
+        height=camera.height // factor,
+        fx=camera.fx / factor,
+        fy=camera.fy / factor,
+        # The middle of the first pixel is 0: the middle of the first `factor` pixels moves there.
+        cx=(camera.cx + 0.5) / factor - 0.5,
+        cy=(camera.cy + 0.5) / factor - 0.5,
+    )
+
+
+def _reader(
+    path: Path, read: Callable[[int], NDArray[np.uint8]], camera: Camera, factor: int
+) -> Callable[[int], NDArray[np.uint8]]:
+    def checked(k: int) -> NDArray[np.uint8]:
+        image = read(k)
+        if image.shape != (camera.height, camera.width):
+            height, width = image.shape
+            raise DeviceError(
+                f"{path}: image {k} has {width}x{height} px, but the camera {camera.width}x{camera.height}"
+            )
+        if factor == 1:
+            return image
+        size = (camera.width // factor, camera.height // factor)
+        whole: NDArray[Any] = image[: size[1] * factor, : size[0] * factor]
+        return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    return checked
+
+
+def _span(stamps_ns: Stamps) -> str:
+    if not len(stamps_ns):
+        return "none"
+    return f"{stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s"

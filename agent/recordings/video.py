@@ -1,0 +1,73 @@
+"""A plain video file, with odometry in a file of its own."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.recordings.options import NO_ODOMETRY, RecordingOptions
+from mapweave.agent.recordings.pose_files import read_poses
+from mapweave.agent.recordings.recording import Images, Recording, assembled
+from mapweave.hybridmap.errors import DeviceError
+
+SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
+
+
+def video(path: Path, options: RecordingOptions) -> Recording:
+    """Open a video. Stamps begin at 0 with the first frame.
+
+    Raises:
+        DeviceError: it cannot be read, or nobody says what camera it is or how it moved.
+    """
+    images = video_images(path)
+    camera, distortion = options.camera_of(path, None)
+    beside = path.with_suffix(".csv")
+    odometry = options.odometry or (beside if beside.exists() else None)
+    if odometry is None:
+        raise DeviceError(f"{path}: video, {len(images.stamps_ns)} frames, but {NO_ODOMETRY}")
+    return assembled(path, "video", camera, distortion, images, read_poses(odometry))
+
+
+def video_images(path: Path) -> Images:
+    """Frames and their stamps; a frame that cannot be decoded ends the video.
+
+    Raises:
+        DeviceError: it cannot be read.
+    """
+    capture = cv2.VideoCapture(str(path))
+    stamps: list[int] = []
+    while capture.grab():
+        stamps.append(round(1e6 * capture.get(cv2.CAP_PROP_POS_MSEC)))
+    if len(stamps) < 2:
+        raise DeviceError(f"{path}: no video that can be read")
+    if not all(before < after for before, after in itertools.pairwise(stamps)):
+        # Some containers give no stamps for each frame.
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        stamps = [round(1e9 * k / (rate if rate > 0 else 30.0)) for k in range(len(stamps))]
+    return Images(np.array(stamps, np.int64), _sequential(path))
+
+
+def _sequential(path: Path) -> Callable[[int], NDArray[np.uint8]]:
+    """Reads frames in ascending order quickly; going back starts the video again."""
+    state: dict[str, cv2.VideoCapture] = {}
+    at = 0
+
+    def read(k: int) -> NDArray[np.uint8]:
+        nonlocal at
+        if "capture" not in state or k < at:
+            state["capture"], at = cv2.VideoCapture(str(path)), 0
+        while at < k and state["capture"].grab():
+            at += 1
+        good, frame = state["capture"].read()
+        if not good:
+            raise DeviceError(f"{path}: frame {k} cannot be decoded")
+        at += 1
+        grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        return np.asarray(grey, np.uint8)
+
+    return read

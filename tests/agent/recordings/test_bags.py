@@ -1,0 +1,256 @@
+"""Bags are written here with rosbags alone, field by field; what Mapweave writes is read by rosbags."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from mapweave.agent.drivers.recorded import RecordedRobot
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter
+from mapweave.agent.recordings.opening import open_recording
+from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.pose import Pose2
+from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE1 = get_typestore(Stores.ROS1_NOETIC)
+
+
+def make(store: Any, name: str, **fields: Any) -> Any:
+    return store.types[name](**fields)
+
+
+def header(store: Any, stamp: int, frame: str) -> Any:
+    time = make(store, "builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    extra = {"seq": 0} if store is STORE1 else {}
+    return make(store, "std_msgs/msg/Header", stamp=time, frame_id=frame, **extra)
+
+
+def odometry(store: Any, stamp: int, pose: Pose2) -> Any:
+    point = make(store, "geometry_msgs/msg/Point", x=pose.x, y=pose.y, z=0.0)
+    half = pose.heading / 2
+    turn = make(store, "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+    zero = make(store, "geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    twist = make(store, "geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    where = make(store, "geometry_msgs/msg/Pose", position=point, orientation=turn)
+    none = np.zeros(36)
+    return make(
+        store, "nav_msgs/msg/Odometry", header=header(store, stamp, "odom"), child_frame_id="base_link",
+        pose=make(store, "geometry_msgs/msg/PoseWithCovariance", pose=where, covariance=none),
+        twist=make(store, "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
+    )  # fmt: skip
+
+
+def camera_info(store: Any, stamp: int, drive: Drive) -> Any:
+    c = drive.camera
+    k = np.array([c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1], np.float64)
+    names = "DKRP" if store is STORE1 else "dkrp"
+    values = (np.array([0.1, 0.0, 0.0, 0.0, 0.0]), k, np.eye(3).ravel(), np.zeros(12))
+    region = make(
+        store, "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return make(
+        store, "sensor_msgs/msg/CameraInfo", header=header(store, stamp, "camera"), height=c.height,
+        width=c.width, distortion_model="plumb_bob", binning_x=0, binning_y=0, roi=region,
+        **dict(zip(names, values, strict=True)),
+    )  # fmt: skip
+
+
+def image(store: Any, stamp: int, grey: np.ndarray, encoding: str) -> Any:
+    """Rows are padded, as drivers with aligned memory send them."""
+    colour = {"mono8": grey[:, :, None], "mono16": np.stack([np.full_like(grey, 7), grey], axis=2)}
+    pixels = colour.get(encoding, np.repeat(grey[:, :, None], 4 if encoding.endswith("a8") else 3, axis=2))
+    rows = pixels.reshape(len(grey), -1)
+    padded = np.concatenate([rows, np.zeros((len(rows), 5), np.uint8)], axis=1)
+    return make(
+        store, "sensor_msgs/msg/Image", header=header(store, stamp, "camera"), height=grey.shape[0],
+        width=grey.shape[1], encoding=encoding, is_bigendian=0, step=padded.shape[1], data=padded.ravel(),
+    )  # fmt: skip
+
+
+def write_bag(path: Path, drive: Drive, encoding: str = "mono8", ros1: bool = False, **named: str) -> None:
+    """Images at their stamps, odometry four times as often; both arrive late."""
+    store: Any = STORE1 if ros1 else STORE
+    topics = {"image": "/cam/image_raw", "info": "/cam/camera_info", "odom": "/odom", **named}
+    kinds = {
+        "image": "sensor_msgs/msg/" + ("CompressedImage" if encoding in ("jpeg", "png") else "Image"),
+        "info": "sensor_msgs/msg/CameraInfo", "odom": "nav_msgs/msg/Odometry",
+    }  # fmt: skip
+    plugin = StoragePlugin.SQLITE3 if encoding == "bgra8" else StoragePlugin.MCAP
+    writer: Any = Writer1(path) if ros1 else Writer(path, version=8, storage_plugin=plugin)
+    serialize: Callable[[Any, str], Any] = store.serialize_ros1 if ros1 else store.serialize_cdr
+    with writer:
+        opened = {key: writer.add_connection(topics[key], kinds[key], typestore=store) for key in topics}
+        fine = [Pose2(*row) for row in between(drive.poses, 4)]
+        for k, pose in enumerate(fine):
+            stamp = BEGUN_NS + k * STEP_NS // 4
+            late = stamp + 30_000_000
+            writer.write(opened["odom"], late, serialize(odometry(store, stamp, pose), kinds["odom"]))
+            if k % 4:
+                continue
+            grey = drive.images[k // 4]
+            if encoding in ("jpeg", "png"):
+                data = cv2.imencode(f".{encoding}", grey)[1].ravel()
+                head = header(store, stamp, "camera")
+                message = make(store, kinds["image"], header=head, format=encoding, data=data)
+            else:
+                message = image(store, stamp, grey, encoding)
+            writer.write(opened["image"], late, serialize(message, kinds["image"]))
+            writer.write(opened["info"], late, serialize(camera_info(store, stamp, drive), kinds["info"]))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "ros1"),
+    [("mono8", False), ("rgb8", False), ("bgr8", False), ("bgra8", False), ("mono16", False), ("png", False),
+     ("mono8", True)],
+)  # fmt: skip
+def test_a_bag_is_read_as_it_was(encoding: str, ros1: bool, drive: Drive, tmp_path: Path) -> None:
+    path = tmp_path / ("drive.bag" if ros1 else "drive")
+    write_bag(path, drive, encoding, ros1)
+    replay = Replay(path, options=RecordingOptions(camera_height=0.3))
+    description = replay.describe()
+    assert description.camera == drive.camera and description.distortion == (0.1, 0.0, 0.0, 0.0, 0.0)
+    assert replay.recording.notes == ("images from /cam/image_raw", "odometry from /odom")
+    seen = list(iter(replay.sense, None))
+    assert [observation.stamp_ns for observation in seen] == drive.stamps_ns
+    for observation, grey, (forward, turn) in zip(seen, drive.images, drive.increments, strict=True):
+        assert np.array_equal(observation.image, grey)
+        assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx((forward, turn))
+
+
+def test_a_single_mcap_file_is_read_without_its_folder(drive: Drive, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive", drive)
+    (file,) = (tmp_path / "drive").glob("*.mcap")
+    recording = open_recording(file, RecordingOptions(camera_height=0.3))
+    assert len(recording) == COUNT
+
+
+def test_topics_are_named_by_the_person_or_guessed(drive: Drive, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive", drive, odom="/ground_truth/odom")
+    height = 0.3
+    with pytest.raises(DeviceError, match=r"no odometry.*/ground_truth/odom \(nav_msgs/msg/Odometry\)"):
+        open_recording(tmp_path / "drive", RecordingOptions(camera_height=height))
+    given = RecordingOptions(camera_height=height, odometry_topic="/ground_truth/odom")
+    assert len(open_recording(tmp_path / "drive", given)) == COUNT
+    with pytest.raises(DeviceError, match=r"no topic /camera; it has .*/cam/image_raw"):
+        open_recording(tmp_path / "drive", RecordingOptions(image_topic="/camera"))
+    with pytest.raises(DeviceError, match=r"/cam/camera_info has 9 messages of .*CameraInfo; images"):
+        open_recording(tmp_path / "drive", RecordingOptions(image_topic="/cam/camera_info"))
+
+
+def test_a_bag_cut_off_in_the_middle_is_refused_or_used_up_to_there(drive: Drive, tmp_path: Path) -> None:
+    write_bag(tmp_path / "drive.bag", drive, ros1=True)
+    whole = (tmp_path / "drive.bag").read_bytes()
+    for share in (0.1, 0.5, 0.9):
+        (tmp_path / "drive.bag").write_bytes(whole[: round(share * len(whole))])
+        with pytest.raises(DeviceError) as error:
+            open_recording(tmp_path / "drive.bag", RecordingOptions(camera_height=0.3))
+        assert "drive.bag" in str(error.value) and "\n" not in str(error.value)
+
+
+class Driven:
+    """A robot that senses a drive."""
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive, self._at, self.closed = drive, 0, False
+
+    def describe(self) -> RobotDescription:
+        return RobotDescription(
+            camera=self._drive.camera,
+            distortion=(-0.1, 0.02, 0.001, 0.0, 0.0),
+            ranger_bearings=(0.0, 0.5),
+            ranger_reach=2.0,
+        )
+
+    def sense(self) -> Observation | None:
+        k, self._at = self._at, self._at + 1
+        if k == COUNT:
+            return None
+        forward, turn = self._drive.increments[k]
+        return Observation(
+            self._drive.stamps_ns[k], Odometry(forward, turn), self._drive.images[k], np.array([1.0, 2.0])
+        )
+
+    def act(self, command: Command) -> Command:
+        return Command(min(command.forward, 0.3), command.turn)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def record(drive: Drive, folder: Path, lossless: bool = True) -> Driven:
+    robot = Driven(drive)
+    recorded = RecordedRobot(robot, McapWriter(folder, robot.describe(), lossless))
+    while recorded.sense() is not None:
+        assert recorded.act(Command(0.5, 0.1)) == Command(0.3, 0.1)
+    recorded.close()
+    return robot
+
+
+def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_path: Path) -> None:
+    robot = record(drive, tmp_path / "walk")
+    assert robot.closed
+    replay = Replay(tmp_path / "walk")
+    assert replay.describe().camera == drive.camera
+    assert replay.describe().distortion == robot.describe().distortion
+    seen = list(iter(replay.sense, None))
+    assert [observation.stamp_ns for observation in seen] == drive.stamps_ns
+    for observation, grey, increment in zip(seen, drive.images, drive.increments, strict=True):
+        assert np.array_equal(observation.image, grey)
+        assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx(
+            tuple(increment), abs=1e-9
+        )
+
+
+def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> None:
+    """Read by rosbags with the definitions in the file itself."""
+    record(drive, tmp_path / "walk", lossless=False)
+    with AnyReader([tmp_path / "walk" / "walk_0"]) as reader:
+        kinds = {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
+        assert kinds == {
+            "/tf_static": ("tf2_msgs/msg/TFMessage", 1),
+            "/camera/image/compressed": ("sensor_msgs/msg/CompressedImage", COUNT),
+            "/camera/camera_info": ("sensor_msgs/msg/CameraInfo", COUNT),
+            "/odom": ("nav_msgs/msg/Odometry", COUNT),
+            "/cmd_vel": ("geometry_msgs/msg/TwistStamped", COUNT),
+            "/proximity/0": ("sensor_msgs/msg/Range", COUNT),
+            "/proximity/1": ("sensor_msgs/msg/Range", COUNT),
+        }
+        for connection, stamp, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            if connection.topic == "/cmd_vel":
+                assert message.twist.linear.x == (0.0 if stamp == BEGUN_NS else 0.3)
+            if connection.topic == "/tf_static":
+                (mount,) = message.transforms
+                assert mount.transform.translation.z == 0.3 and mount.header.frame_id == "base_footprint"
+
+
+def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path: Path) -> None:
+    gap = round((PART_S + 1.0) * 1e9 / 4)
+    slow = Drive(drive.images, [BEGUN_NS + k * gap for k in range(COUNT)], drive.poses, drive.camera)
+    record(slow, tmp_path / "walk")
+    assert sorted(p.name for p in (tmp_path / "walk").iterdir()) == ["walk_0", "walk_1", "walk_2"]
+    assert [o.stamp_ns for o in iter(Replay(tmp_path / "walk").sense, None)] == slow.stamps_ns
+    # The last file of a robot whose battery failed has no index.
+    (tmp_path / "walk" / "walk_2" / "metadata.yaml").unlink()
+    assert len(Replay(tmp_path / "walk")) == 8
+
+
+def test_a_recording_overwrites_nothing(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "notes.txt").write_text("mine")
+    with pytest.raises(DeviceError, match="not empty; a recording overwrites nothing"):
+        McapWriter(tmp_path / "walk", Driven(drive).describe())

@@ -1,0 +1,180 @@
+"""The same drive in every format gives the same observations."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.recordings.opening import open_recording
+from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.agent.recordings.recording import reduced
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive
+
+KNOWN = COUNT - 1
+"""The odometry ends before the last image."""
+
+
+def kitti(drive: Drive, folder: Path) -> None:
+    (folder / "image_0").mkdir()
+    for k, image in enumerate(drive.images):
+        cv2.imwrite(str(folder / "image_0" / f"{k:06d}.png"), image)
+    (folder / "times.txt").write_text("".join(f"{(s - BEGUN_NS) / 1e9:e}\n" for s in drive.stamps_ns))
+    c = drive.camera
+    (folder / "calib.txt").write_text(f"P0: {c.fx} 0 {c.cx} 0 0 {c.fy} {c.cy} 0 0 0 1 0\nP1: 1 0 0\n")
+
+
+def euroc(drive: Drive, folder: Path) -> None:
+    cam = folder / "mav0" / "cam0"
+    (cam / "data").mkdir(parents=True)
+    rows = ["#timestamp [ns],filename"]
+    for image, stamp in zip(drive.images, drive.stamps_ns, strict=True):
+        cv2.imwrite(str(cam / "data" / f"{stamp}.png"), image)
+        rows.append(f"{stamp},{stamp}.png")
+    (cam / "data.csv").write_text("\r\n".join(rows) + "\r\n")
+    c = drive.camera
+    (cam / "sensor.yaml").write_text(
+        "sensor_type: camera\nresolution: [320, 240]\n"
+        f"intrinsics: [{c.fx}, {c.fy}, {c.cx}, {c.cy}]  #fu, fv, cu, cv\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
+    )
+
+
+def tum_rgbd(drive: Drive, folder: Path) -> None:
+    (folder / "rgb").mkdir()
+    rows = ["# color images", "# timestamp filename"]
+    for image, stamp in zip(drive.images, drive.stamps_ns, strict=True):
+        name = f"{stamp // 10**9}.{stamp % 10**9 // 1000:06d}"
+        cv2.imwrite(str(folder / "rgb" / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+        rows.append(f"{name} rgb/{name}.png")
+    (folder / "rgb.txt").write_text("\n".join(rows) + "\n")
+    (folder / "groundtruth.txt").write_text("is never read\n")
+
+
+def four_seasons(drive: Drive, folder: Path) -> None:
+    cam = folder / "undistorted_images" / "cam0"
+    cam.mkdir(parents=True)
+    rows = []
+    for image, stamp in zip(drive.images, drive.stamps_ns, strict=True):
+        cv2.imwrite(str(cam / f"{stamp}.png"), image)
+        rows.append(f"{stamp} {stamp // 10**9}.{stamp % 10**9:09d} 8.5")
+    (folder / "times.txt").write_text("\n".join(rows) + "\n")
+
+
+def folder_with_poses(drive: Drive, folder: Path) -> None:
+    (folder / "images").mkdir()
+    for k, image in enumerate(drive.images):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
+    (folder / "times.txt").write_text("".join(f"{s // 10**9}.{s % 10**9:09d}\n" for s in drive.stamps_ns))
+
+
+CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+
+
+@pytest.mark.parametrize(
+    "write", [kitti, euroc, tum_rgbd, four_seasons, folder_with_poses], ids=lambda f: f.__name__
+)
+def test_a_drive_is_read_as_it_was(write, drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    write(drive, folder)
+    camera = tmp_path / "camera.toml"
+    camera.write_text(CAMERA_TOML)
+    if write is kitti:
+        # Its times begin at 0.
+        text = poses_file.read_text().splitlines()
+        rows = [line.split(" ", 1) for line in text[1:]]
+        poses_file.write_text("".join(f"{float(t) - BEGUN_NS / 1e9:.6f} {rest}\n" for t, rest in rows))
+    replay = Replay(folder, options=RecordingOptions(camera=camera, odometry=poses_file))
+    assert replay.describe().camera == drive.camera
+    assert len(replay) == KNOWN
+    assert any("1 of 9 images have no odometry" in note for note in replay.recording.notes)
+    seen = list(iter(replay.sense, None))
+    for k, observation in enumerate(seen):
+        assert np.array_equal(observation.image, drive.images[k])
+        assert observation.odometry.forward == pytest.approx(drive.increments[k, 0], abs=1e-5)
+        assert observation.odometry.turn == pytest.approx(drive.increments[k, 1], abs=1e-5)
+    gaps = np.diff([observation.stamp_ns for observation in seen])
+    assert np.abs(gaps - STEP_NS).max() <= 1000
+
+
+def test_kitti_and_euroc_say_what_camera_it_is_but_not_how_high(
+    drive: Drive, poses_file: Path, tmp_path: Path
+) -> None:
+    euroc(drive, tmp_path)
+    with pytest.raises(DeviceError, match="--camera-height"):
+        open_recording(tmp_path, RecordingOptions(odometry=poses_file))
+    recording = open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=0.3))
+    assert recording.camera == drive.camera
+
+
+def test_without_odometry_nothing_is_guessed(drive: Drive, tmp_path: Path) -> None:
+    euroc(drive, tmp_path)
+    with pytest.raises(DeviceError, match="EuRoC, 9 images, but no odometry: give --odometry FILE"):
+        open_recording(tmp_path, RecordingOptions(camera_height=0.3))
+
+
+def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, tmp_path: Path) -> None:
+    path, camera = tmp_path / "walk.avi", tmp_path / "camera.toml"
+    camera.write_text(CAMERA_TOML)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (320, 240), isColor=True)
+    for image in drive.images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    with pytest.raises(DeviceError, match="video, 9 frames, but no odometry"):
+        open_recording(path, RecordingOptions(camera=camera))
+    rows = [f"{0.2 * k},{p.x!r},{p.y!r},{p.heading!r}" for k, p in enumerate(drive.poses)]
+    path.with_suffix(".csv").write_text("\n".join(["stamp_s,x_m,y_m,heading_rad", *rows]) + "\n")
+    recording = open_recording(path, RecordingOptions(camera=camera))
+    assert np.abs(recording.increments - drive.increments).max() < 1e-9
+    for k in (0, 3, 8, 2):
+        error = np.abs(recording.read(k).astype(int) - drive.images[k])
+        assert error.mean() < 3.0, "not the same frame"
+
+
+def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+    kitti(drive, tmp_path)
+    with pytest.raises(DeviceError, match="do not overlap: they must be of one clock"):
+        open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=1.65))
+
+
+def test_a_large_image_is_reduced_with_its_camera(drive: Drive) -> None:
+    """A point falls on the same place of the scene in both images."""
+    large = Camera(1601, 1201, 1400.0, 1390.0, 803.2, 588.7, mount_height=0.4, mount_forward=0.1)
+    small = reduced(large, 3)
+    assert (small.width, small.height) == (533, 400)
+    points = np.array([[3.0, 0.4, 0.2], [2.0, -0.7, 0.9], [5.0, 0.0, 0.4]])
+    # Pixel k of the small image covers pixels 3 k to 3 k + 2, whose middle is 3 k + 1.
+    assert 3.0 * small.project(points) + 1.0 == pytest.approx(large.project(points))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 2 3\n", "line 1: a pose is `stamp x y z qx qy qz qw`"),
+        ("", "0 poses; there must be two or more"),
+        ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "all finite"),
+        ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
+    ],
+)
+def test_wrong_poses_are_refused_in_one_line(text: str, words: str, drive: Drive, tmp_path: Path) -> None:
+    kitti(drive, tmp_path)
+    (tmp_path / "odometry.txt").write_text(text)
+    with pytest.raises(DeviceError) as error:
+        open_recording(tmp_path, RecordingOptions(camera_height=1.65))
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "walk.mp4", "walk.mcap", "walk.bag", "walk.db3"])
+def test_what_is_no_recording_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(struct.pack("<8I", *range(8)))
+    with pytest.raises(DeviceError) as error:
+        open_recording(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
