@@ -17,8 +17,6 @@ from mapweave.mapserver.relocalization import relocalizer
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.merge import merging
-from mapweave.merge.mutual_exclusion import exclusion
-from mapweave.merge.mutual_exclusion.negative_evidence import Views
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency
 from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
@@ -40,10 +38,6 @@ def _nothing(*_: object, **__: object) -> list[Any]:
     return []
 
 
-def _no_views(*_: object) -> Views:
-    return Views(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64))
-
-
 MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "independent support": ((pairwise_consistency, "neighbours", _each_a_witness),),
     "chance support": ((Sorted, "beyond_chance", _as_it_is),),
@@ -57,7 +51,6 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
 TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
     **MERGE_RULES,
     "mutual exclusion": ((Refutation, "impossible", lambda *_: {}), (Refutation, "verdict", lambda *_: "")),
-    "negative evidence": ((exclusion, "negative_evidence", _no_views),),
     "aliased landmarks": ((merging, "weigh", lambda links, *_: list(links)),),
 }
 """Rules on links, for robots with images and bodies."""

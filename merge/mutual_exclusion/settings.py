@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mapweave.merge.mutual_exclusion.mutual_visibility import MutualVisibilitySettings
-from mapweave.merge.mutual_exclusion.negative_evidence import NegativeEvidenceSettings
 from mapweave.merge.mutual_exclusion.trajectories import BodyTrajectorySettings
 
 
@@ -20,7 +19,6 @@ class ExclusionSettings:
         least_witnesses: independent moments (see `window`) that must make the merge half as likely each.
         trail: how well it is known where a robot is between two nodes.
         sight: what robots should have seen of each other.
-        absence: what they should have seen of each other's maps.
     """
 
     least_apart: float = 0.2
@@ -28,4 +26,3 @@ class ExclusionSettings:
     least_witnesses: int = 3
     trail: BodyTrajectorySettings = field(default_factory=BodyTrajectorySettings)
     sight: MutualVisibilitySettings = field(default_factory=MutualVisibilitySettings)
-    absence: NegativeEvidenceSettings = field(default_factory=NegativeEvidenceSettings)
