@@ -194,15 +194,26 @@ MERGING = Question(
     "Are maps merged rightly?",
     (
         Row(
-            "synthetic fleets with 80 and 90 % false links: as good as least squares with the true ones",
-            "{good/80:.0%}, {good/90:.0%} of {runs}",
-            "merge",
+            "synthetic fleets with 80 and 90 % false links that are as good as with the true links known",
+            "{fleets/all rules/80/good}, {fleets/all rules/90/good}",
+            "rules_fleets",
         ),
         Row(
             "the same: joined by no true link",
-            "{joined_falsely/80:.0%}, {joined_falsely/90:.0%} of {runs}",
-            "merge",
+            "{fleets/all rules/80/joined_falsely}, {fleets/all rules/90/joined_falsely}",
+            "rules_fleets",
             "none",
+        ),
+        Row(
+            "the same by pairwise consistency and graduated non-convexity (PCM and GNC), and by GNC alone",
+            "{rivals/pcm_gnc/joined_falsely/80:.0%}, {rivals/pcm_gnc/joined_falsely/90:.0%}; "
+            "{rivals/gnc/joined_falsely/80:.0%}, {rivals/gnc/joined_falsely/90:.0%} of {runs}",
+            "merge",
+        ),
+        Row(
+            "Intel and Manhattan split among four robots: chi-square over GTSAM's batch optimum",
+            "{graphs/all rules/intel:.6f}, {graphs/all rules/manhattan:.6f}",
+            "rules_graphs",
         ),
         Row(
             "a map of 10 000 nodes grows, processor time: a new node, verified; a merge after five nodes",
@@ -223,11 +234,11 @@ MERGING = Question(
             "none false",
         ),
         Row(
-            "simulated warehouse: the same",
-            "{false_links/warehouse} of {links/warehouse}, {false_merges/warehouse}, "
-            "{merged_ate_m_median/warehouse:.0m} mm",
-            "merge_sim",
-            "none false",
+            "simulated warehouses and twin rooms on a corridor: false links",
+            "{trials/warehouse/all rules/false_links} of {trials/warehouse/all rules/links}, "
+            "{trials/twin-corridor/all rules/false_links} of {trials/twin-corridor/all rules/links}",
+            "rules_trials",
+            "none",
         ),
         Row(
             "a real street (KITTI odometry 03) cut into two robots: components, false links, error",
@@ -269,7 +280,7 @@ def _fleets(rule: str) -> tuple[str, str]:
         for figure in ("good", "joined_falsely")
     )
     words = (
-        f"fleets with 50, 80, 90 % false links that are as good as with the true ones: {good} instead of "
+        f"fleets as good as with the true links known, with 50, 80, 90 % false ones: {good} instead of "
         f"{good_all}; joined falsely: {falsely} instead of {falsely_all}"
     )
     return words, "rules_fleets"
@@ -335,7 +346,19 @@ RULES = (
     Rule(
         "mutual exclusion",
         "merge/mutual_exclusion/",
-        (_trials("mutual exclusion", "twin-corridor"), _trials("mutual exclusion", "warehouse")),
+        (_trials("mutual exclusion", "twin-corridor"),),
+    ),
+    Rule(
+        "aliased landmarks",
+        "merge/outlier_rejection/distinctness.py",
+        (
+            (
+                "warehouse: {trials/warehouse/aliased landmarks/links} links instead of "
+                "{trials/warehouse/all rules/links}, maps in {trials/warehouse/aliased landmarks/components} "
+                "pieces instead of {trials/warehouse/all rules/components}",
+                "rules_trials",
+            ),
+        ),
     ),
     Rule(
         "aliased regions",
