@@ -24,7 +24,6 @@ MEASUREMENTS: dict[str, str] = {
     "rules_graphs": "python -m benchmarks.rules --g2o DATA/posegraph/intel.g2o DATA/posegraph/manhattan.g2o "
     "--json",
     "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",
-    "rules_corridors": "python -m benchmarks.rules --trials twin-corridor --runs 3 --seed 724 --json",
     "rules_places": "python -m benchmarks.rules --places 1000 --seed 708 --json",
     "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
     "--seed 723 --json",
