@@ -1,4 +1,4 @@
-"""How far the footprint may move, by what the rangers see now."""
+"""How far the footprint may move, by the present ranger readings."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from mapweave.agent.observation import RobotDescription
 
 ASIDE = 0.06
-"""m, kept free beside the footprint."""
+"""m, kept free to the sides of the footprint."""
 BEFORE = 0.12
-"""m, kept free before it."""
+"""m, kept free ahead of it."""
 
 
 def clearance(

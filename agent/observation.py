@@ -1,4 +1,4 @@
-"""What goes into the pipeline and what comes out of a robot: plain values."""
+"""Observations, commands and the description of a robot: plain values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mapweave.hybridmap.ranges import Ranges
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """What the wheels did since the observation before.
+    """Motion of the wheels since the observation before.
 
     Attributes:
         forward: u1 of the paper, way of the middle of the axle, m.
@@ -35,7 +35,7 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """All that a robot senses in one tick (0.1 s).
+    """A robot's sensor readings of one tick (0.1 s).
 
     Attributes:
         stamp_ns: time of the image.
@@ -78,7 +78,7 @@ class RobotDescription:
         axle: distance between the wheels L, m.
         wheel_noise: standard deviation of a wheel's way, as a share of the way: sigma of the paper.
         side_slip: standard deviation of the slip aside in a step, as a share of the way: two wheels never
-            quite agree, and no encoder sees that.
+            quite agree, and no encoder measures that.
         ranger_bearings: (K,) rad, directions of the proximity sensors, 0 ahead, positive to the left.
         ranger_reach: the rangers' maximum, m.
         ranges_see_robots: whether the rangers are low enough to see other robots of the fleet. Then what they
@@ -105,7 +105,7 @@ class RobotDescription:
     ranges_see_robots: bool = False
 
     def ranges(self, proximity: NDArray[np.float64]) -> Ranges:
-        """What goes with a node of what the rangers read; empty if they are no help to see other robots."""
+        """Ranger readings to store with a node; empty if the rangers cannot see other robots."""
         if not self.ranges_see_robots:
             return Ranges()
         return Ranges.around(proximity, self.ranger_bearings, self.ranger_reach, self.radius)

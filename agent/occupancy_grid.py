@@ -127,9 +127,9 @@ class OccupancyGrid:
         return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
 
     def unknown_in_sight(self, points: Array, covered: Array, radius: float, reach: float) -> Array:
-        """How much unknown floor would be seen from each of some points, looking all around, (N,) m^2.
+        """How much unknown floor would be seen from each of some points, by a full turn, (N,) m^2.
 
-        What was seen to be occupied hides what is behind it; unknown floor hides nothing.
+        Occupied cells hide what is behind them; unknown cells hide nothing.
 
         Args:
             points: (N, 2) m in map.

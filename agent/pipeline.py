@@ -65,12 +65,13 @@ class Status:
         map_from_robot: estimated pose in its own map while mapping.
         finished: whether the mission is complete.
         mission: its name.
-        fix_node: the node that the robot knows itself by while navigating.
+        fix_node: the node by which the robot is localized while navigating.
         node_from_robot: pose in that node's frame.
         legs: nodes on the first route of the drive, beginning and goal included.
-        lost: whether it has given up to find itself on its own map: a fresh map must be begun.
+        lost: whether it has given up localizing on its own map: a new map must be begun.
         astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
-        tally: what the drive was made of so far.
+        located: whether `map_from_robot` comes from this observation.
+        tally: statistics of the drive so far.
     """
 
     doing: str
@@ -85,6 +86,7 @@ class Status:
     legs: int = 0
     lost: bool = False
     astray: bool = False
+    located: bool = False
     tally: DriveStatistics = NOTHING_DRIVEN
 
 
@@ -106,7 +108,7 @@ class Step:
 
 
 class Pipeline:
-    """The robot's mind."""
+    """One robot's pipeline."""
 
     def __init__(
         self,
@@ -156,7 +158,7 @@ class Pipeline:
 
     @property
     def lost(self) -> bool:
-        """Whether the robot shall map and has given up to find itself on its own map.
+        """Whether the robot shall map and has given up localizing on its own map.
 
         It stands still then. The caller may begin a new map, in a new pipeline; another `set_mission`
         lets it try again.
@@ -222,7 +224,7 @@ class Pipeline:
         return kind(*parts, settings.explorer, settings.seed)
 
     def _keep_up(self, observation: Observation) -> None:
-        """Let the mapper see; it may find out that the robot was carried off."""
+        """Pass the observation to the mapper; it may detect that the robot was carried off."""
         started = self._mapper.started
         self._mapper.step(observation)
         if started and not self._mapper.started:
@@ -259,12 +261,12 @@ class Pipeline:
         return Command()
 
     def _restart(self) -> None:
-        """The mapper does not know any more where the robot is."""
+        """The mapper has lost the robot's pose."""
         if self.map.nodes:
             if self._explorer is not None:
                 self._explorer.restart()
             return
-        # The map may begin anywhere, and all that was found out on the way to it is void.
+        # The map may begin anywhere, and earlier estimates are void.
         self._floor = OccupancyGrid(self._description, self._settings.floor)
         if self._explorer is not None:
             self._explorer = self._new_explorer()
@@ -307,5 +309,6 @@ class Pipeline:
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
             astray=self._resumption is not None,
+            located=mapping and self._mapper.started and not self._mapper.astray,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )

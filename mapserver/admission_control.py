@@ -14,7 +14,7 @@ from typing import TypeVar
 from mapweave.hybridmap.errors import Busy, SettingsError
 
 LATENESS = 0.5
-"""Who comes so much after or before the appointment still has it, s: the way there and back takes time."""
+"""Tolerance of an appointment, s: a message takes time both ways."""
 MOST_BOOKED = 1024
 """Retry appointments that are kept; beyond this number there is no precedence."""
 
@@ -62,8 +62,8 @@ class AdmissionSettings:
 class AdmissionControl:
     """A pool of workers with a queue that is never longer than can be worked off in time.
 
-    Those who are refused get appointments one after the other, so that a crowd does not come back as a crowd.
-    Who comes back with the same question has precedence over who comes for the first time.
+    Refused questions get appointments one after the other, so that a crowd does not come back as a crowd.
+    A question that comes back has precedence over new ones.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class AdmissionControl:
         self._pool = executor or ThreadPoolExecutor(workers, thread_name_prefix="desk")
 
     def submit(self, work: Callable[[], _T], ticket: int | None = None, usual: bool = True) -> Future[_T]:
-        """Have something done.
+        """Submit a job.
 
         Args:
             work: to be done.
@@ -129,7 +129,7 @@ class AdmissionControl:
             }
 
     def close(self) -> None:
-        """Finish what was taken on. Twice is no error."""
+        """Finish accepted jobs. Idempotent."""
         self._pool.shutdown()
 
     def _wait(self) -> float:
@@ -148,7 +148,7 @@ class AdmissionControl:
         return True
 
     def _expected(self, now: float) -> float:
-        """How long those will take who have an appointment as long as a new question would wait, s."""
+        """Time that appointments will take while a new question would wait, s."""
         soon = sum(due <= now + self._settings.in_time for due in self._booked.values())
         return soon * self._seconds / self._settings.workers
 

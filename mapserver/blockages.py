@@ -28,18 +28,18 @@ class Blockages:
     """Pairs of nodes between which some robot did not get through, with the time of its report. Thread-safe.
 
     A robot reports it with the question for its next route. That robot bars the pair for itself; for all
-    others
-    it only costs more: one robot's obstacle may have moved, and need not be in another's way.
+    others it
+    only costs more: one robot's obstacle may have moved, and need not be in another's way.
     """
 
     def __init__(self, settings: BlockageSettings | None = None) -> None:
-        """Nothing is blocked."""
+        """Start without blocks."""
         self._settings = settings or BlockageSettings()
         self._reported: dict[Pair, float] = {}
         self._turn = threading.Lock()
 
     def report(self, pairs: Collection[Pair], now: float) -> None:
-        """A robot could not get through here.
+        """Add pairs between which a robot could not drive.
 
         Args:
             pairs: of nodes, in either order.
@@ -54,7 +54,7 @@ class Blockages:
                 del self._reported[next(iter(self._reported))]
 
     def known(self, now: float) -> list[Pair]:
-        """What still counts at a time of the server's clock, s."""
+        """The pairs that still count at a time of the server's clock, s."""
         forget = self._settings.forget
         with self._turn:
             self._reported = {pair: stamp for pair, stamp in self._reported.items() if now - stamp < forget}

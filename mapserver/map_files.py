@@ -32,7 +32,7 @@ def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
 
     Args:
         merged: the map.
-        history: what has become of its maps by itself.
+        history: events of its maps.
     """
     whole = merged.union()
     probabilities = link_probabilities(merged)

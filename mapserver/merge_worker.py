@@ -45,14 +45,14 @@ class MergeWorker:
         keeper: VerificationCacheKeeper | None = None,
         history: MapHistory | None = None,
     ) -> None:
-        """Begin with nothing.
+        """Start with no map.
 
         Args:
             schedule: runs the work, all of it one after the other.
             share: largest share of the time that is spent merging.
             index: is filled with the nodes that come; may have them already.
             merge: how maps are merged.
-            keeper: of what comparing nodes has found.
+            keeper: of the verification cache.
             history: records what joins and parts.
         """
         self._schedule = schedule
@@ -76,7 +76,7 @@ class MergeWorker:
 
     @property
     def event(self) -> str:
-        """What holds up merging; else the newest of what has become one map, or is no longer one, and why."""
+        """What holds up merging; else the newest event of the history, with its reason."""
         return (self._plight or self._history.newest)[:MOST_WORDS]
 
     @property
@@ -85,7 +85,7 @@ class MergeWorker:
         return self._done == self._came
 
     def current(self) -> Answers:
-        """Answers that know all that a question may expect them to know (see Schedule.catch_up)."""
+        """Answers that contain all changes before a question (see Schedule.catch_up)."""
         self._schedule.catch_up()
         return self._answers
 
@@ -140,7 +140,7 @@ class MergeWorker:
         return merged.wait(timeout)
 
     def close(self) -> None:
-        """Stop after what has come."""
+        """Stop after the posted changes."""
         self._schedule.post(lambda: self._save(last=True))
         self._schedule.close()
 
@@ -239,7 +239,7 @@ class MergeWorker:
         return self._fresh.get(node_id) or self._merger.node(node_id)
 
     def _search_pairs(self) -> None:
-        """A little of what comes before the first merge: it must not hold up what comes."""
+        """A part of the work before the first merge, which must not hold up new changes."""
         self._plight = f"{self._merger.uncompared} nodes are still to be compared with others"
         try:
             self._merger.search_pairs(SEARCHES_AT_ONCE)

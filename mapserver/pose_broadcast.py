@@ -31,7 +31,7 @@ TURN = math.radians(1.0)
 
 @dataclass(frozen=True)
 class PoseBroadcastSettings:
-    """What is worth telling, and how often.
+    """What is published, and how often.
 
     Attributes:
         every: s between two news of one agent, at least.
@@ -70,7 +70,7 @@ class PoseBroadcast:
             bus: the connection; stays the caller's.
             keys: of the fleet.
             name: of the server in the fleet.
-            settings: what is worth telling.
+            settings: what is published, and how often.
             clock: only grows, s.
         """
         self._clock = clock

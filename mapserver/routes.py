@@ -31,7 +31,7 @@ ON_EDGE = 0.25
 """A robot this near to an edge that was driven is on it, m: along it a metre costs a metre, so that it
 need not turn back to the edge's beginning."""
 WARY_COST = 4.0
-"""What it costs to try again where another robot did not get through, m."""
+"""Cost of an edge that another robot could not drive, m."""
 
 
 ENTRIES = 12
@@ -90,8 +90,8 @@ class Router:
         """Find the cheapest way.
 
         Args:
-            start: a node that the robot knows itself by.
-            goal: where it shall be.
+            start: a node by which the robot is localized.
+            goal: the node to reach.
             blocked: pairs of nodes, in either order, between which the robot cannot drive.
             wary: pairs of nodes, in either order, between which another robot did not get through: they are
                 driven only where every other way is much longer.

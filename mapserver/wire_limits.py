@@ -17,8 +17,7 @@ from mapweave.mapserver.relocalization.verdict import NOWHERE
 from mapweave.wire.pose_codec import pack_pose
 
 FARTHEST = 1e5
-"""A node that is farther from the middle of its map is no place for robots, m: float32 has steps of 8 mm
-there."""
+"""Nodes farther from the middle of their map are left out, m: float32 has steps of 8 mm there."""
 LONGEST_LEG = 1e3
 """No robot drives farther from node to node, m."""
 MOST_DETOURS = 8

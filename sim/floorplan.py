@@ -34,7 +34,7 @@ class Rectangle:
         length: along its own x axis, m.
         width: along its own y axis, m.
         heading: of its x axis, rad.
-        name: what it is.
+        name: of the thing.
     """
 
     x: float
@@ -168,7 +168,7 @@ class FloorPlan:
         """A reachable pose with any heading, in any room or the given one.
 
         Args:
-            rng: where chance comes from.
+            rng: random numbers.
             radius: what must fit there and along the way there, m.
             room: name of a room.
 

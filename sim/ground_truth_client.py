@@ -34,7 +34,7 @@ class RobotStatus:
 
     Attributes:
         world_from_robot: true pose.
-        collisions: how often it has hit something.
+        collisions: their number.
         active: whether its agent takes part.
     """
 
@@ -62,14 +62,14 @@ class SimStatus:
 
 
 class SimControl:
-    """Asks the simulator.
+    """Client of the ground truth service.
 
     Every method raises NotConnected if no simulator answers, InvalidValue if it refuses (with its reason),
     and InvalidMessage if its answer is broken.
     """
 
     def __init__(self, bus: Bus, fleet: str, timeout: float = 10.0) -> None:
-        """Nothing is asked yet.
+        """Prepare the client.
 
         Args:
             bus: the connection.
@@ -148,7 +148,7 @@ class SimControl:
         return any(not reply.error for reply in replies)
 
     def snapshot(self) -> Snapshot:
-        """What a bird sees, and what the robots saw last."""
+        """The view from above, and the robots' last images."""
         reader = self._ask("snapshot")
         actors, furniture = (
             tuple(_read_rectangle(reader, value) for value in reader.array(name, MAX_RECTANGLES))

@@ -58,7 +58,7 @@ class GroundTruthService:
         }
 
     def answer(self, question: bytes) -> bytes:
-        """Do what is asked.
+        """Answer a question.
 
         Raises:
             MapweaveError: the question is broken, or the simulation refuses.

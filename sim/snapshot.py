@@ -14,7 +14,7 @@ from mapweave.sim.floorplan import Rectangle
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """What there is to see from above, and what the robots saw last.
+    """The view from above, and the robots' last images.
 
     Attributes:
         tick: ticks that are over.

@@ -57,7 +57,7 @@ class RemoteRobot:
     """
 
     def __init__(self, bus: Bus, fleet: str, name: str, patience: float = PATIENCE) -> None:
-        """Nothing is asked yet.
+        """Prepare the client.
 
         Args:
             bus: the connection.

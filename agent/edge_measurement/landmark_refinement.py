@@ -1,4 +1,4 @@
-"""What drives teach of a node's landmarks: their depths, better known each time the robot drives by them."""
+"""Refinement of a node's landmarks: drives past them measure their depths more precisely."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import snap
 
 DOUBT = 3.3
-"""A depth that is off from the mapped one by more than this many sigma of that is no better one: what was
-followed may be something else."""
+"""A depth that differs from the mapped one by more than this many sigma is not taken over: the track may have
+moved to another feature."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class LandmarkRefinementSettings:
     """When a node is written again.
 
     Attributes:
-        share: a landmark is known better if its depth's sigma has fallen below this share of what it was.
-        least: a node is written again if so many of its landmarks are known better: it costs some 3 kB.
-        floor: what a depth is never better than: m, and share of the depth; as when it was mapped.
+        share: a landmark is refined if its depth's sigma has fallen below this share of the mapped one.
+        least: a node is written again if so many of its landmarks are refined: it costs some 3 kB.
+        floor: least sigma of a depth: m, and share of the depth; as in mapping.
     """
 
     share: float = 0.7
@@ -81,7 +81,7 @@ def refined(
         mapped: N landmarks as the map has them.
         depths: (N,) m, NaN where nothing was learned.
         sigmas: (N,) m, of independent errors.
-        s: what counts as better.
+        s: when a depth is refined.
     """
     sigmas_with_floor = np.hypot(sigmas, s.floor[0] + s.floor[1] * depths)
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""What a drive measures between the nodes that it passes: a traverse, as surveyors call it.
+"""Traverses: relative poses of nodes, measured on a drive that passes them.
 
 At a hand-over the robot is localized by the landmarks of one node, and a moment later by those of the next:
 two poses of the same robot measure the relative pose of the two nodes.
@@ -20,10 +20,10 @@ SETTLED = 3
 """Images through which a node's landmarks must have been followed: fewer than lie between two detections of
 the next node."""
 TRAVERSE_GAP = 0.5
-"""What may lie between the landmarks of two nodes, as `Fix.blind` counts it, m."""
+"""Largest blind way between the landmarks of two nodes, see `Fix.blind`, m."""
 REACH = 0.45
-"""This near to a node the robot has passed it, m. It is twice the distance within which the follower takes
-a node for passed."""
+"""This near to a node the robot has passed it, m. It is twice the distance at which the follower counts
+a node as passed."""
 DETOUR = 1.3
 """A way longer than the straight line by more than this factor, and `reach` at either end, is not measured:
 it leads around something."""
@@ -107,7 +107,7 @@ class TraverseRecorder:
             if self._gap > TRAVERSE_GAP:
                 self._forget()
             return None
-        assert fix.localizer is not None, "landmarks are in sight"
+        assert fix.localizer is not None, "landmarks are visible"
         self._set_reference_node(fix.node, self._with_floor(fix.node_from_robot), len(fix.localizer.visible))
         mean = self._node_from_robot.mean
         return self._arrive() if mean.distance(Pose2()) <= REACH else None
@@ -121,7 +121,7 @@ class TraverseRecorder:
         return same_localizer and self._images >= SETTLED
 
     def _set_reference_node(self, node: NodeId, node_from_robot: PoseGaussian, visible: int) -> None:
-        """Know the robot by a node; where that is another one, this is a hand-over."""
+        """Localize by a node; if it is another node than before, this is a hand-over."""
         if self._node is None:
             self._fewest = visible
         elif node != self._node:
@@ -145,7 +145,7 @@ class TraverseRecorder:
         return Traverse(start, self._node, between, fewest) if widest < s.widest and way < straight else None
 
     def _with_floor(self, pose: PoseGaussian) -> PoseGaussian:
-        """A pose of the filter with the uncertainty that the filter cannot know."""
+        """A pose of the filter with the error floor added."""
         xy, heading = self._settings.floor
         more: Array = np.diag([xy**2, xy**2, heading**2])
         return PoseGaussian(pose.mean, pose.covariance + more)

@@ -17,19 +17,19 @@ class AdaptiveOdometryNoise:
         """Begin with trust."""
         self._noise = noise
         self._settings = settings
-        self._steps_doubted = 0
+        self._steps_left = 0
 
     @property
-    def doubted(self) -> bool:
+    def increased(self) -> bool:
         """Whether an image refuted the wheels a moment ago."""
-        return self._steps_doubted > 0
+        return self._steps_left > 0
 
     def root(self, odometry: Odometry) -> Array:
         """(2, 2) root of the covariance of (u1 m, u2 rad) of the step that is taken now."""
-        if not self._steps_doubted:
+        if not self._steps_left:
             return self._noise.root(odometry)
         # Slip and lost encoders last for more than one step.
-        self._steps_doubted -= 1
+        self._steps_left -= 1
         return self._noise.refuted_root(odometry, 1.0, self._settings.slip[0])
 
     def side_slip(self, odometry: Odometry) -> float:
@@ -39,13 +39,13 @@ class AdaptiveOdometryNoise:
 
     def refuted(self, odometry: Odometry, surprise: float) -> Array:
         """The root for a step that its image refutes by so many sigmas; the next ones get more noise, too."""
-        self.doubt()
+        self.increase()
         return self._noise.refuted_root(odometry, surprise, self._settings.slip[0])
 
     def slipped(self) -> Array:
         """The root for a step in which the wheels carry no information."""
         return np.diag(self._settings.slip)
 
-    def doubt(self) -> None:
+    def increase(self) -> None:
         """From now on, for a while."""
-        self._steps_doubted = self._settings.distrust
+        self._steps_left = self._settings.distrust

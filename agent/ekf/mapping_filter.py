@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.ekf.adaptive_odometry_noise import AdaptiveOdometryNoise
 from mapweave.agent.ekf.filter_health import FilterHealth
-from mapweave.agent.ekf.gating import MEDIAN, Judgement, believe, believe_some, pixel_gate
+from mapweave.agent.ekf.gating import MEDIAN, Judgement, pixel_gate, remove_outliers, select_inliers
 from mapweave.agent.ekf.innovations import Examined, innovation_covariance, whiten
 from mapweave.agent.ekf.landmark_estimates import Ids, LandmarkEstimates
 from mapweave.agent.ekf.mapping_state import MappingState, Step
@@ -157,7 +157,7 @@ class MappingFilter:
             self._step = by_wheels
             self._settle(self.state)
         self._watch.saw(health, reason)
-        return measurement.report(judged.believed, judged.innovations, nis, health, reason)
+        return measurement.report(judged.inliers, judged.innovations, nis, health, reason)
 
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
@@ -231,20 +231,22 @@ class MappingFilter:
         """Which measured landmarks to accept, and what they say about the wheels and the pixels."""
         s, slots = self.settings, measurement.slots
         innovations, whitening, worst, median = examined
-        believed = np.ones(len(slots), np.bool_)
+        inliers = np.ones(len(slots), np.bool_)
         if not worst <= self._gate:
-            believed, whitening, median = believe_some(innovations, self._spread(slots), self._gate)
+            inliers, whitening, median = remove_outliers(innovations, self._spread(slots), self._gate)
         agreeing, least = len(whitening) // 2, s.least_agreeing_share * len(slots)
         if agreeing < least:
             if self._step is not None:
                 # Many landmarks are seldom wrong together; the wheels may be (slip, a lost encoder).
                 step, self._step = self._step, self._step.again(wheel_root=self._wheels.slipped())
-                still_believed, still_whitening, _ = believe(innovations, self._spread(slots), self._gate)
+                still_inliers, still_whitening, _ = select_inliers(
+                    innovations, self._spread(slots), self._gate
+                )
                 still_agreeing = len(still_whitening) // 2
                 if still_agreeing >= max(s.least_agreeing, least):
-                    self._wheels.doubt()
+                    self._wheels.increase()
                     reason = f"the wheels are refuted by {still_agreeing} of {len(slots)} landmarks"
-                    return Judgement(innovations, still_believed, still_whitening, Health.SLIP, reason)
+                    return Judgement(innovations, still_inliers, still_whitening, Health.SLIP, reason)
                 self._step = step
             # A few that agree among many that do not may as well be the wrong ones.
             reason = f"{agreeing} of {len(slots)} landmarks agree"
@@ -253,8 +255,8 @@ class MappingFilter:
             self._noise.learn(median / MEDIAN)
         elif agreeing < s.least_agreeing:
             reason = f"{agreeing} of {len(slots)} landmarks in view agree, {s.least_agreeing} are needed"
-            return Judgement(innovations, believed, whitening, Health.FEW, reason)
-        return Judgement(innovations, believed, whitening)
+            return Judgement(innovations, inliers, whitening, Health.FEW, reason)
+        return Judgement(innovations, inliers, whitening)
 
     def _correct(self, measurement: ImageMeasurement, judged: Judgement) -> tuple[float, str]:
         """Update with the accepted measurements.
@@ -271,8 +273,8 @@ class MappingFilter:
         slip, slots, slopes = "", measurement.slots, measurement.slopes
         residual, whitening = judged.innovations, judged.whitening
         if judged.agreeing < len(slots):
-            slots, slopes = slots[judged.believed], slopes[judged.believed]
-            residual = residual[judged.believed]
+            slots, slopes = slots[judged.inliers], slopes[judged.inliers]
+            residual = residual[judged.inliers]
         for _ in range(self.settings.relinearisations):
             if self._step is None:
                 break
@@ -286,7 +288,7 @@ class MappingFilter:
                 abs(likely.forward - at.forward) >= SAME_STEP[0] or abs(likely.turn - at.turn) >= SAME_STEP[1]
             ):
                 self._step = self._step.again(at=likely)
-                if self._wheels.doubted:
+                if self._wheels.increased:
                     slip = slip or "the wheels were refuted a moment ago, and are again"
             else:
                 break

@@ -100,9 +100,9 @@ class ImageMeasurement(NamedTuple):
         return step, examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)
 
     def report(
-        self, believed: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
+        self, inliers: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
     ) -> UpdateReport:
-        """Report of an update: believed (m,), innovations (m, 2) slopes measured minus expected."""
+        """Report of an update: inliers (m,), innovations (m, 2) slopes measured minus expected."""
         accepted, innovations_px = np.zeros(len(self.ids), np.bool_), np.full((len(self.ids), 2), np.nan)
-        accepted[self.rows], innovations_px[self.rows] = believed, innovations * self.focal
+        accepted[self.rows], innovations_px[self.rows] = inliers, innovations * self.focal
         return UpdateReport(self.ids, accepted, innovations_px, mean_nis, health, reason)

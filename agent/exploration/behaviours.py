@@ -29,11 +29,11 @@ MOST_TURN = 1.0
 TRAVEL_STEP = 0.8
 """A new node at least this often on the way, m."""
 PATIENCE = 4.0
-"""Seconds without getting on before a way is given up."""
+"""Seconds without progress before a way is given up."""
 
 
 class ExplorationBehaviours:
-    """What an exploring robot can do, one generator a move: each `yield` is a command for one tick.
+    """The behaviours of exploration, one generator each: each `yield` is a command for one tick.
 
     Attributes:
         phase: what it is doing.
@@ -199,9 +199,9 @@ class ExplorationBehaviours:
         return clearance(self._description, self._now.proximity, direction, DRIVE)
 
     def _ticks(self, most: float) -> range:
-        """A bound on the length of a behaviour: nothing may last forever."""
+        """A bound on the duration of a behaviour."""
         return range(int(most))
 
     def finish(self) -> None:
-        """End the episode: what was seen becomes nodes."""
+        """End the episode: its views become nodes."""
         self._mapper.finish(self._now)

@@ -1,4 +1,4 @@
-"""Exploration: look around at a place, map each view by driving back and forth, travel to the next place."""
+"""Exploration: map each view around a place by driving back and forth, travel to the next place."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Explorer:
         return self.phase is Phase.DONE
 
     def restart(self) -> None:
-        """Begin again from where the robot is now: it was lost, and knows its pose again."""
+        """Begin again from the present pose, after the robot was lost."""
         self._moves.phase, self._moves.detail = Phase.LOOKING, ""
         self._behaviour = self._explore()
 
@@ -114,14 +114,14 @@ class Explorer:
             before = turned
             turned += yield from self._moves.turn_to_next_view(self._side)
             if before < math.pi <= turned:
-                # The answer has half of the turn to come, and is still new when the robot has to choose.
+                # The answer may take half of the turn, and is recent when the robot has to choose.
                 self._ask()
             if turned > math.tau - 0.3:
                 yield from self._moves.map_view()
                 return
 
     def _scan(self) -> Iterator[Command]:
-        """Turn until the rangers have swept all around: the views are mapped, the floor is not known."""
+        """Turn until the rangers have swept all around: the views are mapped, the floor is unknown."""
         self._ask()
         bearings = np.sort(np.array(self._description.ranger_bearings))
         gaps = np.diff(bearings, append=bearings[:1] + math.tau)

@@ -1,4 +1,4 @@
-"""Exploration as in the paper: by chance."""
+"""Random exploration, as in the paper."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ SHORTEST = 0.3
 
 
 class RandomExploration(Explorer):
-    """Maps a view, turns to a side that chance chooses, and again (paper, section 4.1).
+    """Maps a view, turns to a random side, and repeats (paper, section 4.1).
 
-    The paper leaves open how the robot gets on, and turning on the spot it never would. Here it drives
-    straight on after each turn, for a way that chance chooses out of the room that there is.
+    The paper does not say how the robot moves on from a place. Here it drives straight on after each turn,
+    for a random part of the free room.
     """
 
     def _explore(self) -> Iterator[Command]:

@@ -13,13 +13,13 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.pose import Array
 
 VIEW_RADIUS = 1.6
-"""What lies around a place, and what others know around theirs, is judged within this radius, m."""
+"""Radius around a place within which its floor is known, m; also around places of others."""
 VIEW = 3.0
 """A full turn shows floor up to this far, m."""
 SCAN_TIME = 60.0
 """Duration of a full turn, about, s."""
 LEAST_AREA = 1.0
-"""New floor that is worth one, m^2."""
+"""New floor that is worth a full turn, m^2."""
 
 
 DIRECTIONS = 36
@@ -118,7 +118,7 @@ def _closer_view(
     covered: Array,
     settings: ExplorerSettings,
 ) -> list[Array]:
-    """The way to where most around is unknown, visible or not; the arguments are those of `_new_floor`."""
+    """The way to where most around is unknown, visible or not; the arguments are those of `_new_area`."""
     unknown = floor.unknown_around(VIEW_RADIUS, covered)[ways.cells[free, 0], ways.cells[free, 1]]
     worth = unknown - 0.04 * ways.lengths[free]
     worth[unknown < 0.02] = -math.inf

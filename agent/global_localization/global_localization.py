@@ -26,7 +26,7 @@ LENIENCY = 1.0
 VIEWS_NEEDED = 1
 """Recognitions that must agree, 1 or 2; 2 counts the own map's alone."""
 TURNS = (1, 1)
-"""Whole turns at the first place, and at each further one; one where anything is recognised."""
+"""Full turns at the first place, and at each further one; a single one where anything is recognised."""
 PLACES = 0
 """How many places it searches from; 0 for no limit."""
 CARRIED_PAUSE = 0.5
@@ -72,7 +72,7 @@ class GlobalLocalization:
     """Localizes a lost robot. Of two places that look the same it takes neither.
 
     Attributes:
-        detail: what it does and sees, in words.
+        detail: what it does and why, in words.
     """
 
     def __init__(
@@ -90,9 +90,9 @@ class GlobalLocalization:
             description: of the robot.
             sift: finds features.
             motion: moves the robot.
-            own_map: what the robot knows itself.
-            fleet: what others know; None for a robot that counts on its own map alone.
-            settings: how hard it tries.
+            own_map: the robot's own map.
+            fleet: the fleet's map; None for a robot that uses only its own map.
+            settings: of the search.
         """
         self.detail = ""
         self._description = description
@@ -129,7 +129,7 @@ class GlobalLocalization:
             if candidate is not None:
                 return candidate
             if self._views < LEAST_VIEWS * self._attempts:
-                # With a covered lens, or in the dark, there is nothing to be learnt from going elsewhere.
+                # With a covered lens, or in the dark, driving elsewhere does not help.
                 continue
             last = place == PLACES
             moved = False if last else (yield from self._move())
@@ -151,7 +151,7 @@ class GlobalLocalization:
         return None
 
     def look(self, leniency: float = 1.0) -> Search:
-        """Recognise the current view; None if it is not known, or not for sure.
+        """Recognise the current view; None if it is unknown or uncertain.
 
         Args:
             leniency: by how much a recognition may be less exact than `sure`.
@@ -193,7 +193,7 @@ class GlobalLocalization:
             self.detail = f"own map: {own.reason}"
             # The robot stood still while it waited for the answer.
             return own_best
-        # How far away a photograph was taken shows on the way to it, not by looking again.
+        # The unknown distance of a photograph is measured on the way to it, not by another view.
         vague = fleet_best is not None and not exact_enough(fleet_best.node_from_robot, sure, leniency)
         if fleet_best is not None and fleet_best.distance_known and vague:
             self.detail += ", but not exactly enough"
@@ -224,7 +224,7 @@ class GlobalLocalization:
         return None
 
     def _elsewhere(self, fleet: Candidate, own: Candidate) -> bool:
-        """Whether the fleet puts the robot elsewhere. It may not know yet what the own map knows."""
+        """Whether the fleet puts the robot elsewhere. Its map may be older than the own map."""
         nodes = self._own.map.nodes
         if fleet.node not in nodes:
             return True
@@ -235,7 +235,7 @@ class GlobalLocalization:
 
     def _give_up(self, where: str) -> None:
         why = "no two views agreed" if self._hypotheses else "nothing was recognised"
-        self.detail = f"cannot find itself on its own map of {len(self._own.map.nodes)} nodes: {why} {where}"
+        self.detail = f"cannot localize on its own map of {len(self._own.map.nodes)} nodes: {why} {where}"
 
     # Moves
 
@@ -283,7 +283,7 @@ class GlobalLocalization:
         return True
 
     def _take_hint(self, own: Candidates) -> None:
-        """Remember the node that was seen best from here, however vaguely."""
+        """Remember the node with most inliers from here, even if its pose is uncertain."""
         best = own.places[0].recognized if own.places else None
         if best is not None and (self._hint is None or best.recognition.inliers > self._hint[0]):
             robot_from_node = best.recognition.node_from_robot.mean.inverse()

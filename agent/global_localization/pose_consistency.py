@@ -1,4 +1,4 @@
-"""Two recognitions that agree where the robot is.
+"""Consistency of two recognitions: whether they give the same pose.
 
 One image may show something that occurs in another room or on every shelf, too. So a robot that wants to map
 on needs a second view of other things, because it has turned or driven on in between, that gives the same
@@ -34,7 +34,7 @@ class ConsistencySettings:
 
 @dataclass(frozen=True)
 class PoseHypothesis:
-    """Where a recognised node puts the robot.
+    """The robot's pose by a recognised node.
 
     Attributes:
         map_from_robot: by the node.
@@ -52,7 +52,7 @@ class PoseHypothesis:
 
 
 def consistent(earlier: PoseHypothesis, now: PoseHypothesis, settings: ConsistencySettings) -> bool:
-    """Whether two recognitions come of different views and put the robot at the same place."""
+    """Whether two recognitions are of different views and give the same pose."""
     moved = earlier.odom_from_robot.inverse() @ now.odom_from_robot
     if abs(moved.heading) < settings.turn and math.hypot(moved.x, moved.y) < settings.way:
         return False

@@ -1,4 +1,4 @@
-"""Taking up a map again: global localization on the own map alone, tick by tick, for a robot that maps."""
+"""Resumption of a map: global localization on the own map alone, tick by tick, for a robot that maps."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.vision.sift import Sift
 
 REMEMBERED = 600
-"""Readings of the rangers that are kept for the floor, the latest."""
+"""Readings of the rangers that are kept for the grid, the latest."""
 
 
 class Resumption:
-    """Finds a robot on its own map: one that was started again, has navigated, or was carried off.
+    """Localizes a robot on its own map after a restart, after navigation, or after a kidnapping.
 
     Attributes:
         found: the place that was recognised in the last observation; None until then.
@@ -45,7 +45,7 @@ class Resumption:
             sift: features of an image.
             own_map: with at least one node.
             drives: whether it may turn and drive by itself.
-            settings: how hard it tries.
+            settings: of the search.
             seed: of the recognition's random samples.
         """
         self.found: RecognizedNode | None = None

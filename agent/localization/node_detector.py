@@ -1,4 +1,4 @@
-"""Looking for nodes whose landmarks should be in view."""
+"""Detection of nodes whose landmarks should be in view."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class NodeDetectorSettings:
 
     Attributes:
         localizer: tracking and filtering of its landmarks from then on.
-        recognition: when it counts as recognised. Less is asked than of a lost robot, because the pose
-            must also be the expected one.
+        recognition: when it counts as recognised. The thresholds are lower than for a lost robot, because the
+            pose must also be the expected one.
     """
 
     localizer: NodeLocalizerSettings = field(default_factory=NodeLocalizerSettings)
@@ -90,7 +90,7 @@ class NodeDetector:
         self._rng = rng
 
     def find(self, image: NDArray[np.uint8], wanted: Iterable[Expected]) -> tuple[int, NodeLocalizer] | None:
-        """Look for nodes, in their order.
+        """Search for nodes, in their order.
 
         Args:
             image: (H, W) grey.

@@ -20,7 +20,7 @@ from mapweave.vision.sift import Features
 LEAST = 4
 """Landmarks that must be tracked (paper, section 6: n >= 4)."""
 STRIKES = 3
-"""A track that the filter refuses this often in a row is given up."""
+"""A track that the filter rejects this often in a row is dropped."""
 
 
 @dataclass(frozen=True)
@@ -79,25 +79,25 @@ class NodeLocalizer:
 
     @property
     def in_sight(self) -> bool:
-        """Whether enough landmarks are tracked and the filter trusts itself."""
+        """Whether enough landmarks are tracked and the filter is healthy."""
         return len(self._tracks.ids) >= LEAST and self._filter.healthy
 
     def restart(self, pose: PoseGaussian) -> None:
         """Restart at a pose that is known better than by the tracks so far.
 
-        By the same landmarks: so from then on they learn nothing from where the robot is.
+        The pose comes from the same landmarks, so from then on their depths do not learn from it.
         """
         self._note(np.ones(len(self._filter.ids), np.bool_))
         self._teaches = False
         self._filter = self._filter_at(pose, self._tracks.ids)
 
     def depths(self) -> tuple[Array, Array]:
-        """What the filter knows of the depths of all landmarks that were followed until they left the view.
+        """Depths of all landmarks that were tracked until they left the view.
 
         Returns:
-            (N,) m, and standard deviations (N,) m by which they may be kept one by one, see
+            (N,) m, and standard deviations (N,) m as of independent errors, see
             LocalizationState.depths; in the order of the node's landmarks, NaN for those that were not
-            followed, or given up.
+            tracked, or dropped.
         """
         self._note(np.ones(len(self._filter.ids), np.bool_))
         return self._depths.copy(), self._depth_sigmas.copy()
@@ -110,7 +110,7 @@ class NodeLocalizer:
             self._depths[ids], self._depth_sigmas[ids] = depths[which], sigmas[which]
 
     def step(self, observation: Observation) -> None:
-        """One tick: predict by the wheels, follow the landmarks, correct."""
+        """One tick: predict by the wheels, track the landmarks, update."""
         self._filter.predict(observation.odometry)
         if observation.image is None:
             return

@@ -16,7 +16,7 @@ from mapweave.registration.recognition import Recognition, recognise
 
 @dataclass(frozen=True)
 class PlaceRecognitionSettings:
-    """How places are looked up.
+    """When places are verified.
 
     Attributes:
         tries: nodes that are verified, by descending votes.

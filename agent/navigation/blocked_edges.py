@@ -14,7 +14,7 @@ class BlockedEdgeSettings:
     """How long a block is remembered.
 
     Attributes:
-        forget: after the first time, s: people walk on.
+        forget: after the first time, s: people move on.
         longest: each further time it is remembered twice as long, up to this, s: walls stay.
     """
 
@@ -23,16 +23,16 @@ class BlockedEdgeSettings:
 
 
 class BlockedEdges:
-    """What was in the way, in the order in which it was met last."""
+    """Blocked pairs, in the order of their last block."""
 
     def __init__(self, settings: BlockedEdgeSettings | None = None) -> None:
-        """Nothing is in the way."""
+        """Start without blocks."""
         self._settings = settings or BlockedEdgeSettings()
         self._until: dict[Pair, float] = {}
         self._times: dict[Pair, int] = {}
 
     def add(self, a: NodeId, b: NodeId, now: float) -> None:
-        """The robot could not get from one node to the other, nor would it the other way round.
+        """Add a pair between which the robot could not drive, in either direction.
 
         Args:
             a: one node.
@@ -49,5 +49,5 @@ class BlockedEdges:
         return tuple(pair for pair, until in self._until.items() if now < until)
 
     def next_change(self, now: float) -> float:
-        """Seconds until something is forgotten; 0 if nothing is blocked."""
+        """Seconds until a block is forgotten; 0 without blocks."""
         return min((until - now for until in self._until.values() if now < until), default=0.0)

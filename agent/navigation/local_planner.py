@@ -19,9 +19,9 @@ REPLAN_EVERY = 5
 LEAST = 0.065
 """Clearance around the footprint that a way needs, m."""
 WISHED = 0.2
-"""Room above which more is worth nothing, m."""
+"""Clearance above which more has no value, m."""
 AHEAD = 0.6
-"""The point of the way that it steers to is at most this far, m."""
+"""Largest distance of the point of the way that it steers to, m."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class LocalPlannerSettings:
 
 
 class LocalPlanner:
-    """Remembers what the rangers have seen around, in the wheels' own frame.
+    """Keeps a local occupancy grid in the odometry frame.
 
-    That frame drifts, but the memory has to serve for a few metres only.
+    That frame drifts, but the grid is needed for a few metres only.
     """
 
     def __init__(self, description: RobotDescription, settings: LocalPlannerSettings | None = None) -> None:
-        """Know nothing of the floor yet."""
+        """Start with an unknown grid."""
         self._settings = s = settings or LocalPlannerSettings()
         self._description = description
         self._floor = OccupancyGrid(description, s.floor)

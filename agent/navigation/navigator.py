@@ -1,4 +1,4 @@
-"""Navigation in the large: find out where the robot is, get a route, follow it, and again if it is lost."""
+"""Navigation: localize, get a route, follow it, and again if the robot gets lost."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
 TIGHT = 0.07
-"""Something nearer than this counts as what is in the way, m."""
+"""An obstacle nearer than this counts as in the way, m."""
 ANSWER_PATIENCE = 100
 """Ticks that an answer may take before the question counts as lost."""
 PAUSE = 2.0
-"""Seconds that it waits before what is in its way, and before it asks again for a route."""
+"""Seconds that it waits at an obstacle, and before it asks again for a route."""
 TRUSTED = 1.0
-"""After a block it still knows where it is if it has driven less than this blindly, m."""
+"""After a block the robot is still localized if it has driven less than this blindly, m."""
 
 
 HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
-NO_PROGRESS = "it gets no further, though nothing is near"
+NO_PROGRESS = "no progress, though nothing is near"
 
 
 @dataclass(frozen=True)
@@ -77,25 +77,25 @@ class NavigatorSettings:
 class Stage(StrEnum):
     """What the navigator is doing while it follows no route."""
 
-    LOST = "looking around to find out where it is"
+    LOST = "turning to localize"
     ASKING = "asking for a route"
-    BLOCKED = "standing before something in the way"
-    WAITING = "waiting for a way"
+    BLOCKED = "waiting at an obstacle"
+    WAITING = "waiting for a route"
     ARRIVED = "parked at the goal"
 
 
 class Navigator:
-    """Brings the robot to a goal node. The kidnapped robot of the paper is the same path: it starts lost.
+    """Brings the robot to a goal node. The kidnapped robot of the paper is the same case: it starts lost.
 
     Attributes:
         stage: what it is doing, in words.
         detail: why.
         fix: where the robot is, or None while lost.
-        goal: where it shall be.
+        goal: the node to reach.
         legs: nodes on the first route that was given.
-        tally: what the drive was made of so far.
+        tally: statistics of the drive so far.
         traverse: from one node to another, if the last step has ended one.
-        refined: a node of the own map as it is known better after the last step, if it is.
+        refined: a node of the own map that was refined by the last step, if any.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class Navigator:
         Args:
             observation: what the robot senses now.
             answers: that have come.
-            standing: the robot must not move; the behaviour waits, and where the robot is is kept up.
+            standing: the robot must not move; the behaviour waits, and the fix is updated.
         """
         self._motion.take_in(observation, answers)
         self._local_planner.see(observation)
@@ -216,14 +216,14 @@ class Navigator:
         return content.legs
 
     def _wait_for_a_way(self) -> Behaviour:
-        """Without a route: what is in the way may go; without that the robot may not be where it thinks."""
+        """Without a route: obstacles may go away; without obstacles the robot's pose may be wrong."""
         self.stage = Stage.WAITING
         if not self._blocks.at(self._motion.now):
             self.fix = None
         yield from self._motion.stand(PAUSE)
 
     def _follow(self, route: tuple[RouteLeg, ...], fix: Fix) -> Behaviour:
-        """Follow a route until it is driven, or blocked, or the robot does not know where it is."""
+        """Follow a route until it is driven, or blocked, or the robot is lost."""
         follower = RouteFollower(
             self._description, self._lens, self._sift, route, fix, self._local_planner,
             self._settings.follower, self._rng,
@@ -245,11 +245,11 @@ class Navigator:
                 self.tally = self.tally.passed([0.0])
             case RouteProgress.BLOCKED if not self._parking_retried and self._stuck_at_goal(follower):
                 # Nothing keeps it from its goal but its own precision: that blocks no other robot.
-                self.detail, self._parking_retried = "parking came to no end: once more", True
+                self.detail, self._parking_retried = "parking did not end: trying once more", True
             case RouteProgress.BLOCKED:
                 yield from self._report_block(*follower.blocked)
                 if self._parking_retried:
-                    # Twice: it begins from another heading, by what it sees then.
+                    # Twice: localize again, so that parking begins from another heading.
                     self.fix, self._expected, self._parking_retried = None, self._on_own_map(self.fix), False
             case RouteProgress.UNSURE if (
                 self._goal_hidden and follower.fix.blind < self._settings.follower.blind
@@ -295,7 +295,7 @@ class Navigator:
         return node.map_from_robot.mean @ fix.node_from_robot.mean
 
     def _obstacle(self) -> str:
-        """What keeps the robot from getting on; empty if nothing is near."""
+        """The obstacle ahead, in words; empty if nothing is near."""
         ranges = self._motion.observation.proximity
         bearings = self._description.ranger_bearings
         if len(ranges) == len(bearings) and len(bearings):
@@ -306,5 +306,5 @@ class Navigator:
         return ""
 
     def _stuck_at_goal(self, follower: RouteFollower) -> bool:
-        """Whether the robot is about at the route's last node, with nothing in its way."""
+        """Whether the robot is near the route's last node, with nothing in its way."""
         return follower.to_goal <= NEAR and not self._obstacle()

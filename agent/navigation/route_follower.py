@@ -40,7 +40,7 @@ GOAL_VIEWS = 4
 HIDDEN = 2.0
 """Seconds at the goal without its landmarks visible, or recognised, after which it is not there, s."""
 PATIENCE = 6.0
-"""Seconds without getting on before an edge counts as blocked."""
+"""Seconds without progress before an edge counts as blocked."""
 STALLED = 3.0
 """Seconds that the servo may take without getting nearer; then the robot drives around."""
 STALLED_PARKING = 10.0
@@ -54,13 +54,13 @@ MOST_CANDIDATES = 8
 
 
 class RouteProgress(StrEnum):
-    """How far a follower is."""
+    """State of a follower."""
 
     DRIVING = "driving along the route"
     PARKING = "parking at the goal"
     ARRIVED = "parked at the goal"
-    UNSURE = "no landmark in sight for a while"
-    BLOCKED = "not getting on"
+    UNSURE = "no landmark visible for a while"
+    BLOCKED = "no progress"
 
 
 class RouteFollower:
@@ -142,7 +142,7 @@ class RouteFollower:
         return self.distance(self._last)
 
     def distance(self, leg: int) -> float:
-        """How far the robot is from a leg's node, m."""
+        """Distance of the robot from a leg's node, m."""
         leg_from_robot = self._from_reference(leg) @ self.fix.node_from_robot.mean
         return math.hypot(leg_from_robot.x, leg_from_robot.y)
 
@@ -213,7 +213,7 @@ class RouteFollower:
         return None if detection is None else detection[1]
 
     def _may_servo(self, target: Pose2, distance: float, parking: bool) -> bool:
-        """Whether the servo may drive: where it gets no nearer, it cannot pass what is in its way."""
+        """Whether the servo may drive: without progress it cannot pass an obstacle."""
         _s, tick = self._settings, self._description.tick
         self._servo_barred = max(self._servo_barred - tick, 0.0)
         if self._servo_barred or self._reference != self.leg or not (parking or _lies_ahead(target)):

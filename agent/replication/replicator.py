@@ -182,7 +182,7 @@ class Replicator:
             return dict(self._current.refusals)
 
     def close(self) -> None:
-        """Commit what was submitted and stop. Twice is no error."""
+        """Commit what was submitted and stop. Idempotent."""
         for declared in self._declared:
             declared.close()
         self._work.put(None)

@@ -7,7 +7,7 @@ of 2 % that slip by 10 % in two steps of a hundred. The rival is the maximum a p
 GTSAM on the same measurements, noise and priors. An error is the RMS distance to the truth, in the first
 robot frame, of all landmarks and of the robot itself at the end. The same runs are repeated with 30 % of the
 tracks spoiled; there the other 70 % are judged. Localization: ten random starts a run, and one node that is
-driven through again and again with the map that the drive before has left. Times of a step are told beside
+driven through again and again with the map that the drive before has left. Times of a step are printed beside
 FilterPy's (benchmarks.ekf_speed).
 """
 

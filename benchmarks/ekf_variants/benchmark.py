@@ -3,7 +3,7 @@
     python -m benchmarks.ekf_variants [--runs N] [--steps N] [--seed N] [--jobs N] [--json]
 
 Every filter gets the same runs as in benchmarks.ekf: 50 s at 10 Hz in four shapes, 30 landmarks, wheels that
-slip, no wrong tracks. Its error is told as a ratio to that of the batch optimum. NEES (3 degrees of freedom,
+slip, no wrong tracks. Its error is given as a ratio to that of the batch optimum. NEES (3 degrees of freedom,
 of the pose and of a landmark in the filter's own coordinates) is averaged over the runs that have not
 diverged: to diverge is to be ten times as far off as the optimum, or to end without a number.
 """
@@ -142,8 +142,8 @@ def main() -> None:
     table = Table("filter", "median", "p90", "pose", "marks", "diverged", title=title)
     table.caption = "error over the optimum's: median, p90; NEES: pose, landmarks"
     for name, row in figures.items():
-        told = [f"{row[key]:.3g}" if row[key] >= 10 else f"{row[key]:.2f}" for key in list(row)[:4]]
-        table.add_row(name, *told, f"{100 * row['diverged']:.0f} %")
+        cells = [f"{row[key]:.3g}" if row[key] >= 10 else f"{row[key]:.2f}" for key in list(row)[:4]]
+        table.add_row(name, *cells, f"{100 * row['diverged']:.0f} %")
     console.print(table)
     if arguments.json:
         keys = next(iter(figures.values()))

@@ -81,7 +81,7 @@ def explore(stage: Stage, seconds: float, on_time: Callable[[float], None]) -> E
     Args:
         stage: which, and where.
         seconds: how long, simulated.
-        on_time: is told each time how many seconds have passed since the last.
+        on_time: called with the seconds since the last call.
     """
     fleet = LocalFleet(stage)
     fleet.start()

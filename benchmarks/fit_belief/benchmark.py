@@ -90,15 +90,16 @@ def fit(seen: Seen) -> Array:
 
 
 def reliability(seen: Seen, weights: Array) -> list[dict[str, float]]:
-    """In each bin of told probability: how many, told on average, right in truth."""
-    told = np.array([p for supports, _ in seen for p in probabilities(supports, weights.tolist())])
+    """In each bin of predicted probability: count, mean prediction, share that is right."""
+    predicted = np.array([p for supports, _ in seen for p in probabilities(supports, weights.tolist())])
     true = np.array([there for _, right in seen for there in right], dtype=np.float64)
     rows = []
     for low, high in pairwise(BINS):
-        inside = (told >= low) & ((told < high) | (high == 1.0))
+        inside = (predicted >= low) & ((predicted < high) | (high == 1.0))
         n = int(inside.sum())
         rows.append({
-            "from": low, "to": high, "places": n, "told": float(told[inside].mean()) if n else float("nan"),
+            "from": low, "to": high, "places": n,
+            "predicted": float(predicted[inside].mean()) if n else float("nan"),
             "right": float(true[inside].mean()) if n else float("nan"),
         })  # fmt: skip
     return rows
@@ -134,7 +135,7 @@ def main() -> None:
         "fitted": reliability(others, weights), "as_shipped": rows,
     }  # fmt: skip
     title = f"shipped weights, {len(others)} other views"
-    table = Table("told from", "to", "places", "told", "right", title=title)
+    table = Table("predicted from", "to", "places", "predicted", "right", title=title)
     for row in rows:
         table.add_row(*(f"{value:.3g}" for value in row.values()))
     console.print(table)

@@ -44,7 +44,7 @@ SPEED = 0.15
 NEAREST, FARTHEST = 1.5, 5.0
 """What the robot looks at is so far ahead, m."""
 WALK_FROM, WALK_FOR = 0.3, 0.4
-"""Somebody walks past after this share of the run, and for this share of it."""
+"""A person walks past after this share of the run, and for this share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Moment:
         ids: (N,) tracks alive.
         pixels: (N, 2) px, where they are.
         believed: whether the image was taken for a continuation of the one before.
-        person: bearing of somebody in view, rad, positive to the left; NaN if nobody is.
+        person: bearing of a person in view, rad, positive to the left; NaN without one.
         step_ms: wall time of tracking and filtering.
     """
 
@@ -90,7 +90,7 @@ class MappingDrive:
         flat: (N,) whether the patch of a track is on one surface, so that it is one point.
         filter_settings: of the filter that ran.
         moments: one a tick; the first is the anchor.
-        images: (H, W) by the number of the moment: at the anchor, where somebody is in the middle of the
+        images: (H, W) by the number of the moment: at the anchor, where a person is in the middle of the
             view or else farthest from the anchor, at the end.
         given_up: why the robot would have dropped the episode, in words; then the run ends there.
     """
@@ -139,7 +139,7 @@ def drive(
         kind: of world, see mapweave.sim.worlds.catalog.
         shape: of the drive, one of synthetic.mapping_run.SHAPES.
         steps: ticks.
-        person: whether somebody walks past.
+        person: whether a person walks past.
         progress: called once a tick.
 
     Raises:
@@ -259,15 +259,15 @@ class _Run:
         self.images.append(observation.image)
 
     def _telling(self) -> dict[int, NDArray[np.uint8]]:
-        """The first image, the last, and one between: somebody in the middle of it, or the end of a way."""
+        """The first image, the last, and one between: a person in the middle of it, or the end of a way."""
         numbers = [k for k, image in enumerate(self.images) if image is not None]
         between = max(numbers, key=lambda k: self._worth(self.moments[k]))
         return {k: image for k, image in enumerate(self.images) if image is not None and k in
                 (numbers[0], between, numbers[-1])}  # fmt: skip
 
     def _worth(self, moment: Moment) -> float:
-        nobody = math.isnan(moment.person)
-        return math.hypot(moment.true.x, moment.true.y) if nobody else 10.0 - abs(moment.person)
+        alone = math.isnan(moment.person)
+        return math.hypot(moment.true.x, moment.true.y) if alone else 10.0 - abs(moment.person)
 
     def _person(self, world_from_robot: Pose2) -> float:
         """Bearing of the nearest actor whose middle is in view, rad; NaN if there is none."""

@@ -25,7 +25,7 @@ from mapweave.storage.map_file import MapFile, unpack_map_file
 
 ROBOT = "r0"
 TRUTH = "truth.json"
-"""Where each node's image was truly taken: for scoring, and for nobody else."""
+"""Where each node's image was truly taken: for scoring only."""
 LOOK_EVERY = 5.0
 """How often it is looked whether exploration is complete, simulated s."""
 

@@ -1,17 +1,17 @@
-"""Many lost robots at once: how soon a map server answers, and whom it asks to come again.
+"""Many lost robots at once: how soon a map server answers, and which questions it refuses.
 
     python -m benchmarks.relocalize_load [--robots N] [--seconds S] [--nodes N] [--seed N] [--json]
 
 A real `mapweave server` process, over Zenoh on loopback, holds a map of synthetic rooms (descriptors with the
 spread of real ones). Each robot has a session of its own and asks without a pause where it is, always about
-another view; a robot that is told to come again does so after that time. Meanwhile one more asks for a route,
+another view; a refused robot asks again at its retry time. Meanwhile one more asks for a route,
 ten times a second. Robots and server share this machine's cores.
 
 For each server: `p50_ms` and `p95_ms` from asking to a found, ambiguous or unknown answer; `refused_share` of
 the questions; `answers_per_s`; `wait_p95_ms` from a robot's first asking about a view to its answer, pauses
 included; `route_p95_ms`; `right_share` of the answers (within 0.25 m and 5 degrees); `lost`, questions that
-nobody answered or refused. Side by side: the desk as it is by default, and a server that answers everybody
-in turn (one worker, nobody refused).
+without answers and refusals. Side by side: the default admission control, and a server that answers all
+in turn (one worker, no refusals).
 """
 
 from __future__ import annotations
@@ -150,8 +150,10 @@ def is_right(building: Building, query: tuple[View, MapId, Pose2], payload: byte
     if not candidates:
         return False
     _, _, true = query
-    told = building.truth[candidates[0].node] @ candidates[0].node_from_robot.mean
-    return told.distance(true) < 0.25 and abs(wrap_angle(told.heading - true.heading)) < math.radians(5)
+    answered = building.truth[candidates[0].node] @ candidates[0].node_from_robot.mean
+    return answered.distance(true) < 0.25 and abs(wrap_angle(answered.heading - true.heading)) < math.radians(
+        5
+    )
 
 
 def ask_routes(bus: ZenohBus, building: Building, stop: threading.Event) -> list[float]:
@@ -226,7 +228,7 @@ def wait_until_merged(bus: ZenohBus, nodes: int, children: Children) -> None:
 
 
 def figures(total: Tally, routes: list[float], took: float) -> dict[str, float]:
-    """The numbers that are told."""
+    """The numbers that are printed."""
     asked = len(total.answered) + total.refused + total.lost
     answered = 1e3 * np.array(total.answered or [math.nan])
     return {

@@ -58,7 +58,7 @@ def start(folder: Path, queries: Sequence[Query], places: Sequence[Place], bar: 
     Returns:
         Seconds from the start of the process: `answer_s`, of which of processors `answer_cpu_s`. Of all
         questions then, while maps are compared: `right_share` of the answers "here" (`here_share`), their
-        times, and how many told a pose in a merged frame (`in_frame_share`). `peak_mb` of memory.
+        times, and how many gave a pose in a merged frame (`in_frame_share`). `peak_mb` of memory.
     """
     truth = {place.node.id: place for place in places}
     endpoint, task = f"tcp/127.0.0.1:{free_port()}", bar.add_task("a server starts", total=len(queries))

@@ -1,11 +1,11 @@
-"""Fleets with one robot whose map has wrong geometry and true views: what lost robots are told then.
+"""Fleets with one robot whose map has wrong geometry and true views: answers to lost robots then.
 
     python -m benchmarks.wrong_geometry [--runs N] [--kinds slip carried long turns] [--seed N] [--json]
 
 Nothing is rendered (see `synthetic.wrong_geometry`). Three sound robots map a house; a fourth maps the same
 house with one of four faults of its odometry. Lost robots then ask where they are: without the fourth robot's
 map, with it, and with it while no map is looked for that has wrong geometry. The house may have two rooms
-that look the same: what is told there must not become surer.
+that look the same: answers there must not become more certain.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rich.table import Table
 
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
-from synthetic.wrong_geometry import ODD, SCENES, Fault, Told, draw_fleet, lost_views, outcome
+from synthetic.wrong_geometry import ODD, SCENES, Fault, AnswerOutcome, draw_fleet, lost_views, outcome
 
 WITHOUT, WITH, UNSEARCHED = "without_the_map", "with_the_map", "rule_off"
 NO_SEARCH: tuple[Switch, ...] = ((WrongGeometrySearch, "wrong", lambda *_: {}),)
@@ -40,7 +40,7 @@ def measured(
         with switched_off(NO_SEARCH):
             told[UNSEARCHED] = outcome(fleet, views)
         for way, one in told.items():
-            answers = {str(sort): one[str(sort)] for sort in Told}
+            answers = {str(sort): one[str(sort)] for sort in AnswerOutcome}
             out[way].update(
                 answers | {"fleets": 1, "in_pieces": int(one["parts"] > 1), "found": len(one["found"])}
             )

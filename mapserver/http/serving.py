@@ -39,7 +39,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""What pages may load: files of this server, nothing inline, nothing of others."""
+"""Content security policy of the pages: files of this server only, nothing inline."""
 HEADERS = {
     "Connection": "close",
     "Cache-Control": "no-store",
@@ -221,7 +221,7 @@ class HttpThread:
         self.close()
 
     def close(self) -> None:
-        """Stop serving; connections end. Twice is no error."""
+        """Stop serving; connections end. Idempotent."""
         self._server.should_exit = True
         self._thread.join(10.0)
 

@@ -1,4 +1,4 @@
-"""Succession: superseded nodes leave the place index, so that a new node costs the same on every drive.
+"""Superseded nodes leave the place index, so that a new node costs the same on every drive.
 
 A robot's nodes of today stay in it for the time being, superseded or not: while maps are being made, links
 between all of them distinguish true merges from false ones.
@@ -15,19 +15,19 @@ from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP, Pair
 from mapweave.merge.pose_graph.pairs import PairTable
 
 SETTLED = 3600.0
-"""s on the robot's own clock after which what it saw is no longer of today."""
+"""s on the robot's own clock after which a node is no longer of today."""
 SECOND = 1_000_000_000
 
 
 class SupersededNodes:
-    """Keeps old superseded nodes out of the place index. What they were compared with is kept."""
+    """Keeps old superseded nodes out of the place index, but keeps their verdicts."""
 
     def __init__(self, index: PlaceIndex, pairs: PairTable, node_of: Callable[[NodeId], Node | None]) -> None:
         """Begin with nothing superseded.
 
         Args:
             index: of places that are searched.
-            pairs: that are compared; revived nodes are put into it.
+            pairs: that are compared; nodes that become active again are put into it.
             node_of: gives a node by its id.
         """
         self._index, self._pairs, self._node_of = index, pairs, node_of
@@ -58,11 +58,11 @@ class SupersededNodes:
         self._newest[node.id.agent] = max(key, self._newest.get(node.id.agent, key))
 
     def drop(self, node_id: NodeId) -> None:
-        """A node has gone."""
+        """Remove a node."""
         self._left_out.discard(node_id)
 
     def follow(self, superseded: Collection[NodeId]) -> None:
-        """These nodes are superseded now, and no others."""
+        """Set the superseded nodes."""
         past = {node_id for node_id in superseded if self._is_past(node_id)}
         for node_id in self._left_out - past:
             if (node := self._node_of(node_id)) is not None:
@@ -74,7 +74,7 @@ class SupersededNodes:
         self._left_out = past
 
     def _is_past(self, node_id: NodeId) -> bool:
-        """Whether its robot is in a later epoch by now, or was there long after it."""
+        """Whether its robot has a later epoch by now, or much later nodes."""
         node = self._node_of(node_id)
         if node is None:
             return True

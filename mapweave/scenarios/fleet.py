@@ -115,7 +115,7 @@ class Fleet(Protocol):
         ...
 
     def end(self) -> None:
-        """End everything in order; journals and store are then closed. Twice is no error."""
+        """End everything in order; journals and store are then closed. Idempotent."""
         ...
 
     def wall(self) -> dict[str, float]:

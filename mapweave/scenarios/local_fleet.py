@@ -33,7 +33,7 @@ class LocalFleet:
     """Calls every agent itself, tick by tick. Its answers are those of a fleet of processes."""
 
     def __init__(self, stage: Stage) -> None:
-        """Nothing runs yet."""
+        """Prepare; nothing runs yet."""
         self._stage = stage
         self.keys = SimKeys(FLEET)
         self._hub = MemoryHub()

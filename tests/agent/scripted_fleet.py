@@ -36,7 +36,7 @@ def home_world() -> World:
 
 
 def home_map(home: World) -> HybridMap:
-    """Three nodes in a row, each 1.2 m before the one before."""
+    """Three nodes in a row, 1.2 m apart."""
     nodes, edges = take_map(home, MapId("r0", 1), TOUR, np.random.default_rng(2), sigma_xy=0.002)
     return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
 
@@ -55,7 +55,7 @@ class Eyes:
 
 
 class Trial:
-    """A navigator, a body that does what it is told unless it is held, and a scripted fleet."""
+    """A navigator, a base that executes its commands unless it is held, and a scripted fleet."""
 
     def __init__(
         self, navigator: Navigator, eyes: Eyes, fleet: Fleet, proximity: np.ndarray = FREE, held: bool = False

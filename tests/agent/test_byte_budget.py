@@ -1,4 +1,4 @@
-"""What a user lets a node cost is what it costs on the wire, and it is the same node for everybody."""
+"""A node keeps to its byte budget on the wire, and is the same node for all receivers."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def test_a_status_without_a_field_is_refused(status: Status, data: st.DataObject
 
 @given(st.text(), st.integers(1, 400))
 def test_any_status_can_be_encoded(text: str, times: int) -> None:
-    """A status quotes servers and drivers: line breaks and long stories must not end the robot's loop."""
+    """A status quotes servers and drivers: line breaks and long texts must not end the robot's loop."""
     status = Status("looking", text * times, 0, 0, Pose2(), False)
     said = decode_agent_status(encode_agent_status(AgentStatus(status, 0))).status.detail
     assert said.isprintable()

@@ -164,7 +164,7 @@ def test_a_mission_can_be_changed_at_any_time(walls, drive):
 
 
 def test_exploration_that_was_interrupted_goes_on(walls, drive):
-    """The robot stands for a while in the middle of its first drive; the rest is as if it had not."""
+    """The robot stops for a while in the middle of its first drive; the rest is as without the stop."""
     _, steps, _ = drive
     pipeline = on(Explore())
     _, begun, poses = live(walls, pipeline, 25)

@@ -1,4 +1,4 @@
-"""The codec of bodies behind the bus, and the driver's patience."""
+"""The codec of bases behind the bus, and the driver's patience."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A desk that answers as a test says, and a picture to ask it about."""
+"""A server with scripted answers, and a picture to ask about."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What others have mapped, told in the asking robot's own map: against where everything truly is."""
+"""What others have mapped, in the asking robot's own map: against the truth."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
     true = [scene.truth[n] for n in sorted(scene.truth) if n.map == B]
     assert len(answer.views) == len(true)
     for pose in true:
-        # The own map drifts: what is told is right beside the own node that is nearest.
+        # The own map drifts: answers are right near the nearest own node.
         beside = min(own.values(), key=lambda node: scene.truth[node.id].distance(pose))
         world_from_map = scene.truth[beside.id] @ beside.map_from_robot.mean.inverse()
         told = [world_from_map @ Pose2(*view[:3]) for view in answer.views]

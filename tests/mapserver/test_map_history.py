@@ -1,4 +1,4 @@
-"""What has become of the maps: told once, with its date, and kept on the disk."""
+"""The history of the maps: each event once, with its date, and kept on the disk."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap)
 def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, two: MergedMap) -> None:
     MapHistory(store).follow(one)
     again = MapHistory(store)
-    # It merges before it has read its store if people's rulings come first.
+    # It merges before it has read its store if manual constraints come first.
     again.follow(MergedMap.empty())
     again.follow(one)
     assert told(again) == [JOINED]
@@ -137,7 +137,7 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
     assert again.happenings == chronicle.happenings, "told already"
     again.follow(one)
     again.follow(held)
-    # What came apart by it tells the reason itself.
+    # The split by it has the reason itself.
     assert [kind for kind, _ in told(again)] == [
         MapEventKind.KEPT_APART,
         MapEventKind.JOINED,

@@ -170,7 +170,7 @@ def test_in_lockstep_all_changes_are_merged_before_an_answer() -> None:
 
 
 def test_an_index_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
-    """Whoever gave it saves it: a server's first start must leave a saved index, too."""
+    """The owner of the index saves it: a server's first start must leave a saved index, too."""
     _, _, changes = mapped_room(("a",))
     index = PlaceIndex()
     upkeep = MergeWorker(LiveSchedule(), 1.0, index=index)

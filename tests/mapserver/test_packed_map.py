@@ -1,4 +1,4 @@
-"""The whole map as an answer: it holds up nobody, and costs one pack a merge."""
+"""The whole map as an answer: it blocks no other question, and costs one pack a merge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agents are told where their nodes lie in the merged map: what moved noticeably; all on request."""
+"""Merged poses are published to agents: those that moved noticeably, and all on request."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def merged(*graphs: PoseGraph) -> MergedMap:
     return replace(whole, components=tuple(frozenset(one.nodes) for one in graphs))
 
 
-class Told:
-    """A herald, and what it publishes."""
+class Recorder:
+    """A pose broadcast, and what it publishes."""
 
     def __init__(self, fleet: Fleet, settings: PoseBroadcastSettings | None = None) -> None:
         self.heard: list[PoseNews] = []
@@ -83,12 +83,12 @@ def zenoh() -> Iterator[ZenohFleet]:
 
 
 def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) -> None:
-    told = Told(memory)
+    told = Recorder(memory)
     (first,) = told.tell(graph(A))
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
     assert told.tell(graph(A, 0.049)) == []
     assert told.tell(graph(A, 0.0, math.radians(0.9))) == []
-    # Each step is small; what counts is how far it is from what was told.
+    # Each step is small; the distance from the published pose counts.
     steps = [told.tell(graph(A, 0.03 * k)) for k in range(1, 5)]
     assert [len(news) for news in steps] == [0, 1, 0, 1]
     (turned,) = told.tell(graph(A, 0.12, math.radians(1.1)))
@@ -96,7 +96,7 @@ def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) 
 
 
 def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
-    told = Told(memory)
+    told = Recorder(memory)
     told.tell(graph(A), graph(B))
     one = graph(A)
     one.means[3, 1] = 0.2
@@ -110,7 +110,7 @@ def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> 
 
 
 def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
-    told = Told(memory)
+    told = Recorder(memory)
     told.tell(graph(A))
     (news,) = told.tell(graph(A[:-1]))
     assert news.gone == (A[-1],) and not news.placed
@@ -120,7 +120,7 @@ def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
 
 
 def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet) -> None:
-    told = Told(memory, PoseBroadcastSettings(most=2, beat=math.inf))
+    told = Recorder(memory, PoseBroadcastSettings(most=2, beat=math.inf))
     pieces = told.tell(graph(A))
     assert [len(news.placed) for news in pieces] == [2, 2, 1]
     assert [(news.after, news.sequence) for news in pieces] == [(0, 1), (1, 2), (2, 3)]

@@ -57,7 +57,7 @@ def sent(request: pytest.FixtureRequest) -> bool:
 
 
 def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
-    """Fewest pairs on any way between which nobody could drive, by trying all ways of up to five steps."""
+    """Fewest pairs on any way between which no robot could drive, by trying all ways of up to five steps."""
     merged = router.merged
     whole = merged.union()
     graph: nx.Graph = nx.Graph()
@@ -120,9 +120,9 @@ def test_recently_blocked_edges_are_reported(router: Router) -> None:
     free, wary = explain_route(router, one, two), explain_route(router, one, two, wary=[(one, two)])
     if [hop.b for hop in wary.hops] == [two]:
         assert wary.hops[0].cost == pytest.approx(free.hops[0].cost + router.settings.wary_cost)
-        assert "did not get through of late" in wary.hops[0].words
+        assert "recently could not get through" in wary.hops[0].words
     else:
-        assert "did not get through of late" in wary.gaps[0].words
+        assert "recently could not get through" in wary.gaps[0].words
     assert wary.gaps, "the way that would be cheaper is told"
 
 

@@ -1,4 +1,4 @@
-"""Nobody's map ends the fleet: what a robot may legally send, and what it may not, also over restarts."""
+"""No map ends the fleet: what a robot may legally send, and what it may not, also over restarts."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def stored(path: Path, logs: dict[MapId, list[bytes]]) -> Store:
 
 
 def node(number: int, landmarks: int = 100) -> Node:
-    """Of a place that nobody else has seen, with at most so many landmarks."""
+    """Of a place that no other robot has seen, with at most so many landmarks."""
     rng = np.random.default_rng(3)
     (some,), _ = take_map(room(0, 0, 5, 4, 600, rng), BAD, TOUR[:1], rng)
     return replace(some, id=NodeId(*BAD, number), landmarks=some.landmarks.take(np.arange(landmarks)))
@@ -118,7 +118,7 @@ def attacks() -> dict[str, list[bytes]]:
 
 
 class Fleet:
-    """A server, and somebody at the bus who plays all robots and people."""
+    """A server, and a client at the bus that plays all robots and people."""
 
     def __init__(self, path: Path) -> None:
         hub = MemoryHub()
@@ -135,7 +135,7 @@ class Fleet:
         return dict(decode_record(self.ask(KEYS.server_status("s0"), b"").payload))
 
     def where(self) -> list[RelocalizeAnswer]:
-        """What lost robots are told."""
+        """Answers to lost robots."""
         replies = [self.ask(KEYS.relocalize("s0"), encode_view(view)) for view in views()]
         return [decode_relocalize_answer(reply.payload) for reply in replies]
 
@@ -199,7 +199,7 @@ def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path: Path) -> No
 
 
 def fails_with(monkeypatch: pytest.MonkeyPatch, bad: MapId) -> None:
-    """Let the merge fail with a map, by a defect that nobody knows yet."""
+    """Let the merge fail with a map, by an unknown defect."""
     real = decision_cache.fragments_of
 
     def fails(maps: dict[MapId, HybridMap], *more: Any) -> Any:
@@ -270,7 +270,7 @@ def test_a_map_can_be_retired_when_nothing_can_be_merged(
 
 
 class Beside:
-    """Two sound robots, merged anew with the content of a third one, which a store has taken in."""
+    """Two correct robots, merged again with the content of a third one, which is in the store."""
 
     def __init__(self, folder: Path) -> None:
         self.store = stored(folder / "s0.sqlite", sound_logs())
@@ -333,7 +333,7 @@ def test_300_random_legal_contents_change_nothing_for_sound_robots(part: int, be
 
 
 def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
-    """They are linked with sound maps, and may move these; nothing fails by them, and nobody is unheard."""
+    """They are linked with correct maps, and may move these; nothing fails, and no map is left out."""
     seen = [body.node for _, body in beside.sound if isinstance(body, NodePut)]
     linked = 0
     for seed in range(30):

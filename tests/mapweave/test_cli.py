@@ -1,4 +1,4 @@
-"""The command line: help for everything, and one line on stderr for whatever is wrong."""
+"""The command line: help for everything, and one line on stderr for each error."""
 
 from __future__ import annotations
 

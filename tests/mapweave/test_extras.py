@@ -87,7 +87,7 @@ def merged() -> MergedMap:
 
 @pytest.fixture
 def filled(merged: MergedMap, recording: Path, nobody: str, tmp_path: Path) -> dict[str, object]:
-    """What stands for the braces in CASES."""
+    """The values of the braces in CASES."""
     own, whole = tmp_path / "own.mapweave", tmp_path / "merged.mapweave"
     write_map_file(own, MapFile("agent", "r0.1", tuple(merged.maps[MapId("r0", 1)].contents())))
     write_map_file(whole, map_file_of(merged))

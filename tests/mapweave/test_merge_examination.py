@@ -154,7 +154,7 @@ def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
             lambda folder: (folder / "splits.toml").write_text(
                 '[[robot]]\nname="a"\nfirst=0\nlast=9\n[[robot]]\nname="A"\nfirst=0\nlast=9\n'
             ),
-            (), "called alike",
+            (), "two robots have the same name",
         ),
         (lambda folder: None, ("--robots", "1"), "use 2 to"),
         (lambda folder: None, ("--robots", "20"), "too few"),

@@ -1,4 +1,4 @@
-"""Settings: TOML over defaults, and one line for whatever is wrong."""
+"""Settings: TOML over defaults, and one line for each error."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def load(tmp_path: Path, text: str | bytes) -> Settings:
 
 
 def refused(tmp_path: Path, text: str | bytes) -> str:
-    """The one line."""
+    """The single line."""
     with pytest.raises(SettingsError) as error:
         load(tmp_path, text)
     said = str(error.value)

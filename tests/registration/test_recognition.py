@@ -91,7 +91,7 @@ def test_two_nodes_register_the_same_in_both_directions() -> None:
             continue
         true = a.inverse() @ b
         distances.append(there.node_from_robot.mahalanobis2(true))
-        # The same information is used either way, up to which side's depths stand for shared landmarks.
+        # The same information is used either way, up to which side's depths are used for shared landmarks.
         difference = back.node_from_robot.inverse()
         assert there.node_from_robot.mahalanobis2(difference.mean) < 3.0
         sure.append(there.evidence["inliers_3d"])

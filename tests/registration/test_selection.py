@@ -63,7 +63,7 @@ def test_more_bytes_keep_more_of_the_same() -> None:
 
 
 def test_twins_come_last() -> None:
-    """Landmarks that look alike cannot be told apart, so no match of theirs passes the ratio test."""
+    """Similar landmarks are ambiguous, so no match of theirs passes the ratio test."""
     some = candidates(40, 2)
     some.codes[30:] = some.codes[30]
     order = choose(some, np.ones(40), CAMERA, PLENTY)

@@ -275,7 +275,7 @@ TOP = st.dictionaries(st.sampled_from([field.name for field in dataclasses.field
     DESIGNS, st.dictionaries(st.sampled_from([f.name for f in dataclasses.fields(Design)]), ODD, max_size=1)
 )
 def test_any_table_makes_a_world_or_one_line(lists: dict[str, Any], top: dict[str, Any]) -> None:
-    """Whatever stands in the file; and what is built can be asked for poses, and moved."""
+    """Any content of the file; and a built world has poses, and can be rearranged."""
     try:
         table = {**lists, **top}
         for name, cls in ITEMS.items():

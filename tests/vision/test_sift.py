@@ -81,7 +81,7 @@ def test_points_on_an_edge_are_left_out(angle):
     lax = SiftSettings(least_texture=0.0, least_roundness=0.0)
     assert len(Sift(IDEAL, lax).extract(image)) > 10, "there is something to leave out"
     assert len(Sift(IDEAL).extract(image)) == 0
-    # A spot is held in both directions, wherever it is, and so is all whose patch has it in view.
+    # A spot is held in both directions, at any position, and so are all patches that contain it.
     spotted = cv2.circle(image.copy(), (160, 120), 5, 20, cv2.FILLED, cv2.LINE_AA)
     at = Sift(IDEAL).extract(spotted).raw
     assert len(at)

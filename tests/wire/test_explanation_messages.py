@@ -1,4 +1,4 @@
-"""Explanations and rulings come back as they went, and nothing that is wrong gets in."""
+"""Explanations and manual constraints round-trip, and invalid ones are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever comes from outside: nothing but InvalidMessage comes out, and nothing huge is made of it."""
+"""Any bytes from outside: only InvalidMessage is raised, and nothing huge is allocated."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def poses(node: Node, gone: NodeId) -> PoseNews:
 
 
 def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tuple[Decoder, bytes]]:
-    """Of two nodes and two maps, with the questions and rulings."""
+    """Of two nodes and two maps, with the questions and manual constraints."""
     b, (one, two) = replace(a, id=NodeId("r1", 1, 1)), (a.id.map, MapId("r1", 1))
     ruling = ManualConstraint((a.id, b.id), True, "anna", 5, "two kitchens")
     pairs = np.array([[1, 2], [3, 4]])

@@ -168,7 +168,7 @@ def test_landmarks_come_back_in_their_order(some: SimpleNamespace, data: st.Data
 
 @given(data)
 def test_settled_landmarks_come_back_to_the_last_bit(some: SimpleNamespace, data: st.DataObject) -> None:
-    """What the robot that made a node works with is what everybody else gets."""
+    """The robot that made a node works with the same numbers as all receivers."""
     camera = data.draw(some.cameras)
     one, _ = settle(data.draw(some.landmarks(camera)), camera)
     back = unpack_landmarks(pack_landmarks(one, camera), camera)
@@ -256,7 +256,7 @@ def both_forms(packed: bytes) -> list[Landmarks | str]:
 @settings(max_examples=300)
 @given(data)
 def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data: st.DataObject) -> None:
-    """Whatever decodes is finite, within the image's surroundings, and encodes to what decodes alike."""
+    """Every decoded value is finite, within the image's surroundings, and round-trips."""
     bad = bytearray(pack_landmarks(some.node(20).landmarks, CAMERA)[:-4])
     for _ in range(data.draw(st.integers(1, 3))):
         reach = data.draw(st.sampled_from([12, len(bad)]))

@@ -1,4 +1,4 @@
-"""Depths that drives have taught: nearer to the truth, no surer than they are right, told where it pays."""
+"""Depths refined by drives: nearer to the truth, with honest sigmas, sent where it pays."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def drive(rng: np.random.Generator, node: Landmarks, true: np.ndarray) -> Locali
 
 
 def test_four_drives_make_depths_better_and_never_too_sure():
-    """Each drive begins with what the one before has written back: one depth a landmark, as a node holds it.
+    """Each drive begins with the refined node of the drive before: one depth a landmark.
 
     With the filter's own variances the mean of the squared normalised errors is 1.5 after four drives.
     """
@@ -151,7 +151,7 @@ def test_a_node_is_refined_once_a_drive_when_the_robot_leaves_it():
     assert refinement.see(fixes[0]) is None and refinement.see(fixes[0]) is None
     told = refinement.see(fixes[1])
     assert told is not None and told.id == A and told.stamp_ns == 7
-    # On the grid on which it is sent: off by a sixth of their sigmas at most, and alike for everybody.
+    # On the grid on which it is sent: off by a sixth of their sigmas at most, and equal for all receivers.
     assert (np.abs(told.landmarks.depths - DEPTHS) <= told.landmarks.depth_sigmas / 5.5).all()
     sent = decode_body(encode_body(NodePut(told)))
     assert isinstance(sent, NodePut)

@@ -1,4 +1,4 @@
-"""Which drives are measurements, and how good: a robot that is told where it is, with noise."""
+"""Which drives are measurements, and how precise: for a robot whose pose is given, with noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The mapping filter: its algebra against dense textbook forms, and what it tells."""
+"""The mapping filter: its algebra against dense textbook forms, and its reports."""
 
 import numpy as np
 import pytest

@@ -56,7 +56,7 @@ def own_map(home: World) -> HybridMap:
 
 @dataclass
 class Body:
-    """A body that does what it is told, and the features that it sees: takes the place of Sift.
+    """A robot base that executes its commands, and the features that it sees: replaces Sift.
 
     Attributes:
         world: that it is in; None if its lens is covered.
@@ -164,7 +164,7 @@ def test_a_twin_of_one_wall_is_not_enough(home, elsewhere, own_map):
     assert resumption.found is None
     assert resumption.lost
     assert any("landmarks agree; another view must, too" in said for said in body.said)
-    assert body.said[-1] == ("cannot find itself on its own map of 7 nodes: no two views agreed at 2 places")
+    assert body.said[-1] == ("cannot localize on its own map of 7 nodes: no two views agreed at 2 places")
 
 
 def test_without_recognition_it_searches_elsewhere_and_gives_up(elsewhere, own_map):
@@ -172,9 +172,7 @@ def test_without_recognition_it_searches_elsewhere_and_gives_up(elsewhere, own_m
     resumption = search(own_map, body)
     assert resumption.lost
     assert resumption.found is None
-    assert body.said[-1] == (
-        "cannot find itself on its own map of 7 nodes: nothing was recognised at 2 places"
-    )
+    assert body.said[-1] == ("cannot localize on its own map of 7 nodes: nothing was recognised at 2 places")
     assert "none of 7 nodes is recognised" in body.said
     assert "nothing here is known: driving on to search from elsewhere" in body.said
     assert turned(body) > 2 * math.tau

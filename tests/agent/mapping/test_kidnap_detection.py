@@ -1,4 +1,4 @@
-"""Whether an image continues the one before: on photographs, in the dark, and behind somebody's back."""
+"""Whether an image continues the one before: on photographs, in the dark, and behind a person's back."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_passing_objects_leave_the_tracks_alone(walls, mapper, elsewhere, what):
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_a_camera_that_hangs_stops_the_robot_and_not_its_wheels(walls, mapper, frozen):
-    """The same image again while the wheels turn is none: else it would speak against the wheels."""
+    """The same image again while the wheels turn is not a new image: else it would refute the wheels."""
     image = walls.render(HERE) if frozen else None
     watch(mapper, [image] * 3, forward=0.01)
     assert not mapper.doubtful, "a dropped image now and then is nothing to stop for"

@@ -1,4 +1,4 @@
-"""Wheels against image: small slips are no dispute, two different stories are."""
+"""Wheels against image: small slips are consistent, contradicting motions are not."""
 
 from __future__ import annotations
 

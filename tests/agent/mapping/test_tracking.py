@@ -86,7 +86,7 @@ def test_further_tracks_hold_the_heading_when_wheels_lie(walls, description):
 
 
 def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last(walls, description):
-    """Few tracks in one corner: wheels are trusted alone, lie by and by, and nobody carried the robot off.
+    """Few tracks in one corner: only wheels are trusted, they drift, and the robot was not carried off.
 
     A robot before a bare wall once took itself for carried off when its filter was 20 px off its tracks.
     """
@@ -102,7 +102,7 @@ def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last
 
 
 def past(image: np.ndarray, tick: int) -> np.ndarray:
-    """Somebody with a striped coat walks through the view, as wide as a third of it."""
+    """A person with a striped coat walks through the view, as wide as a third of it."""
     left = 16 * tick - 110
     shown = image.copy()
     columns = np.arange(max(left, 0), min(left + 110, image.shape[1]))

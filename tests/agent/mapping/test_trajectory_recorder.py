@@ -47,7 +47,7 @@ def test_a_missing_reading_carries_no_information(clocked):
     for tick, proximity in ((10, (2.0, 2.0)), (20, ()), (30, (2.0, 2.0))):
         wayside.step(seen(tick, proximity), Pose2())
     wake = wayside.wake(0, clocked.ranges(np.array([1.0, 3.0])))
-    # A ray that ends at the sensor tells of nothing behind.
+    # A ray that ends at the sensor has no information about what is behind.
     assert wake.distances[1] == pytest.approx([0.0, 0.0]) and (wake.distances[[0, 2]] > 2.0).all()
 
 
@@ -87,7 +87,7 @@ def test_moments_before_a_view_that_became_no_node_belong_to_the_next(clocked):
 
 
 def test_a_mapped_drive_records_the_trajectory(walls, clocked):
-    """Forward and back before photographs: one node, whose wake is the true way."""
+    """Forward and back before photographs: one node, whose trajectory is the true one."""
     mapper = Mapper(MapId("r0", 1), clocked)
     way = [*np.arange(0.0, 0.6, 0.025), *np.arange(0.6, 0.2, -0.025)]
     before = Pose2(way[0])

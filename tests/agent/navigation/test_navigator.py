@@ -106,7 +106,7 @@ def test_it_goes_around_by_another_way(home):
 
 
 def test_endless_parking_is_retried_before_it_is_a_block(home):
-    """Almost at the goal, held there by nothing that anybody else could meet."""
+    """Almost at the goal, held there by nothing that could block another robot."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
     follower = RouteFollowerSettings(blind=1e9, parking_patience=3.0)
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(follower=follower))

@@ -31,7 +31,7 @@ ROBOT = RobotDescription(camera=CAMERA)
 
 
 class Deluded:
-    """A localizer whose tracks have slid: it is sure to stand at the goal, wherever it stands."""
+    """A localizer whose tracks have slid: it is certain to be at the goal, wherever it is."""
 
     def __init__(self, node: Node) -> None:
         self.node = node
@@ -57,7 +57,7 @@ def follower_at_the_goal(node: Node) -> RouteFollower:
     "begin", [Pose2(-0.03, 0.0, 0.0), Pose2(-0.01, 0.02, -0.015), Pose2(0.02, -0.02, 0.02)]
 )
 def test_drifted_tracks_do_not_park_the_robot_next_to_the_goal(walls, node, begin):
-    """The robot believes to be parked, 2 to 3 cm off. It looks afresh, and drives the rest."""
+    """The robot's estimate is parked, 2 to 3 cm off. It detects the goal again, and drives the rest."""
     follower, pose = follower_at_the_goal(node), begin
     odometry = Odometry(0.0, 0.0)
     for tick in range(400):
@@ -135,7 +135,7 @@ def test_nodes_are_found_where_they_are_expected_only(walls, node):
 
 
 def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypatch):
-    """It once stood before an obstacle for as long as anybody had patience, and the drive around had none."""
+    """A robot waited at an obstacle until its patience ended, and the drive around had none left."""
     standing = ServoStep(Command(), "driving", None, "standing still to think the way over", 9)
 
     monkeypatch.setattr(Servo, "command", lambda *_: standing)

@@ -105,7 +105,7 @@ def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: Ha
 
 
 def test_the_disk_comes_first(hub: MemoryHub, path: Path) -> None:
-    """Whoever hears of a change finds it in the journal."""
+    """A published change is in the journal."""
     agent = Agent(hub, path)
     on_disk: list[bool] = []
     server = MemoryBus(hub)

@@ -101,7 +101,7 @@ def test_the_page_leads_from_maps_to_landmarks(served: Web, tmp_path_factory: py
         assert page.run(count(".alike")) == len(told.matches) - len(told.shared)
         assert page.run(count("circle")) == len(told.a.landmarks) + len(told.b.landmarks)
         assert f"{told.a_from_b.mean.x:.3f} m ahead" in page.run(TOLD)
-        # Whoever is given the address sees the same at once, and the way back leads back.
+        # The address shows the same page at once, and the back button works.
         address = page.run("return location.href")
         assert address.endswith(f"/why?a={a}&b={b}")
         page.run("document.getElementById('all').click()")

@@ -375,7 +375,7 @@ HALF = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\
 
 def test_closed_or_slow_connections_block_no_other(desk: Desk) -> None:
     with Web(("127.0.0.1", 0), desk, patience=0.5) as served:
-        # Nobody is left who would read an answer.
+        # No client is left to read an answer.
         assert raw(served, HALF, close=True) == b""
         slow = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(web.MOST_AT_ONCE)]
         for connection in slow:

@@ -94,7 +94,7 @@ def merger_of(told: dict[MapId, Log], *maps: MapId) -> Merger:
 
 
 def alone_fails(monkeypatch: pytest.MonkeyPatch, *bad: MapId) -> None:
-    """Let the merge fail wherever any of these maps is cut into pieces."""
+    """Let the merge fail where any of these maps is cut into pieces."""
     real = decision_cache.fragments_of
 
     def fails(maps: dict[MapId, HybridMap], *more: Any) -> Any:
@@ -169,7 +169,7 @@ def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
         merged = merger_of(small, *order).merged()
         assert merged.set_apart.keys() == {WORSE}
         assert said(merged, R0, R1) == said(alone, R0, R1)
-    # Whoever was set apart by another process is so again.
+    # A map that another process set apart is set apart again.
     merger = merger_of(small, R0, R1, WORSE)
     merger.suspect([R1])
     assert merger.merged().set_apart.keys() == {R1}

@@ -150,7 +150,7 @@ def test_reading_a_store_gives_the_same_as_merging_live(scene: Scene, merger: Me
 
 @pytest.mark.parametrize(("clock", "joined"), [("net", False), ("", True)])
 def test_robots_that_would_walk_through_each_other_are_not_joined(clock: str, joined: bool) -> None:
-    """Two robots do the same at the same time in two rooms that look the same: only their clock can tell."""
+    """Two robots do the same at the same time in two rooms that look the same: only the clock differs."""
     rng = np.random.default_rng(4)
     one = room(0, 0, 5, 4, 600, rng)
     merger = Merger()
@@ -202,7 +202,7 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
         return examine_matches(node, *others)
 
     monkeypatch.setattr("mapweave.mapserver.relocalization.relocalizer.examine_matches", counted)
-    # Nobody suffices alone and nothing is faint: then every node that looks alike is examined.
+    # No single candidate is enough: then every similar node is examined.
     thorough = Relocalizer(
         merger.index,
         merger.node,
@@ -331,7 +331,7 @@ def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
     legs = router.route(start, goal, start_from_robot=start_from_robot).legs
     first = scene.truth[legs[0].node.id]
     assert first.distance(scene.truth[far]) < min(1.0, first.distance(scene.truth[start]))
-    # Its pose is told relative to the node that the robot knows.
+    # Its pose is given relative to the node of the robot.
     assert legs[0].previous_from_node.mean.distance(scene.truth[start].inverse() @ first) < 0.2
 
 

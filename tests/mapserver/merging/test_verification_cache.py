@@ -1,4 +1,4 @@
-"""What comparing nodes has found outlives the process, and is believed of nodes that are just so alone."""
+"""The verification cache outlives the process, and is used for unchanged nodes only."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_loading_returns_what_was_saved(seed: int, tmp_path: Path) -> None:
         assert list(again.evidence.items()) == list(verdict.evidence.items())
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
     with pytest.raises(InvalidFile, match="other settings"):
-        load(tmp_path / "x", "somebody else")
+        load(tmp_path / "x", "another version")
 
 
 def test_a_restarted_server_compares_nothing_and_merges_the_same(logged: Log, tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_a_damaged_index_is_built_again(
     merger = Merger(None, settings.get(damage))
     with caplog.at_level(logging.INFO):
         VerificationCacheKeeper(tmp_path / "store").restore(merger)
-    assert len(caplog.records) == 1 and "compared anew" in caplog.text
+    assert len(caplog.records) == 1 and "compared again" in caplog.text
     merger.read(logged)
     assert len(merger.merged().components) == 1
     assert merger.counters.verified > 50
@@ -203,7 +203,7 @@ def test_a_server_that_ends_before_it_has_merged_leaves_the_file_as_it_is(
 
 
 def test_a_merge_before_the_store_is_read_keeps_earlier_results(logged: Log, tmp_path: Path) -> None:
-    """Rulings come first: on a busy machine they were merged alone, and all was compared again."""
+    """Manual constraints come first: on a busy machine they were merged alone, and all was compared again."""
     path = saved_once(logged, tmp_path)
     before = path.read_bytes()
     merger, keeper = Merger(), VerificationCacheKeeper(tmp_path / "store")

@@ -117,7 +117,7 @@ def test_unobserved_places_are_no_evidence() -> None:
     answer = asked(nodes, joined(nodes)).answer(VIEW)
     assert answer.certainty is Certainty.AMBIGUOUS
     assert answer.candidates[1].node in {one.id for one in there}
-    # Somebody who looks there and sees other things settles it; one who looks from elsewhere does not.
+    # A view of the same spot with other things decides; a view from elsewhere does not.
     for turn, told in ((0.0, Certainty.FOUND), (0.9, Certainty.AMBIGUOUS)):
         other = taken(19, STOP @ SEEN @ Pose2(0.05, 0.0, turn), AWAY, 30, world=OTHER)
         more = [*nodes, other]
@@ -185,7 +185,7 @@ def test_aliasing_is_cached_and_kept_up_to_date() -> None:
 
     one, twin = nodes[1], nodes[3]
     assert of(one) == {twin.id} and of(one) == {twin.id} and index.asked == 1
-    # Made anew without any change, as nodes that have lost landmarks are: it still holds.
+    # Replaced by an equal node, as nodes that have lost landmarks are: it still holds.
     by_id[twin.id] = replace(twin, landmarks=twin.landmarks.take(np.arange(len(twin.landmarks))))
     assert of(replace(one)) == {twin.id} and index.asked == 1
     # A node that comes later is entered as soon as it is asked about itself.
@@ -194,7 +194,7 @@ def test_aliasing_is_cached_and_kept_up_to_date() -> None:
     index.index.add(late)
     assert of(late, MergedMap.empty()) >= {one.id, twin.id}
     assert of(one) == {twin.id, late.id} and index.asked == 2
-    # What has gone or changed is looked for no longer, or anew.
+    # Removed nodes are not searched, changed ones again.
     del by_id[late.id]
     assert of(one) == {twin.id}
     by_id[twin.id] = replace(twin, stamp_ns=twin.stamp_ns + 1)

@@ -1,4 +1,4 @@
-"""Photographs taken by hand: recognised, told as a place and not as a pose, and as such on the wire."""
+"""Hand-held photographs: recognised, answered as a place and not as a pose, also on the wire."""
 
 from __future__ import annotations
 

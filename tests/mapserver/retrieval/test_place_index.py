@@ -103,7 +103,7 @@ def test_nodes_with_equal_landmarks_cost_no_more_than_others() -> None:
     assert len(index.landmarks) == 3 * MOST_LANDMARKS
     told = index.landmarks.within(nodes[0].landmarks.codes[:10], 0.5)
     assert told is not None and np.bincount(told[0]).max() <= MOST_WITHIN
-    # The first of equals are told: they need not be of every node.
+    # The first of equals are returned: they need not be of every node.
     assert index.overlaps(nodes[2], {}.get).keys() <= {nodes[0].id, nodes[1].id}
     index.remove(nodes[1].id, nodes[1].landmarks.codes)
     assert len(index.landmarks) == 2 * MOST_LANDMARKS

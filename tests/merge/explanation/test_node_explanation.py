@@ -99,7 +99,7 @@ def test_the_misfit_is_the_difference_to_the_merged_poses(merged: MergedMap) -> 
 
 
 def without(merged: MergedMap, left_out: Link | None) -> PoseGaussian:
-    """The relative pose of a link's nodes in a graph that is solved anew without it."""
+    """The relative pose of a link's nodes in a graph that is solved again without it."""
     assert left_out is not None
     measurements = [m for fragment in fragments_of(merged.maps) for m in fragment.measurements]
     measurements += [
@@ -272,7 +272,7 @@ def test_manual_constraints_are_listed() -> None:
     told = explain_nodes(merger.merged(), *link.pair)
     assert told.standing is Standing.UNDONE and told.rulings == (ruling,)
     assert told.probability is not None and told.probability > 0.9, (
-        "a ruling changes nothing of what was seen"
+        "a manual constraint changes no measurement"
     )
     merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
     apart = explain_maps(merger.merged(), A, B)
@@ -299,7 +299,7 @@ def test_a_merge_that_loses_its_support_is_reported() -> None:
 
 
 def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
-    """A server that starts again joins all maps with one merge; it told some links twice."""
+    """A server that starts again joins all maps with one merge; it listed some links twice."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
     merger = Merger()

@@ -63,7 +63,7 @@ def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]
                 stays = 1 - S.goes if before else 1 - S.comes
                 weight *= stays if now == before else 1 - stays
                 weight *= S.hidden if veil else 1 - S.hidden
-                # Who finds by mistake what is gone finds it whatever stands there.
+                # A false detection does not depend on what is there.
                 likely = (0.0 if veil else rate) if now else S.mistaken
                 weight *= likely if seen else 1 - likely
             weights[states[-1]] += weight
@@ -75,7 +75,7 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     """Six landmarks of one thing that all are missed; and one of which nothing is around."""
     together = np.eye(26, dtype=np.bool_)
     together[:6, :6] = True
-    # Neighbours that are found tell how often this view finds what is there.
+    # Detected neighbours measure this view's detection rate.
     together[6:, 6:] = True
 
     def after(misses: int, hits: int = 0, things: np.ndarray = together) -> np.ndarray:
@@ -168,7 +168,7 @@ def test_furniture_that_is_moved_fades_and_comes_back() -> None:
 
 
 def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it() -> None:
-    """The wall behind has stayed, and tells where the robot stands; half of what is there is found."""
+    """The wall behind has stayed, and localizes the robot; half of what is there is found."""
     rng = np.random.default_rng(3)
     world = room(0, 0, 6, 4, 1200, rng)
     wall = np.flatnonzero(world.normals[:, 0] < -0.5)
@@ -197,7 +197,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
 
 
 def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From drive to drive, nodes that others stand for included, as a fader that sees the last map alone."""
+    """From drive to drive, superseded nodes included, as a remover that sees only the last map."""
     rng = np.random.default_rng(4)
     world = room(0, 0, 8, 4, 950, rng)
     thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))

@@ -1,4 +1,4 @@
-"""Nodes that newer ones stand for: only where that is so, and taken back where it no longer is."""
+"""Superseded nodes: only where a newer one covers them, and active again where it no longer does."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_second_drive_supersedes_the_first(drives: Drives, merger: Merger) -
 
 
 def test_nothing_that_could_be_reached_is_cut_off(merger: Merger) -> None:
-    """The graph of the living nodes has the same pieces, by networkx."""
+    """The graph of the active nodes has the same pieces, by networkx."""
     merged = merger.merged()
     roads = Roadmap(merged, 0.5, ReachabilityCache())
     graph: nx.Graph = nx.Graph()
@@ -164,7 +164,7 @@ def test_views_of_one_visit_complete_each_other(drives: Drives) -> None:
 
 
 def test_the_active_nodes_stay_few_over_many_drives(drives: Drives) -> None:
-    """Each drive as the one before, from the same places: the map holds one of them."""
+    """Each drive like the last, from the same places: the map holds one of them."""
     rng = np.random.default_rng(9)
     merger, counts = Merger(), []
     for epoch in range(1, 6):
@@ -183,7 +183,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     merged = merger.merged()
     assert merged.superseded
     assert {node for node in merged.poses if node in merger.index} == living(merged)
-    # Known better, it is judged anew, and superseded again.
+    # Refined, it is judged again, and superseded again.
     old = next(iter(merged.superseded))
     node = merger.node(old)
     assert node is not None
@@ -203,10 +203,10 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
 
 @pytest.mark.parametrize("seed", range(2))
 def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(seed: int) -> None:
-    """Where ways do not matter: each node has a living one that covers it, and none can be spared."""
+    """Where ways do not matter: each node has an active one that covers it, and none can be removed."""
     rng = np.random.default_rng(seed)
     world = room(0, 0, 6, 4, 1200, rng)
-    # Whoever stands in one place gets there: all the room is one.
+    # Nodes at one place reach each other: the whole room is one.
     s = NodeSupersedingSettings(near=100.0, detour=1000.0)
     merger = Merger(settings=MergerSettings(renewal=s))
     for epoch in range(1, 5):

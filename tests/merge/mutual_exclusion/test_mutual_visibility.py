@@ -127,7 +127,7 @@ def test_a_true_merge_has_mean_odds_of_at_most_one(missed: float, spread: float,
 
 
 def chain(share: float = 1.0, n: int = 8) -> PoseGraph:
-    """Two walks, joined by one link at their beginnings: whatever is wrong there is wrong with all."""
+    """Two walks, joined by one link at their beginnings: errors there are common to all."""
     a, b = ([NodeId(agent, 1, k) for k in range(n)] for agent in "ab")
     step = PoseGaussian(Pose2(0.5, 0.0, 0.3), share * np.diag([0.005, 0.005, 0.005]) ** 2)
     across = PoseGaussian(Pose2(0.3, 1.0, 2.0), share * np.diag([0.05, 0.03, 0.04]) ** 2)
@@ -162,7 +162,7 @@ def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
     # The 26 ways of a shell are even: their mean square is a third of that of each component.
     assert np.array_equal(errors.shifts[0], np.zeros((16, 2))) and len(errors.shifts) == 1 + 3 * 26
     full = errors.shifts[-26:] / s.sigmas[-1]
-    # All ways together are about as wide as what they stand for.
+    # All modes together are about as wide as the covariance.
     wide = np.einsum("s,smi,smj->mij", errors.weights, errors.shifts, errors.shifts)
     assert errors.weights.sum() == pytest.approx(1.0)
     assert np.trace(wide, axis1=1, axis2=2) == pytest.approx(
@@ -182,7 +182,7 @@ def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
 
 
 def test_errors_between_maps_have_opposite_signs() -> None:
-    """The floor: if the other is further east for the one, the one is further west for the other."""
+    """The floor: if the second is further east for the first, the first is further west for the second."""
     graph = chain(1e-6)
     observers, others = np.array([0, 8]), np.array([8, 0])
     offsets = graph.means[others, :2] - graph.means[observers, :2]

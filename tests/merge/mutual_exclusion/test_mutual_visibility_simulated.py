@@ -107,7 +107,7 @@ BLIND = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
 
 @pytest.mark.parametrize("seed", range(4))
 def test_twins_should_have_seen_each_other(seed: int) -> None:
-    """Within five minutes, whatever the room: where little of it is free they are seldom in sight."""
+    """Within five minutes, in any room: where little floor is free they rarely see each other."""
     found = Walks("twins", seed, (0, 1), 150).clash(between_twins(seed))
     assert found is not None and found.where and found.evidence > 6.9
     assert f"{found.first} would have seen {found.second} " in found.reason
@@ -116,7 +116,7 @@ def test_twins_should_have_seen_each_other(seed: int) -> None:
 
 
 def with_wakes(walks: Walks, every: int = 5) -> None:
-    """Of each robot's nodes one in five stays; the others become moments of its wake."""
+    """Of each robot's nodes one in five stays; the others become moments of its trajectory segment."""
     kept = []
     for name in ("r0", "r1"):
         nodes = [node for node in walks.nodes if node.id.agent == name]
@@ -134,7 +134,7 @@ def with_wakes(walks: Walks, every: int = 5) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
-    """What nodes alone do not tell, or hardly, their wakes do; the same looks in other hands."""
+    """Nodes alone do not refute the merge, or hardly, segments do; the same scans of another robot."""
     walks = Walks("twins", seed, (0, 1), 150)
     all_nodes = walks.clash(between_twins(seed))
     with_wakes(walks)
@@ -160,7 +160,7 @@ def test_robots_that_are_in_one_room_are_not_refused(kind: str, seed: int) -> No
     """They come as near as they can, with furniture between, and rays that miss them."""
     walks = Walks(kind, seed, (0, 0))
     assert walks.clash() is None
-    # Not even by far: what is seen speaks for the merge. Nor does anything speak where nobody meets.
+    # Not even nearly: the scans are evidence for the merge. There is no evidence where no robots meet.
     loose = ExclusionSettings(doubt=0.9, least_witnesses=1)
     assert walks.clash(settings=loose) is None
     assert walks.clash(moved=20.0, settings=loose) is None

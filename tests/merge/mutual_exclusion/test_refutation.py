@@ -127,7 +127,7 @@ def test_closed_twins_stay_two(seed: int) -> None:
 
 @pytest.mark.parametrize(("clock", "late"), [("", 0.0), ("net", 500.0)])
 def test_without_a_clock_or_at_other_times_there_is_no_evidence(clock: str, late: float) -> None:
-    """A false story that nothing contradicts is believed; once the true one is told as well, neither is."""
+    """A false set without contradiction is kept; with the true one as well, neither is."""
     twins = Twins(1, clock, late)
     merged = merge_maps(twins.maps, twins.false)
     assert pairs(merged.links) == pairs(twins.false)

@@ -92,7 +92,7 @@ def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expect
     assert (set(wrong) == {ids[2]}) is expected
     if expected:
         assert wrong[ids[2]].reason == "map c.1 contradicts a.1 and b.1, which agree: its geometry is wrong"
-        # Nobody can say which of two is wrong; nor is anybody heard whose map is retired.
+        # Which of two is wrong cannot be decided; retired maps do not count.
         assert not finder.wrong(maps, links.__getitem__, (), [ids[0]])
         assert finder.wrong(maps, links.__getitem__, ()).keys() == wrong.keys()
 

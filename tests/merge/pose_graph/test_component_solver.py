@@ -1,4 +1,4 @@
-"""The solver against a batch optimum, whatever links come and go."""
+"""The solver against a batch optimum, while links come and go."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The choice of pairs, change by change, against the choice made anew."""
+"""The choice of pairs, change by change, against a fresh choice."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 
 @pytest.mark.parametrize("seed", range(6))
 def test_it_agrees_with_a_fresh_choice(seed: int) -> None:
-    """Nodes come, go and are known better, edges come and go; all that has changed is told once."""
+    """Nodes and edges come and go, nodes are refined; every change is returned once."""
     rng = np.random.default_rng(seed)
     settings = CandidateSettings(most_per_map=2, least_hops=int(rng.integers(1, 4)))
     nodes = [NodeId("abc"[k % 3], 1, k) for k in range(24)]
