@@ -21,7 +21,7 @@ from rich.table import Table
 
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
-from synthetic.wrong_geometry import ODD, SCENES, Fault, AnswerOutcome, draw_fleet, lost_views, outcome
+from synthetic.wrong_geometry import ODD, SCENES, AnswerOutcome, Fault, draw_fleet, lost_views, outcome
 
 WITHOUT, WITH, UNSEARCHED = "without_the_map", "with_the_map", "rule_off"
 NO_SEARCH: tuple[Switch, ...] = ((WrongGeometrySearch, "wrong", lambda *_: {}),)
