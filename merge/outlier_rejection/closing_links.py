@@ -1,4 +1,4 @@
-"""Pieces of map and sorted groups of links become components with optimised poses."""
+"""Joins pieces of map by sorted groups of links; how far a link is from a solved graph."""
 
 from __future__ import annotations
 
