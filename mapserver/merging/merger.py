@@ -8,7 +8,6 @@ from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId, Node, NodeId
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
