@@ -1,4 +1,4 @@
-"""What a drive was made of: edges driven, nodes skipped, times that the robot had to find itself."""
+"""Statistics of a drive: edges driven, nodes skipped, relocalizations."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class DriveStatistics:
     """Counts of one drive.
 
     Attributes:
-        edges: of the map that were driven: each ends at a node that was reached, or where the robot took up
-            another node ahead.
+        edges: of the map that were driven: each ends at a node that was reached, or where the robot
+            recognised another node ahead.
         skipped: nodes of the route that were left for later ones before they were reached.
-        relocalizations: times that the robot found out where it is, without knowing it before.
-        blocks: times that something was in the way.
+        relocalizations: times that the lost robot was localized.
+        blocks: times that an obstacle was in the way.
     """
 
     edges: int = 0
@@ -27,15 +27,15 @@ class DriveStatistics:
     blocks: int = 0
 
     def passed(self, distances: list[float]) -> DriveStatistics:
-        """After the route's next nodes were passed at these distances, m, and others are driven to."""
+        """After the route's next nodes were passed at these distances, m."""
         reached = sum(distance <= REACHED for distance in distances)
         edges, skipped = self.edges + bool(distances), self.skipped + len(distances) - reached
         return replace(self, edges=edges, skipped=skipped)
 
     def found(self) -> DriveStatistics:
-        """After the robot has found itself once more."""
+        """After one more relocalization."""
         return replace(self, relocalizations=self.relocalizations + 1)
 
     def blocked(self) -> DriveStatistics:
-        """After something was in the way once more."""
+        """After one more block."""
         return replace(self, blocks=self.blocks + 1)

@@ -32,7 +32,7 @@ def decode_mission(payload: bytes) -> Mission:
     """Read an operator's command.
 
     Raises:
-        InvalidMessage: it is none.
+        InvalidMessage: it is not a command.
     """
     message = decode_record(payload)
     name, node = str(message.get("mission", "")), str(message.get("node", ""))
@@ -67,9 +67,9 @@ class FleetClient:
             keys: of the fleet.
             map_id: the map that the agent makes.
             answer_timeout: how long a question may take, s.
-            server: the map server that `server_in_reach` speaks of.
-            unsent: counts the changes that it does not have yet; called from any thread.
-            placed: counts the nodes of the map that are known to lie in the merged map; likewise.
+            server: the map server of `server_in_reach`.
+            unsent: counts the changes that it has not acknowledged; called from any thread.
+            placed: counts the nodes of the map with a merged pose; likewise.
         """
         self._bus = bus
         self._keys = keys
@@ -111,7 +111,7 @@ class FleetClient:
         Args:
             status: of the pipeline.
             stamp_ns: time of the observation that it describes.
-            publish: send it now; else only remember it for who asks.
+            publish: send it now; else only answer questions with it.
         """
         self._status, self._stamp_ns = status, stamp_ns
         if publish:

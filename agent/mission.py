@@ -1,4 +1,4 @@
-"""What an operator wants of a robot, and what the pipeline asks of the fleet: plain values."""
+"""Missions from an operator, and the pipeline's questions to the fleet: plain values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Idle:
 
 @dataclass(frozen=True)
 class Explore:
-    """Map whatever can be reached."""
+    """Map all reachable floor."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class WhichWay:
 
     Attributes:
         number: of the question; the answer repeats it.
-        start: node that the robot knows itself by.
+        start: node by which the robot is localized.
         goal: node where it wants to be.
         start_from_robot: where it is exactly.
         blocked: pairs of nodes between which it could not drive.
@@ -85,7 +85,7 @@ Question = WhereAmI | WhichWay | WhatIsKnown
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What came back.
+    """An answer.
 
     Attributes:
         number: of the question.

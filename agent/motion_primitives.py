@@ -15,10 +15,10 @@ NO_ANSWER = "no answer: is the map server running?"
 
 
 class MotionPrimitives:
-    """Ties behaviours, which read from top to bottom, to observations and answers, which come tick by tick.
+    """Connects behaviours, which are generators, to observations and answers, which come tick by tick.
 
     Attributes:
-        odom_from_robot: where the wheels have brought the robot since the beginning.
+        odom_from_robot: pose by the wheels since the beginning.
         now: simulated or real time since then, s.
         way: driven since then, m, forward or backward.
         turned: turned since then, rad, either way.
@@ -121,10 +121,10 @@ class MotionPrimitives:
             yield Command(speed, 0.0)
 
     def room(self, direction: float) -> float:
-        """How far the robot may move in a direction (rad, 0 ahead), m; 0 where no ranger looks."""
+        """How far the robot may move in a direction (rad, 0 ahead), m; 0 where no ranger points."""
         return clearance(self._description, self.observation.proximity, direction, 0.0)
 
     def freest(self, most: float = math.inf) -> tuple[float, float]:
-        """Room and direction (m, rad) where there is most; from `most` m on, one is as good as another."""
+        """Room and direction (m, rad) of most room; rooms above `most` m count the same."""
         ways = [(min(self.room(bearing), most), bearing) for bearing in self._description.ranger_bearings]
         return max(ways, key=lambda one: one[0], default=(0.0, 0.0))

@@ -1,20 +1,35 @@
-"""What goes into the pipeline and what comes out of a robot: plain values."""
+"""Observations, commands and the description of a robot: plain values."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.limits import NAME_OR_NOTHING, Angle, Share
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.ranges import Ranges
+
+MAX_RANGERS = 256
+FARTHEST = 1e4
+"""No ranger reaches farther, m."""
+FASTEST = 1e3
+"""No robot drives or turns faster, m/s and rad/s."""
+
+Coefficient = Annotated[float, Meta(ge=-1e4, le=1e4)]
+Distortion = tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
+Length = Annotated[float, Meta(ge=1e-3, le=100.0)]
+Reach = Annotated[float, Meta(ge=0.0, le=FARTHEST)]
+Speed = Annotated[float, Meta(ge=0.0, le=FASTEST)]
 
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """What the wheels did since the observation before.
+    """Motion of the wheels since the observation before.
 
     Attributes:
         forward: u1 of the paper, way of the middle of the axle, m.
@@ -35,7 +50,7 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """All that a robot senses in one tick (0.1 s).
+    """A robot's sensor readings of one tick (0.1 s).
 
     Attributes:
         stamp_ns: time of the image.
@@ -78,7 +93,7 @@ class RobotDescription:
         axle: distance between the wheels L, m.
         wheel_noise: standard deviation of a wheel's way, as a share of the way: sigma of the paper.
         side_slip: standard deviation of the slip aside in a step, as a share of the way: two wheels never
-            quite agree, and no encoder sees that.
+            quite agree, and no encoder measures that.
         ranger_bearings: (K,) rad, directions of the proximity sensors, 0 ahead, positive to the left.
         ranger_reach: the rangers' maximum, m.
         ranges_see_robots: whether the rangers are low enough to see other robots of the fleet. Then what they
@@ -91,21 +106,21 @@ class RobotDescription:
     """
 
     camera: Camera
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    radius: float = 0.16
-    axle: float = 0.24
-    wheel_noise: float = 0.02
-    side_slip: float = 0.005
-    ranger_bearings: tuple[float, ...] = ()
-    ranger_reach: float = 0.0
-    max_forward: float = 0.3
-    max_turn: float = 0.8
-    tick: float = 0.1
-    clock: str = ""
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+    radius: Length = 0.16
+    axle: Length = 0.24
+    wheel_noise: Share = 0.02
+    side_slip: Share = 0.005
+    ranger_bearings: Annotated[tuple[Angle, ...], Meta(max_length=MAX_RANGERS)] = ()
+    ranger_reach: Reach = 0.0
+    max_forward: Speed = 0.3
+    max_turn: Speed = 0.8
+    tick: Annotated[float, Meta(ge=1e-4, le=3600.0)] = 0.1
+    clock: Annotated[str, Meta(pattern=NAME_OR_NOTHING)] = ""
     ranges_see_robots: bool = False
 
     def ranges(self, proximity: NDArray[np.float64]) -> Ranges:
-        """What goes with a node of what the rangers read; empty if they are no help to see other robots."""
+        """Ranger readings to store with a node; empty if the rangers cannot see other robots."""
         if not self.ranges_see_robots:
             return Ranges()
         return Ranges.around(proximity, self.ranger_bearings, self.ranger_reach, self.radius)

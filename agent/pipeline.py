@@ -12,22 +12,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from mapweave.agent.drive_statistics import DriveStatistics
-from mapweave.agent.exploration.carried_mapping import CarriedMapping, CarriedMappingSettings
+from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.random_exploration import RandomExploration
-from mapweave.agent.exploration.settings import ExplorerSettings
 from mapweave.agent.global_localization.resumption import Resumption
-from mapweave.agent.global_localization.settings import ResumptionSettings
-from mapweave.agent.mapping.mapper import Mapper, MapperSettings
+from mapweave.agent.mapping.episode import EpisodeRequest
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Answer, Carried, Explore, GoTo, Idle, Mission, Question
-from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
+from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid, OccupancyGridSettings
+from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.ranger_monitor import RangerMonitor
 from mapweave.agent.servo.proximity import guard
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -38,19 +38,6 @@ from mapweave.vision.sift import Sift
 
 IDENTITY = Pose2()
 NOTHING_DRIVEN = DriveStatistics()
-
-
-@dataclass(frozen=True)
-class PipelineSettings:
-    """Settings of the parts."""
-
-    mapper: MapperSettings = field(default_factory=MapperSettings)
-    explorer: ExplorerSettings = field(default_factory=ExplorerSettings)
-    passenger: CarriedMappingSettings = field(default_factory=CarriedMappingSettings)
-    navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
-    resumption: ResumptionSettings = field(default_factory=ResumptionSettings)
-    floor: OccupancyGridSettings = field(default_factory=OccupancyGridSettings)
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -65,12 +52,13 @@ class Status:
         map_from_robot: estimated pose in its own map while mapping.
         finished: whether the mission is complete.
         mission: its name.
-        fix_node: the node that the robot knows itself by while navigating.
+        fix_node: the node by which the robot is localized while navigating.
         node_from_robot: pose in that node's frame.
         legs: nodes on the first route of the drive, beginning and goal included.
-        lost: whether it has given up to find itself on its own map: a fresh map must be begun.
+        lost: whether it has given up localizing on its own map: a new map must be begun.
         astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
-        tally: what the drive was made of so far.
+        located: whether `map_from_robot` comes from this observation.
+        tally: statistics of the drive so far.
     """
 
     doing: str
@@ -85,6 +73,7 @@ class Status:
     legs: int = 0
     lost: bool = False
     astray: bool = False
+    located: bool = False
     tally: DriveStatistics = NOTHING_DRIVEN
 
 
@@ -106,13 +95,13 @@ class Step:
 
 
 class Pipeline:
-    """The robot's mind."""
+    """One robot's pipeline."""
 
     def __init__(
         self,
         map_id: MapId,
         description: RobotDescription,
-        settings: PipelineSettings | None = None,
+        settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
     ) -> None:
@@ -129,13 +118,13 @@ class Pipeline:
         """
         jit.load()  # a robot that drives must not wait for a compiler
         self._map_id = map_id
-        self._settings = settings or PipelineSettings()
+        self._settings = settings or AgentSettings()
         self._description = description
         lens = Lens(description.camera, description.distortion)
         self._lens = lens
-        self._sift = Sift(lens, self._settings.mapper.sift)
-        self._mapper = Mapper(map_id, description, self._settings.mapper, contents, next_number)
-        self._floor = OccupancyGrid(description, self._settings.floor)
+        self._sift = Sift(lens, self._settings.sift)
+        self._mapper = Mapper(map_id, description, self._settings, contents, next_number)
+        self._floor = OccupancyGrid(description, self._settings.occupancy_grid)
         self._rangers = RangerMonitor(description)
         self._mission: Mission = Idle()
         self._explorer: Explorer | None = None
@@ -156,7 +145,7 @@ class Pipeline:
 
     @property
     def lost(self) -> bool:
-        """Whether the robot shall map and has given up to find itself on its own map.
+        """Whether the robot shall map and has given up localizing on its own map.
 
         It stands still then. The caller may begin a new map, in a new pipeline; another `set_mission`
         lets it try again.
@@ -175,12 +164,12 @@ class Pipeline:
             case Explore() if self._explorer is None:
                 self._explorer = self._new_explorer()
             case Carried() if self._passenger is None:
-                self._passenger = CarriedMapping(self._mapper, self._settings.passenger)
+                self._passenger = CarriedMapping(self._mapper)
             case GoTo(goal):
                 self._mapper.lose()
                 self._restart()
                 self._navigator = Navigator(
-                    self._description, self._lens, self._sift, self.map, goal, self._settings.navigator,
+                    self._description, self._lens, self._sift, self.map, goal, self._settings,
                     self._settings.seed,
                 )  # fmt: skip
 
@@ -218,11 +207,11 @@ class Pipeline:
 
     def _new_explorer(self) -> Explorer:
         settings, parts = self._settings, (self._map_id, self._description, self._mapper, self._floor)
-        kind = RandomExploration if settings.explorer.wander else Explorer
-        return kind(*parts, settings.explorer, settings.seed)
+        kind = RandomExploration if settings.exploration.random else Explorer
+        return kind(*parts, settings.exploration, settings.seed)
 
     def _keep_up(self, observation: Observation) -> None:
-        """Let the mapper see; it may find out that the robot was carried off."""
+        """Pass the observation to the mapper; it may detect that the robot was carried off."""
         started = self._mapper.started
         self._mapper.step(observation)
         if started and not self._mapper.started:
@@ -234,19 +223,26 @@ class Pipeline:
             return Command(), []
         if isinstance(self._mission, Carried):
             assert self._passenger is not None
-            self._passenger.step(observation)
-            return Command(), []
+            return self._act(self._passenger, observation), []
         assert self._explorer is not None
         self._floor.see(self._mapper.map_from_robot.mean, observation.proximity)
-        return self._explorer.step(observation, answers)
+        self._explorer.see(observation, answers)
+        return self._act(self._explorer, observation), self._explorer.questions
+
+    def _act(self, behaviour: Explorer | CarriedMapping, observation: Observation) -> Command:
+        """The behaviour's command for this tick; what it asks of the mapper before that is done at once.
+
+        Only here do the views of an episode become nodes. They leave with the step's changes.
+        """
+        while isinstance(move := behaviour.next_move(), EpisodeRequest):
+            self._mapper.meet(move, observation)
+        return move
 
     def _resume(self, observation: Observation) -> Command:
         """Find the robot on its own map; then map on from there."""
         if self._resumption is None:
             drives, settings = isinstance(self._mission, Explore), self._settings
-            self._resumption = Resumption(
-                self._description, self._sift, self.map, drives, settings.resumption, settings.seed
-            )
+            self._resumption = Resumption(self._description, self._sift, self.map, drives, settings.seed)
         command = self._resumption.step(observation, bool(self._blind))
         recognized, odom_from_robot = self._resumption.found, self._resumption.odom_from_robot
         if recognized is None:
@@ -259,13 +255,13 @@ class Pipeline:
         return Command()
 
     def _restart(self) -> None:
-        """The mapper does not know any more where the robot is."""
+        """The mapper has lost the robot's pose."""
         if self.map.nodes:
             if self._explorer is not None:
                 self._explorer.restart()
             return
         # The map may begin anywhere, and all that was found out on the way to it is void.
-        self._floor = OccupancyGrid(self._description, self._settings.floor)
+        self._floor = OccupancyGrid(self._description, self._settings.occupancy_grid)
         if self._explorer is not None:
             self._explorer = self._new_explorer()
 
@@ -307,5 +303,6 @@ class Pipeline:
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
             astray=self._resumption is not None,
+            located=mapping and self._mapper.started and not self._mapper.astray,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )

@@ -1,4 +1,4 @@
-"""What questions are answered from between two merges: one merged map, and who reads it."""
+"""Answers between two merges: one merged map with its relocalizer, router and coverage."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Answers:
 
     @classmethod
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
-        """Answers from a merged map; nodes that are newer, of which `node_of` knows, lie nowhere yet."""
+        """Answers from a merged map; newer nodes, which `node_of` returns, have no merged pose yet."""
         set_apart = [node for map_id in merged.set_apart for node in merger.maps[map_id].nodes]
-        places = ActiveNodes(merger.index, node_of, merged, set_apart)
+        places = ActiveNodes(merger.places, node_of, merged, set_apart)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike)
         return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Coverage(merged))

@@ -14,12 +14,12 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.node import Edge, MapId
 from mapweave.merge.manual_constraints import apply_constraints
-from mapweave.merge.merging import MergeSettings
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import MERGE_AUTHOR, Link, RefusedLink, link_of
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, RefusedPair
 from mapweave.wire.codec import element_of
 
@@ -32,7 +32,7 @@ def map_file_of(merged: MergedMap, history: Iterable[MapEvent] = ()) -> MapFile:
 
     Args:
         merged: the map.
-        history: what has become of its maps by itself.
+        history: events of its maps.
     """
     whole = merged.union()
     probabilities = link_probabilities(merged)
@@ -80,7 +80,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     maps, constraints = maps_of(content), ManualConstraints(content.rulings)
     links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
     try:
-        parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency, s.strain)
+        parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)
         solved = ComponentSolver(parts).solve(links)
     except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
         # The solver raises RuntimeError if a system is singular.

@@ -35,7 +35,7 @@ class PackedMap:
         answer: Callable[[Request, Callable[[], bytes]], None],
         executor: Executor,
     ) -> None:
-        """Begin.
+        """Start.
 
         Args:
             answers: the newest ones. May wait for them.
@@ -77,7 +77,7 @@ class PackedMap:
         if self._packed is not None and self._packed[0]() is merged and self._packed[1] == history:
             return self._packed[2]
         data = pack_map_file(map_file_of(merged, history))
-        # Bytes of a map that has been replaced are let go with it.
+        # Bytes of a map that has been replaced are freed with it.
         self._packed = weakref.ref(merged, self._forget), history, data
         return data
 

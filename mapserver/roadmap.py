@@ -63,7 +63,7 @@ class Roadmap:
             can turn there. And every superseded node is joined with its successor.
         closed: edges that only tie poses.
         poses: of all nodes.
-        living: of the active nodes.
+        active_poses: of the active nodes.
     """
 
     def __init__(self, merged: MergedMap, same_place: float, reaches: ReachabilityCache) -> None:

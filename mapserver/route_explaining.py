@@ -1,4 +1,4 @@
-"""Why a route leads the way it does, and what is missing where there is none."""
+"""Explanations of routes, and of what is missing where there is none."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class _Hindrances:
         if pair in self.blocked:
             return "reported as blocked"
         if pair in self.wary:
-            return f"a robot did not get through of late: {self.wary_cost:g} m dearer"
+            return f"another robot recently could not get through: {self.wary_cost:g} m dearer"
         return ""
 
 
 def explain_route(
     router: Router, start: NodeId, goal: NodeId, blocked: Pairs = (), wary: Pairs = ()
 ) -> RouteExplanation:
-    """Explain a route from node to node, or why there is none: the very route that robots are given there.
+    """Explain a route from node to node, or why there is none: the same route that robots get.
 
     Args:
         router: of the merged map.
@@ -63,7 +63,7 @@ def explain_route(
         wary: as in Router.route.
 
     Raises:
-        InvalidValue: a node that was never there, of those that are blocked too.
+        InvalidValue: an unknown node, also among those that are blocked.
     """
     merged = router.merged
     for end in (start, goal, *(node for pair in blocked for node in pair)):
@@ -93,7 +93,7 @@ def explain_route(
 
 
 def _why(router: Router, route: Route, best: Route, hops: tuple[Hop, ...], gaps: tuple[Hop, ...]) -> str:
-    """Of a way that was found."""
+    """Reason of a route."""
     steps = "1 step" if len(hops) == 1 else f"{len(hops)} steps"
     length = sum(hop.distance for hop in hops)
     reason = f"{steps} over {length:.1f} m, cost {route.cost:.2f} m"
@@ -122,11 +122,11 @@ def _hops(
 def _gaps(
     router: Router, way: Route, poses: Mapping[NodeId, Pose2], hindrances: _Hindrances
 ) -> tuple[Hop, ...]:
-    """Those hops of a way that robots do not drive, or had better not."""
+    """Those hops of a way that robots cannot drive, or should not."""
     roads, out = router.roads, []
     for a, b in pairwise(way.nodes):
         between = [roads.union.edges[key] for key in roads.union.graph.get_edge_data(a, b)]
-        best = min(between, key=lambda e: (edge_cost(e, poses, True, router.settings.route), e.id))
+        best = min(between, key=lambda e: (edge_cost(e, poses, True, router.costs), e.id))
         words = hindrances.words(frozenset((a, b)))
         if words or all(edge.id in roads.closed for edge in between):
             hop = _hop(router, best, a, b, poses, 0.0)
@@ -139,7 +139,7 @@ def _hop(router: Router, edge: Edge, a: NodeId, b: NodeId, poses: Mapping[NodeId
     implied = edge.id.agent in IMPLIED
     kind = edge.id.agent if implied else str(edge.kind)
     words = WORDS[kind] if implied or edge.kind not in RECOGNISED else reach_words(router.merged, edge)
-    cost = edge_cost(edge, poses, True, router.settings.route) + more
+    cost = edge_cost(edge, poses, True, router.costs) + more
     return Hop(a, b, kind, between.distance(Pose2()), between.heading, cost, words)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,22 +30,11 @@ ON_EDGE = 0.25
 """A robot this near to an edge that was driven is on it, m: along it a metre costs a metre, so that it
 need not turn back to the edge's beginning."""
 WARY_COST = 4.0
-"""What it costs to try again where another robot did not get through, m."""
+"""Cost of an edge that another robot could not drive, m."""
 
 
 ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""
-
-
-@dataclass(frozen=True)
-class RouterSettings:
-    """How routes are chosen.
-
-    Attributes:
-        route: what a way costs.
-    """
-
-    route: RouteSettings = field(default_factory=RouteSettings)
 
 
 class Router:
@@ -55,18 +43,18 @@ class Router:
     def __init__(
         self,
         merged: MergedMap,
-        settings: RouterSettings | None = None,
+        costs: RouteSettings | None = None,
         reaches: ReachabilityCache | None = None,
     ) -> None:
         """Take a merged map. Nothing is made of it before the first question.
 
         Args:
             merged: the map.
-            settings: how routes are chosen.
+            costs: what a way costs.
             reaches: cache of reachability from earlier maps; it is filled.
         """
         self.merged = merged
-        self.settings = settings or RouterSettings()
+        self.costs = costs or RouteSettings()
         self._reaches = reaches or ReachabilityCache()
         self._turn = threading.Lock()
         self._made: Roadmap | None = None
@@ -90,8 +78,8 @@ class Router:
         """Find the cheapest way.
 
         Args:
-            start: a node that the robot knows itself by.
-            goal: where it shall be.
+            start: a node by which the robot is localized.
+            goal: the node to reach.
             blocked: pairs of nodes, in either order, between which the robot cannot drive.
             wary: pairs of nodes, in either order, between which another robot did not get through: they are
                 driven only where every other way is much longer.
@@ -142,7 +130,7 @@ class Router:
         """The ways over nodes with these poses; see `route` and mapweave.hybridmap.route.Ways."""
         return Ways(
             self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=blocked,
-            closed=self.roads.closed, settings=self.settings.route, toll=toll,
+            closed=self.roads.closed, settings=self.costs, toll=toll,
         )  # fmt: skip
 
     def _cheapest(
@@ -200,7 +188,7 @@ class Router:
 
     def _saved(self, pose: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
         """By how much it is cheaper to get to a node for a robot that is on an edge to it, m."""
-        _s, roads = self.settings, self.roads
+        roads = self.roads
         target = roads.poses[node]
         goal = np.array([target.x, target.y])
         at = np.array([pose.x, pose.y])

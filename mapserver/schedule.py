@@ -71,11 +71,11 @@ class Schedule(Protocol):
         ...
 
     def start(self) -> None:
-        """Begin. Twice is no error."""
+        """Start. Idempotent."""
         ...
 
     def close(self) -> None:
-        """Finish what was posted, and end. Twice is no error."""
+        """Finish what was posted, and end. Idempotent."""
         ...
 
 
@@ -90,7 +90,7 @@ class LiveSchedule:
     """Threads and the machine's clock."""
 
     def __init__(self) -> None:
-        """Nothing runs yet."""
+        """Prepare; nothing runs yet."""
         self._changed = threading.Condition()
         self._jobs: deque[Job] = deque()
         self._idle: IdleJob | None = None

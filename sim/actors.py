@@ -21,9 +21,9 @@ from mapweave.sim.texture import Image, Texture
 from mapweave.sim.world import Block, PanelSet, block_panels
 
 AHEAD = 0.5
-"""Who walks stops when a robot is nearer than this ahead, m."""
+"""An actor stops when a robot is nearer than this ahead, m."""
 PATIENCE_TICKS = 20
-"""Who had to wait so long turns back."""
+"""After waiting this long an actor turns back, s."""
 GAP = 0.05
 """No actor comes nearer to a robot's side than this, m."""
 TEXELS_PER_METRE = 300
@@ -31,7 +31,7 @@ TEXELS_PER_METRE = 300
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """What moves.
+    """Size of an actor.
 
     Attributes:
         length: along the way, m.

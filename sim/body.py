@@ -29,7 +29,7 @@ CASTER_AT = 0.11
 CASTER_GAP = 5e-5
 """Casters end above the wheels' lowest points, else a robot with small wheels stands on casters alone, m."""
 SLIP_WANDERS = 1.0
-"""Time after which slip has forgotten what it was, s."""
+"""Correlation time of slip, s."""
 EPISODE_TICKS = 10
 """A collision is over when the robot has touched nothing for so long."""
 
@@ -71,7 +71,7 @@ class BodySettings:
             check_range(f"body: {name}", getattr(self, name), low, high)
 
     def wheel_noise(self, tick: float) -> float:
-        """What a calibration drive would give for a wheel's noise, as a share of the way of a tick (s).
+        """A wheel's noise, as a calibration drive would measure it, as a share of the way of a tick (s).
 
         Slip is correlated from tick to tick; over a way it has the effect of so much white noise.
         """
@@ -84,7 +84,7 @@ class Body:
     Attributes:
         number: PyBullet's number of the body.
         bumped: whether the robot touched anything but the floor at the end of the last tick.
-        collisions: how often it has run into something; what comes within a second is the same collision.
+        collisions: number of collisions; contacts within a second are the same collision.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Body:
         """Put a robot on the floor.
 
         Args:
-            physics: where it lives.
+            physics: of the simulation.
             floor: number of the floor's body.
             pose: world_from_robot.
             description: of the robot, nominal; its true wheels and axle differ a little.

@@ -231,7 +231,7 @@ class SimBridge:
             return True
 
     def _announce(self, names: set[str]) -> None:
-        """Remember who knows of the end, or needs to know no more."""
+        """Remember which agents know of the end, or need not know."""
         with self._changed:
             self._announced |= names
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""What a robot's camera is like: intrinsics, lens, shutter, noise; and a few that can be had by name."""
+"""Setup of a robot's camera: intrinsics, lens, shutter, noise; and some named cameras."""
 
 from __future__ import annotations
 

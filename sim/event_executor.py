@@ -1,4 +1,4 @@
-"""Lets events happen to a stage and its robots."""
+"""Executes events on a stage and its robots."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ SPACE = 0.02
 
 
 class EventExecutor:
-    """Knows what every event does. Each event has its own chance, by its number."""
+    """Executes every kind of event. Each event has its own random numbers, by its index."""
 
     def __init__(self, stage: Stage, robots: Mapping[str, SimulatedRobot], seed: int) -> None:
-        """Nothing has happened yet.
+        """Start without events.
 
         Args:
             stage: where things happen.
@@ -40,7 +40,7 @@ class EventExecutor:
         return positions(list(self._robots.values()))
 
     def apply(self, event: SimEvent, tick: int) -> str:
-        """Let an event happen between a tick and the next; returns one line for people.
+        """Execute an event between two ticks; returns one line for people.
 
         Raises:
             InvalidValue: a robot, room or place that is not there, or where nothing fits.

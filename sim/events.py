@@ -1,4 +1,4 @@
-"""What happens to a simulated world and its robots: a table of a scenario file becomes one of these."""
+"""Events of a simulated world and its robots, made from tables of a scenario file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONGEST = 1e6
 class Kidnap:
     """A robot is picked up and put down elsewhere; its encoders do not notice.
 
-    Either `x` and `y` say where, or `near` another robot, or in which `room`: then the place and, if none
+    Either `x` and `y`, or `near` another robot, or a `room` give the place: then the place and, if none
     is given, the heading come from the seed.
 
     Attributes:
@@ -187,7 +187,7 @@ class Fail:
 
     @property
     def size(self) -> float:
-        """The amount, or what is usual."""
+        """The amount, or the default."""
         return WAYS_TO_FAIL[self.sensor][self.how][0] if self.amount is None else self.amount
 
 

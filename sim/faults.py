@@ -12,14 +12,14 @@ from mapweave.sim.events import Fail
 
 
 class Faults:
-    """What is broken of one robot. Healthy sensors pass unchanged."""
+    """Faults of one robot's sensors. Healthy sensors pass unchanged."""
 
     def __init__(self, axle: float, seed: Sequence[int]) -> None:
-        """All is well.
+        """Start without faults.
 
         Args:
             axle: nominal distance of the wheels, m.
-            seed: of readings that are wrong by chance.
+            seed: of random wrong readings.
         """
         self._axle = axle
         self._rng = np.random.default_rng(seed)
@@ -28,7 +28,7 @@ class Faults:
         self._jump = 0.0
 
     def begin(self, fault: Fail, tick: int, ticks: int) -> None:
-        """Break something.
+        """Add a fault.
 
         Args:
             fault: what.
@@ -47,7 +47,7 @@ class Faults:
         return tick <= self._until.get((sensor, how), -1)
 
     def covered(self, tick: int) -> int | None:
-        """Grey of what covers the lens, if anything does."""
+        """Grey of a cover of the lens, if any."""
         if not self.active("camera", "blocked", tick):
             return None
         return round(self._amounts["camera", "blocked"])

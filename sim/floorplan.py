@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Coordinate, Words
 from mapweave.hybridmap.pose import Array, Pose2
 
 CELL = 0.05
@@ -34,15 +35,15 @@ class Rectangle:
         length: along its own x axis, m.
         width: along its own y axis, m.
         heading: of its x axis, rad.
-        name: what it is.
+        name: of the thing.
     """
 
-    x: float
-    y: float
-    length: float
-    width: float
-    heading: float = 0.0
-    name: str = ""
+    x: Coordinate
+    y: Coordinate
+    length: Coordinate
+    width: Coordinate
+    heading: Coordinate = 0.0
+    name: Words = ""
 
     @property
     def corners(self) -> Array:
@@ -168,7 +169,7 @@ class FloorPlan:
         """A reachable pose with any heading, in any room or the given one.
 
         Args:
-            rng: where chance comes from.
+            rng: random numbers.
             radius: what must fit there and along the way there, m.
             room: name of a room.
 

@@ -125,7 +125,7 @@ def rearrange(
         plan: the building.
         movable: indices into its furniture.
         wanted: how many pieces; fewer move where there is no other place for more.
-        rng: where chance comes from.
+        rng: random numbers.
         keep_clear: robots, `world_from_robot`.
         clearance: from the middle of a robot to a piece that moves, m.
 

@@ -74,7 +74,7 @@ class MapweaveEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         render_mode: str | None = None,
         **parameters: Any,
     ) -> None:
-        """Describe what will be seen and done; the world is built by `reset`.
+        """Define the spaces; the world is built by `reset`.
 
         Args:
             kind: of world, see mapweave.sim.worlds.catalog.
@@ -164,7 +164,7 @@ class MapweaveEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         return np.repeat(self._image[..., None], 3, axis=2) if self.render_mode else None
 
     def close(self) -> None:
-        """Let the physics go. Twice is no error."""
+        """Release the physics. Idempotent."""
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None

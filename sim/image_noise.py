@@ -24,7 +24,7 @@ def clouds(rng: np.random.Generator, width_px: int, height_px: int, steepness: f
     """Noise at all scales from the whole picture down to 2 px, deviation about 1.
 
     Args:
-        rng: where chance comes from.
+        rng: random numbers.
         width_px: across.
         height_px: down.
         steepness: 1 has equal power at each scale; larger is softer.

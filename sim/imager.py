@@ -1,4 +1,4 @@
-"""A robot's camera at work: the ideal picture, bent by the lens, blurred, exposed, and noisy."""
+"""Images of a robot's camera: the ideal picture, distorted, blurred, exposed, and noisy."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Imager:
         """Load the camera.
 
         Args:
-            setup: what it is like.
-            background: grey where nothing is.
+            setup: of the robot.
+            background: grey without panels.
             seed: of its noise, its dropped frames, and how it differs from its kind.
         """
         self.setup = setup
@@ -62,7 +62,7 @@ class Imager:
         return math.exp(self._log_gain)
 
     def drops(self) -> bool:
-        """Whether this tick has no frame, by chance. Once a tick."""
+        """Whether this tick's frame is dropped, at random. Call once a tick."""
         return self.setup.dropped > 0.0 and bool(self._drops.random() < self.setup.dropped)
 
     def picture(
@@ -104,7 +104,7 @@ class Imager:
         return image
 
     def _adapt(self, seconds: float) -> None:
-        """Let the automatic move the gain, by the mean of the picture before."""
+        """Update the automatic gain, by the mean of the last picture."""
         if self._mean is None or seconds <= 0.0:
             return
         e = self.setup.exposure

@@ -1,4 +1,4 @@
-"""Who is to be waited for before time advances: a pure object that knows no thread and no clock.
+"""Which robots time waits for: a pure object without threads and clocks.
 
 A robot is *active* from its first step on, until its agent is gone or it keeps the others waiting for too
 long. A tick is due when every active robot has asked for one.

@@ -29,7 +29,7 @@ class Physics:
         return attribute
 
     def close(self) -> None:
-        """Let everything go. Twice is no error."""
+        """Release the physics. Idempotent."""
         if self._client >= 0:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1

@@ -141,7 +141,7 @@ def past(plan: FloorPlan, rng: np.random.Generator, robot: Pose2, radius: float)
 
     Args:
         plan: the building.
-        rng: where chance comes from.
+        rng: random numbers.
         robot: world_from_robot.
         radius: of who shall walk, m.
 

@@ -42,7 +42,7 @@ class Renderer:
 
         Args:
             camera: intrinsics and mount.
-            background: grey where nothing is.
+            background: grey without panels.
         """
         self.camera = camera
         self._background = background

@@ -1,4 +1,4 @@
-"""What a simulated robot is like; made from the tables of a scenario file."""
+"""Setup of a simulated robot, made from the tables of a scenario file."""
 
 from __future__ import annotations
 

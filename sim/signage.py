@@ -17,10 +17,10 @@ def sign(rng: np.random.Generator, width_px: int, height_px: int, text: str) -> 
     """A plate with large letters, an arrow or a pictogram, and small print.
 
     Args:
-        rng: where chance comes from.
+        rng: random numbers.
         width_px: across.
         height_px: down.
-        text: on it; empty for letters and numbers by chance.
+        text: on it; empty for random letters and numbers.
     """
     text = text or "".join([*rng.choice(CAPITALS, 1), *rng.choice(DIGITS, int(rng.integers(2, 4)))])
     dark = rng.random() < 0.5

@@ -23,12 +23,12 @@ class SimulatedRobot:
     """A robot on the stage.
 
     Attributes:
-        setup: what was ordered.
+        setup: of the robot.
         description: the description that its agent gets.
         body: in the physics.
-        rangers: distances at the last call of `look`.
-        faults: what is broken.
-        pose: world_from_robot, true, at the last call of `look`.
+        rangers: distances at the last call of `measure`.
+        faults: of its sensors.
+        pose: world_from_robot, true, at the last call of `measure`.
         image: that it took last; None if the last observation had none.
         render_seconds: wall time that its pictures took.
     """
@@ -37,8 +37,8 @@ class SimulatedRobot:
         """Put a robot on the floor.
 
         Args:
-            setup: what it is like.
-            stage: where it lives.
+            setup: of the robot.
+            stage: of the simulation.
             place: world_from_robot.
             seed: of the simulation, and the robot's number.
         """
@@ -61,7 +61,7 @@ class SimulatedRobot:
         self._frame: Image | None = None
         self._dropped = (-1, False)
 
-    def look(self, tick: int) -> RigidPose:
+    def measure(self, tick: int) -> RigidPose:
         """Read the true pose out of the physics; call after anything that may have moved the robot."""
         self._placement = placement = self.body.position_and_rotation()
         position, rotation = placement

@@ -78,17 +78,17 @@ class Simulation:
         self._remember()
 
     def __enter__(self) -> Simulation:
-        """Nothing more to do: it is built."""
+        """Return self: it is built already."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Let the physics go."""
+        """Release the physics."""
         self.close()
 
     def close(self) -> None:
-        """Let the physics go. Twice is no error."""
+        """Release the physics. Idempotent."""
         self._stage.close()
 
     @property
@@ -144,7 +144,7 @@ class Simulation:
         return self._robot(name).observe(self._stage, self.tick)
 
     def apply(self, event: SimEvent) -> str:
-        """Let something happen now, between two ticks; returns one line for people.
+        """Execute an event between two ticks; returns one line for people.
 
         Raises:
             InvalidValue: a robot or a place that is not there.
@@ -159,7 +159,7 @@ class Simulation:
         self._sense()
 
     def snapshot(self) -> Snapshot:
-        """What there is to see now from above, and the last pictures of the robots."""
+        """The view from above, and the robots' last images."""
         return Snapshot(
             tick=self.tick,
             stamp_ns=self.stamp_ns,
@@ -170,11 +170,11 @@ class Simulation:
         )
 
     def truth(self, name: str) -> Pose2:
-        """Where a robot really is, `world_from_robot`."""
+        """A robot's true pose, `world_from_robot`."""
         return self._robot(name).pose
 
     def truth_at(self, name: str, stamp_ns: int) -> Pose2:
-        """Where a robot really was at a tick.
+        """A robot's true pose at a tick.
 
         Raises:
             InvalidValue: a time that was not simulated.
@@ -191,7 +191,7 @@ class Simulation:
         return np.arange(self.tick + 1, dtype=np.int64) * TICK_NS, np.array(self._log[name])
 
     def collisions(self, name: str) -> int:
-        """How often a robot has run into something."""
+        """Number of a robot's collisions."""
         return self._robot(name).body.collisions
 
     def _robot(self, name: str) -> SimulatedRobot:
@@ -203,7 +203,7 @@ class Simulation:
         """Read poses and rangers of all robots: PyBullet serves one thread at a time."""
         start = time.perf_counter()
         robots = tuple(self._robots.values())
-        self._stage.place_robots([robot.look(self.tick) for robot in robots])
+        self._stage.place_robots([robot.measure(self.tick) for robot in robots])
         rangers.cast(self._stage.physics, [r.rangers for r in robots], [r.pose for r in robots])
         self._wall["rangers"] += time.perf_counter() - start
 

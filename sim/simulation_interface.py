@@ -65,11 +65,11 @@ class Simulated(Protocol):
         ...
 
     def apply(self, event: SimEvent, /) -> str:
-        """Let something happen between two ticks; one line for people."""
+        """Execute an event between two ticks; returns one line for people."""
         ...
 
     def snapshot(self) -> Snapshot:
-        """What there is to see now from above, and the robots' last pictures."""
+        """The view from above, and the robots' last images."""
         ...
 
     def kidnap(self, name: str, world_from_robot: Pose2, /) -> None:
@@ -89,5 +89,5 @@ class Simulated(Protocol):
         ...
 
     def collisions(self, name: str) -> int:
-        """How often a robot has hit something."""
+        """Number of a robot's collisions."""
         ...

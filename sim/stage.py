@@ -30,7 +30,7 @@ class _Cast:
 
     actor: Actor
     number: int
-    looks: PanelSet
+    panels: PanelSet
 
 
 class Stage:
@@ -73,7 +73,7 @@ class Stage:
 
     @property
     def actors(self) -> tuple[Actor, ...]:
-        """Who is there now."""
+        """The actors present now."""
         return tuple(member.actor for member in self._cast)
 
     def place_robots(self, poses: Sequence[RigidPose]) -> None:
@@ -104,7 +104,7 @@ class Stage:
             self._place(number)
 
     def change_light(self, factor: float, tick: int, ticks: int) -> None:
-        """Let all lamps go to a brightness, from a tick on, over some ticks."""
+        """Change all lamps to a brightness, from a tick on, over some ticks."""
         self._light = (self.lamps, factor, tick, tick + ticks)
         if ticks == 0:
             self.lamps = factor
@@ -113,7 +113,7 @@ class Stage:
         """Add an actor.
 
         Args:
-            actor: who.
+            actor: to add.
             seed: of the appearance.
         """
         p, figure = self.physics, actor.figure
@@ -133,7 +133,7 @@ class Stage:
         self.scene = self._assemble()
 
     def close(self) -> None:
-        """Let the physics go. Twice is no error."""
+        """Release the physics. Idempotent."""
         self.physics.close()
 
     def _solid(self, block: Block) -> int:
@@ -143,7 +143,7 @@ class Stage:
         return int(p.createMultiBody(0, shape, -1, place, p.getQuaternionFromEuler(turn)))
 
     def _assemble(self) -> Scene:
-        scene = self.scene = Scene([*self._panels, self._still, *(member.looks for member in self._cast)])
+        scene = self.scene = Scene([*self._panels, self._still, *(member.panels for member in self._cast)])
         self.place_robots(self._poses)
         for number in range(len(self._cast)):
             self._place(number)

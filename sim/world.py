@@ -165,13 +165,13 @@ class World:
     Attributes:
         name: of the world.
         plan: seen from above.
-        blocks: what one can run into.
-        panels: what one can see.
+        blocks: solid for robots and rangers.
+        panels: visible for cameras.
         background: grey where no panel is (the ceiling).
         pieces: one for each of `plan.furniture`, in the same order; empty if unknown, and then nothing can be
             moved.
         start_rooms: names of the rooms in which robots start; by default those called "room ...".
-        look_along: whether robots start looking along the longer side of their room.
+        look_along: whether robots start facing along the longer side of their room.
     """
 
     name: str

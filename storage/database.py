@@ -107,7 +107,7 @@ class Database:
                 raise
 
     def close(self) -> None:
-        """Let go of the file. Twice is no error."""
+        """Close the file. Idempotent."""
         self.connection.close()
 
     def _prepare(self, application_id: int, version: int, schema: str) -> None:

@@ -11,21 +11,20 @@ from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.merging import MergeSettings, merge_maps
+from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.max_clique import best_clique
-from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
-    group_links,
-    loop_distances2,
-)
+from mapweave.merge.outlier_rejection.pairwise_consistency import EXACT, group_links, loop_distances2
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import fragment_by_node
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.settings import ConsistencySettings
 from synthetic.fleet import SyntheticFleet
 from synthetic.gnc import inliers
 
+STRAIN = 25.0
+"""Chi-square with 3 degrees of freedom above which GNC holds a link for wrong."""
 MAPWEAVE = "mapweave"
 """The settings that are the default."""
 Maps = Mapping[MapId, HybridMap]
@@ -37,7 +36,7 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
     fragments = fragments_of(maps)
     by_node = fragment_by_node(fragments)
     used = [link for link in links if link.a in by_node and link.b in by_node]
-    graphs = ComponentSolver(fragments).solve(used, believed=True)
+    graphs = ComponentSolver(fragments).solve(used)
     return MergedMap(
         maps,
         tuple(sorted(used, key=lambda link: link.pair)),
@@ -50,7 +49,7 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
 
 def gnc(maps: Maps, links: Sequence[Link]) -> MergedMap:
     """Graduated non-convexity over all links at once (Yang et al., RA-L 2020)."""
-    return least_squares(maps, inliers(fragments_of(maps), links, MergeSettings().strain))
+    return least_squares(maps, inliers(fragments_of(maps), links, STRAIN))
 
 
 def pcm(maps: Maps, links: Sequence[Link]) -> MergedMap:
@@ -69,7 +68,7 @@ def largest_sets(maps: Maps, links: Sequence[Link]) -> list[Link]:
     out: list[Link] = []
     for (first, second), group in group_links(links, by_node).items():
         agree = loop_distances2(group, by_node[first], by_node[second], s) < s.gate
-        best = best_clique(agree, np.ones(len(group), np.int64), s.exact)
+        best = best_clique(agree, np.ones(len(group), np.int64), EXACT)
         out += [group[k].canonical() for k in best if len(best) >= s.least_links]
     return out
 

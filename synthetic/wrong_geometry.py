@@ -249,7 +249,7 @@ def lost_views(fleet: Fleet, scene: Scene, count: int, seed: int) -> list[tuple[
     return out
 
 
-class Told(StrEnum):
+class AnswerOutcome(StrEnum):
     """What an answer is worth."""
 
     RIGHT = "right"
@@ -258,14 +258,14 @@ class Told(StrEnum):
     UNKNOWN = "unknown"
 
 
-def judged(answers: Answers, view: View, at: Pose2, truth: dict[NodeId, Pose2]) -> Told:
+def judged(answers: Answers, view: View, at: Pose2, truth: dict[NodeId, Pose2]) -> AnswerOutcome:
     """Compare an answer with the truth."""
     answer = answers.relocalizer.answer(view)
     if answer.certainty is not Certainty.FOUND:
-        return Told.AMBIGUOUS if answer.certainty is Certainty.AMBIGUOUS else Told.UNKNOWN
+        return AnswerOutcome.AMBIGUOUS if answer.certainty is Certainty.AMBIGUOUS else AnswerOutcome.UNKNOWN
     best = answer.candidates[0]
     off = (truth[best.node] @ best.node_from_robot.mean).distance(at)
-    return Told.RIGHT if off < RIGHT_M else Told.WRONG
+    return AnswerOutcome.RIGHT if off < RIGHT_M else AnswerOutcome.WRONG
 
 
 def outcome(
@@ -278,4 +278,4 @@ def outcome(
     verdicts = Counter(judged(answers, view, at, fleet.truth) for view, at in views)
     parts = sum(any(node.map != ODD for node in part) for part in merged.components)
     wrong = [verdict.reason for verdict in merged.wrong.values()]
-    return {str(verdict): verdicts[verdict] for verdict in Told} | {"parts": parts, "found": wrong}
+    return {str(verdict): verdicts[verdict] for verdict in AnswerOutcome} | {"parts": parts, "found": wrong}

@@ -16,10 +16,10 @@ from hypothesis import settings
 
 from tests.simulator import INSTALLED, SkipWithoutSimulator
 
-# What these modules assert is told in full, as in tests.
+# Assertions of these modules are rewritten, as in tests.
 pytest.register_assert_rewrite("tests.waiting", "tests.mapweave.command_line", "tests.sim.measured_world")
 
-# How long an example takes says nothing on a machine that does other things as well.
+# The duration of an example means nothing on a busy machine.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 cv2.setNumThreads(1)

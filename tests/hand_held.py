@@ -1,4 +1,4 @@
-"""Nodes as a camera in the hand makes them: tilted, off their height, of a scale that nobody has measured."""
+"""Nodes of a hand-held camera: tilted, off their height, of unknown scale."""
 
 from __future__ import annotations
 

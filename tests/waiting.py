@@ -26,7 +26,7 @@ def eventually(condition: Callable[[], object], seconds: float = PATIENCE) -> No
 
 
 def free_port() -> int:
-    """One of loopback that nobody listens at now."""
+    """A free port of loopback."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION, landmark_tables
+from mapweave.hybridmap.limits import MAX_LANDMARKS
 from mapweave.hybridmap.node import CODE_BYTES, Landmarks
 from mapweave.hybridmap.quantization import (
     FINE_BITS,
@@ -39,7 +40,6 @@ from mapweave.wire.rans import (
     pack_bits,
 )
 
-MAX_LANDMARKS = 2000
 HEAD = struct.Struct("<BBHHHHH")
 """Version, flags, count, least x, reach of x, least y, reach of y."""
 

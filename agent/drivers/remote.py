@@ -51,13 +51,13 @@ def clip(command: Command, description: RobotDescription) -> Command:
 
 
 class RemoteRobot:
-    """The Robot protocol over questions to a base.
+    """A robot base behind Zenoh keys: simulated, or in any language (docs/wire.md).
 
     Each `sense` carries the last command there and the observation back: one question a tick.
     """
 
     def __init__(self, bus: Bus, fleet: str, name: str, patience: float = PATIENCE) -> None:
-        """Nothing is asked yet.
+        """Prepare the client.
 
         Args:
             bus: the connection.

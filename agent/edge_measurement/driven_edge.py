@@ -1,4 +1,4 @@
-"""What was driven is written into the map: an edge between two nodes, known better with every drive.
+"""Driven edges of the map: measured on drives between two nodes, and more precise with every drive.
 
 It is kept beside the other edges between the two nodes and replaces none of them: they were measured by
 other means, and can be checked against each other (docs/decisions/driven-edges.md).
@@ -19,7 +19,7 @@ THERE, BACK, INLIERS = "there", "back", "inliers"
 """Evidence: drives from a to b, drives from b to a, and most visible landmarks at a hand-over in between."""
 
 AGREE = 16.27
-"""Chi-square with 3 degrees of freedom, 99.9 %: drives that differ by more are not of the same two places."""
+"""Chi-square with 3 degrees of freedom, 99.9 %: drives that differ by more are between other places."""
 
 
 def driven_edge(own_map: HybridMap, traverse: Traverse, new_id: Callable[[], EdgeId]) -> Edge:
@@ -32,7 +32,7 @@ def driven_edge(own_map: HybridMap, traverse: Traverse, new_id: Callable[[], Edg
 
     Returns:
         The edge, from the smaller id to the greater: with the id of the earlier one, if these nodes were
-        driven between before. It is to be put.
+        driven between before.
     """
     forth = traverse.start < traverse.end
     a, b = sorted((traverse.start, traverse.end))
@@ -48,7 +48,7 @@ def driven_edge(own_map: HybridMap, traverse: Traverse, new_id: Callable[[], Edg
         evidence = {name: value + earlier_evidence[name] for name, value in evidence.items()}
         evidence[INLIERS] = max(earlier_evidence[INLIERS], float(traverse.landmarks))
     elif drives > 1.0:
-        # The majority counts (Boyer and Moore 1991): a drive that contradicts takes one that agreed away.
+        # The majority counts (Boyer and Moore 1991): a contradicting drive cancels one that agreed.
         a_from_b, evidence = earlier.a_from_b, earlier_evidence
         evidence[THERE if earlier_evidence[THERE] >= earlier_evidence[BACK] else BACK] -= 1.0
     return Edge(earlier.id, a, b, a_from_b, EdgeKind.DRIVEN, evidence=evidence)

@@ -26,14 +26,14 @@ class Judgement(NamedTuple):
 
     Attributes:
         innovations: (m, 2) slopes, measured minus expected.
-        believed: (m,) which of them are accepted.
+        inliers: (m,) which of them are accepted.
         whitening: (2k, 2k) what whitens the innovations of these k (mapweave.agent.ekf.innovations.whiten).
         health: of the filter, by this image.
         reason: what is wrong, in words; empty if nothing is.
     """
 
     innovations: Array
-    believed: Mask
+    inliers: Mask
     whitening: Array
     health: Health = Health.GOOD
     reason: str = ""
@@ -101,7 +101,7 @@ def one_point_consensus(innovations: Array, covariance: Array, gate: float) -> M
     return np.ascontiguousarray(agrees[:, int(np.argmax(np.where(plausible, score, -1.0)))])
 
 
-def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
+def select_inliers(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
     """Which innovations to accept.
 
     If each agrees with all the others, all are accepted. Else those of the one-point consensus, from which
@@ -121,10 +121,10 @@ def believe(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, A
     distances = leave_one_out(innovations, whitening)
     if distances.max() <= gate:
         return np.ones(len(innovations), np.bool_), whitening, _median(distances)
-    return believe_some(innovations, covariance, gate)
+    return remove_outliers(innovations, covariance, gate)
 
 
-def believe_some(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
+def remove_outliers(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
     """The same where some do not agree with all the others."""
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:

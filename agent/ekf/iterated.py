@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.ekf.gating import believe
+from mapweave.agent.ekf.gating import select_inliers
 from mapweave.agent.ekf.innovations import whiten
 from mapweave.agent.ekf.inverse_depth import project_anchored
 from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState
@@ -88,7 +88,7 @@ def iterated_update(
         innovations = measured.slopes - projected.rays[:, :2] - back
         if first is None:
             first = innovations
-            accepted, whitening, _ = believe(innovations, spread, measured.gate)
+            accepted, whitening, _ = select_inliers(innovations, spread, measured.gate)
             if not accepted.any():
                 return Fit(state, accepted, first, float("nan"))
         else:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from mapweave.agent.ekf.innovations import Examined, examine
 from mapweave.agent.ekf.landmark_estimates import Ids
-from mapweave.agent.ekf.mapping_state import MappingState, Step
-from mapweave.agent.ekf.settings import FilterSettings
+from mapweave.agent.ekf.mapping_state import LEAST_AGREEING, MappingState, Step
 from mapweave.agent.ekf.update_report import Health, UpdateReport
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 
@@ -94,15 +94,15 @@ class ImageMeasurement(NamedTuple):
         Returns:
             The step, linearised where it seems to have gone, and what came out.
         """
-        if step is not None and settings.relinearisations and len(self.slots) >= settings.least_agreeing:
+        if step is not None and settings.relinearisations and len(self.slots) >= LEAST_AGREEING:
             return step.glanced(self.slots, self.slopes, variances, settings.slip_sigmas)
         expected = settled if step is None else step.state
         return step, examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)
 
     def report(
-        self, believed: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
+        self, inliers: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
     ) -> UpdateReport:
-        """Report of an update: believed (m,), innovations (m, 2) slopes measured minus expected."""
+        """Report of an update: inliers (m,), innovations (m, 2) slopes measured minus expected."""
         accepted, innovations_px = np.zeros(len(self.ids), np.bool_), np.full((len(self.ids), 2), np.nan)
-        accepted[self.rows], innovations_px[self.rows] = believed, innovations * self.focal
+        accepted[self.rows], innovations_px[self.rows] = inliers, innovations * self.focal
         return UpdateReport(self.ids, accepted, innovations_px, mean_nis, health, reason)

@@ -11,22 +11,22 @@ from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import KnownAnswer
 
 NUMBER = -1
-"""Of every question: only the newest answer counts. The navigator's questions are positive."""
+"""Number of every question: only the newest answer counts. The navigator's numbers are positive."""
 
 
 class FleetCoverage:
-    """Others' views, in this robot's own map: none without a server, or before the maps are joined.
+    """Views of others, in this robot's own map: none without a server, or before the maps are joined.
 
     Attributes:
         views: (N, 4) [x m, y m, heading rad, semi-aperture rad], in map.
     """
 
     def __init__(self, map_id: MapId, reach: float) -> None:
-        """Know nothing.
+        """Start without views.
 
         Args:
             map_id: the robot's own map.
-            reach: how far around it is asked, m.
+            reach: radius of the questions, m.
         """
         self.views: Array = np.zeros((0, 4))
         self._map = map_id
@@ -39,7 +39,7 @@ class FleetCoverage:
     def take(self, answer: Answer) -> None:
         """Take an answer. A missing answer leaves the earlier coverage as it is."""
         if isinstance(answer.content, KnownAnswer):
-            self.views = answer.content.views
+            self.views = answer.content.views.astype(np.float64)
 
     def places(self, views: Array, reach: float, covered_share: float) -> Array:
         """Places that others have covered, so that this robot need not: (M, 2) m, in map.

@@ -1,4 +1,4 @@
-"""Exploration as in the paper: by chance."""
+"""Random exploration, as in the paper."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from collections.abc import Iterator
 import numpy as np
 
 from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.observation import Command
+from mapweave.agent.mapping.episode import Move
 
 SHORTEST = 0.3
 """m; with less room ahead the robot turns on."""
 
 
 class RandomExploration(Explorer):
-    """Maps a view, turns to a side that chance chooses, and again (paper, section 4.1).
+    """Maps a view, turns to a random side, and repeats (paper, section 4.1).
 
-    The paper leaves open how the robot gets on, and turning on the spot it never would. Here it drives
-    straight on after each turn, for a way that chance chooses out of the room that there is.
+    The paper does not say how the robot moves on from a place. Here it drives straight on after each turn,
+    for a random part of the free room.
     """
 
-    def _explore(self) -> Iterator[Command]:
+    def _explore(self) -> Iterator[Move]:
         yield from self._moves.begin()
         while True:
             yield from self._moves.map_view()

@@ -7,19 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.exploration.settings import REACH, SPACING, ExplorerSettings
 from mapweave.agent.occupancy_grid import DistanceField, OccupancyGrid
+from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.pose import Array
 
 VIEW_RADIUS = 1.6
 """What lies around a place, and what others know around theirs, is judged within this radius, m."""
-VIEW = 3.0
-"""A full turn shows floor up to this far, m."""
-SCAN_TIME = 60.0
-"""Duration of a full turn, about, s."""
-LEAST_AREA = 1.0
-"""New floor that is worth one, m^2."""
 
 
 DIRECTIONS = 36
@@ -50,6 +44,12 @@ def seen_around(views: Array, position: Array, reach: float) -> float:
     directions = np.arange(DIRECTIONS) * math.tau / DIRECTIONS
     off = np.abs(np.angle(np.exp(1j * (directions[:, None] - nearby[:, 2]))))
     return float((off <= nearby[:, 3]).any(axis=1).mean())
+
+
+SPACING = 1.7
+"""Places are at least this far from each other, m."""
+REACH = 7.0
+"""The longest way to a next place, m."""
 
 
 def next_viewpoint(
@@ -85,6 +85,14 @@ def next_viewpoint(
     return []
 
 
+VIEW = 3.0
+"""A full turn shows floor up to this far, m."""
+SCAN_TIME = 60.0
+"""How long a full turn takes, about, s."""
+LEAST_AREA = 1.0
+"""New floor that is worth a full turn, m^2."""
+
+
 def _new_area(
     floor: OccupancyGrid,
     ways: DistanceField,
@@ -118,7 +126,7 @@ def _closer_view(
     covered: Array,
     settings: ExplorerSettings,
 ) -> list[Array]:
-    """The way to where most around is unknown, visible or not; the arguments are those of `_new_floor`."""
+    """The way to where most around is unknown, visible or not; the arguments are those of `_new_area`."""
     unknown = floor.unknown_around(VIEW_RADIUS, covered)[ways.cells[free, 0], ways.cells[free, 1]]
     worth = unknown - 0.04 * ways.lengths[free]
     worth[unknown < 0.02] = -math.inf

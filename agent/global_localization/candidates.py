@@ -45,8 +45,8 @@ class Candidate:
     Attributes:
         node: of any robot's map.
         node_from_robot: pose.
-        recognized: how the own map knows it; None if the fleet does.
-        distance_known: False if how far the node is away is not known (a photograph of unknown scale).
+        recognized: the recognition on the own map; None for a candidate of the fleet.
+        distance_known: False if the distance to the node is unknown (a photograph of unknown scale).
     """
 
     node: NodeId
@@ -104,7 +104,7 @@ class FleetMap:
         self._silent_until = 0.0
 
     def candidates(self, view: View) -> Generator[Command, None, Candidates]:
-        """Where a view was taken, as the fleet knows it; who does not answer is not asked at each view."""
+        """Where a view was taken, by the fleet's map; a silent fleet is not asked at each view."""
         if self._motion.now < self._silent_until:
             return Candidates((), "", NO_ANSWER)
         answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view))

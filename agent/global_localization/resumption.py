@@ -1,4 +1,4 @@
-"""Taking up a map again: global localization on the own map alone, tick by tick, for a robot that maps."""
+"""Resumption of a map: global localization on the own map alone, tick by tick, for a robot that maps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from mapweave.agent.global_localization.candidates import OwnMap, RecognizedNode
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
-from mapweave.agent.global_localization.settings import GlobalLocalizationSettings, ResumptionSettings
+from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolicy
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -16,11 +16,11 @@ from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.vision.sift import Sift
 
 REMEMBERED = 600
-"""Readings of the rangers that are kept for the floor, the latest."""
+"""Readings of the rangers that are kept for the grid, the latest."""
 
 
 class Resumption:
-    """Finds a robot on its own map: one that was started again, has navigated, or was carried off.
+    """Localizes a robot on its own map after a restart, after navigation, or after a kidnapping.
 
     Attributes:
         found: the place that was recognised in the last observation; None until then.
@@ -35,8 +35,8 @@ class Resumption:
         sift: Sift,
         own_map: HybridMap,
         drives: bool,
-        settings: GlobalLocalizationSettings | None = None,
         seed: int = 0,
+        policy: SearchPolicy | None = None,
     ) -> None:
         """Start the search.
 
@@ -45,16 +45,16 @@ class Resumption:
             sift: features of an image.
             own_map: with at least one node.
             drives: whether it may turn and drive by itself.
-            settings: how hard it tries.
             seed: of the recognition's random samples.
+            policy: how hard it tries; `TO_MAP` without.
         """
         self.found: RecognizedNode | None = None
         self.lost = False
         self.seen: deque[tuple[Pose2, Array]] = deque(maxlen=REMEMBERED)
         self._motion = MotionPrimitives(description)
         self._localization = GlobalLocalization(
-            description, sift, self._motion, OwnMap(own_map, np.random.default_rng(seed)), None,
-            settings or ResumptionSettings(),
+            description, sift, self._motion, OwnMap(own_map, np.random.default_rng(seed)),
+            policy or TO_MAP,
         )  # fmt: skip
         self._behaviour = self._find(drives)
 

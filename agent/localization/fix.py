@@ -1,4 +1,4 @@
-"""Where the robot is with respect to a node of the map, kept up while it moves."""
+"""The robot's pose with respect to a node of the map, updated while it moves."""
 
 from __future__ import annotations
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.ekf.localization_filter import LocalizationFilter, LocalizationSettings
+from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.node_tracks import NodeTracks
-from mapweave.agent.vision.tracker import TrackerSettings
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.registration.recognition import Recognition
@@ -20,20 +18,7 @@ from mapweave.vision.sift import Features
 LEAST = 4
 """Landmarks that must be tracked (paper, section 6: n >= 4)."""
 STRIKES = 3
-"""A track that the filter refuses this often in a row is given up."""
-
-
-@dataclass(frozen=True)
-class NodeLocalizerSettings:
-    """When a node's landmarks count as visible.
-
-    Attributes:
-        tracker: tracks of the node's landmarks.
-        filter: the localization EKF.
-    """
-
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    filter: LocalizationSettings = field(default_factory=LocalizationSettings)
+"""A track that the filter rejects this often in a row is dropped."""
 
 
 class NodeLocalizer:
@@ -51,11 +36,11 @@ class NodeLocalizer:
         image: NDArray[np.uint8],
         features: Features,
         recognition: Recognition,
-        settings: NodeLocalizerSettings | None = None,
+        settings: AgentSettings | None = None,
     ) -> None:
         """Start from a recognition of the node in an image's features."""
         self.node = node
-        self._settings = s = settings or NodeLocalizerSettings()
+        self._settings = s = settings or AgentSettings()
         self._description = description
         self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, STRIKES)
         self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
@@ -79,25 +64,25 @@ class NodeLocalizer:
 
     @property
     def in_sight(self) -> bool:
-        """Whether enough landmarks are tracked and the filter trusts itself."""
+        """Whether enough landmarks are tracked and the filter is healthy."""
         return len(self._tracks.ids) >= LEAST and self._filter.healthy
 
     def restart(self, pose: PoseGaussian) -> None:
         """Restart at a pose that is known better than by the tracks so far.
 
-        By the same landmarks: so from then on they learn nothing from where the robot is.
+        The pose comes from the same landmarks, so from then on their depths do not learn from it.
         """
         self._note(np.ones(len(self._filter.ids), np.bool_))
         self._teaches = False
         self._filter = self._filter_at(pose, self._tracks.ids)
 
     def depths(self) -> tuple[Array, Array]:
-        """What the filter knows of the depths of all landmarks that were followed until they left the view.
+        """Depths of all landmarks that were tracked until they left the view.
 
         Returns:
-            (N,) m, and standard deviations (N,) m by which they may be kept one by one, see
+            (N,) m, and standard deviations (N,) m as of independent errors, see
             LocalizationState.depths; in the order of the node's landmarks, NaN for those that were not
-            followed, or given up.
+            tracked, or dropped.
         """
         self._note(np.ones(len(self._filter.ids), np.bool_))
         return self._depths.copy(), self._depth_sigmas.copy()
@@ -110,7 +95,7 @@ class NodeLocalizer:
             self._depths[ids], self._depth_sigmas[ids] = depths[which], sigmas[which]
 
     def step(self, observation: Observation) -> None:
-        """One tick: predict by the wheels, follow the landmarks, correct."""
+        """One tick: predict by the wheels, track the landmarks, update."""
         self._filter.predict(observation.odometry)
         if observation.image is None:
             return
@@ -138,7 +123,8 @@ class NodeLocalizer:
             node.points_in_robot[landmarks],
             node.landmarks.covariances_in_robot(node.camera, scale_share=scale_share)[landmarks],
             scale_share,
-            settings=replace(self._settings.filter, side_slip=description.side_slip),
+            settings=self._settings.filter,
+            side_slip=description.side_slip,
         )
 
     def _expected(self) -> Array:

@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.node import NodeId
 
 Pair = tuple[NodeId, NodeId]
 
 
-@dataclass(frozen=True)
-class BlockedEdgeSettings:
-    """How long a block is remembered.
-
-    Attributes:
-        forget: after the first time, s: people walk on.
-        longest: each further time it is remembered twice as long, up to this, s: walls stay.
-    """
-
-    forget: float = 15.0
-    longest: float = 120.0
-
-
 class BlockedEdges:
-    """What was in the way, in the order in which it was met last."""
+    """Blocked pairs, in the order of their last block."""
 
-    def __init__(self, settings: BlockedEdgeSettings | None = None) -> None:
+    def __init__(self, settings: NavigatorSettings | None = None) -> None:
         """Nothing is in the way."""
-        self._settings = settings or BlockedEdgeSettings()
+        self._settings = settings or NavigatorSettings()
         self._until: dict[Pair, float] = {}
         self._times: dict[Pair, int] = {}
 
     def add(self, a: NodeId, b: NodeId, now: float) -> None:
-        """The robot could not get from one node to the other, nor would it the other way round.
+        """Add a pair between which the robot could not drive, in either direction.
 
         Args:
             a: one node.
@@ -42,12 +28,14 @@ class BlockedEdges:
         pair = (a, b) if a <= b else (b, a)
         times = self._times[pair] = self._times.get(pair, 0) + 1
         self._until.pop(pair, None)
-        self._until[pair] = now + min(self._settings.forget * 2.0 ** (times - 1), self._settings.longest)
+        self._until[pair] = now + min(
+            self._settings.blocked_first * 2.0 ** (times - 1), self._settings.blocked_longest
+        )
 
     def at(self, now: float) -> tuple[Pair, ...]:
         """Pairs that count as blocked at a time, s."""
         return tuple(pair for pair, until in self._until.items() if now < until)
 
     def next_change(self, now: float) -> float:
-        """Seconds until something is forgotten; 0 if nothing is blocked."""
+        """Seconds until a block is forgotten; 0 without blocks."""
         return min((until - now for until in self._until.values() if now < until), default=0.0)

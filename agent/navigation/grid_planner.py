@@ -1,4 +1,4 @@
-"""Ways over a local grid that keep away from things: short where there is room, in the middle where not."""
+"""Paths over a local grid with clearance: short where there is room, in the middle where it is narrow."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ _LENGTHS = np.hypot(*_STEPS.T)
 class GridPlanner:
     """The cheapest ways from one cell to all others.
 
-    A cell costs its width, and up to four times that where there is less room than is wished. Into a cell
-    with less room than the least, the robot may go only from one with less still: it may leave a place that
-    is too tight.
+    A cell costs its width, and up to four times that where the clearance is less than wished. A cell with
+    less clearance than the least may only be entered from one with less still: so the robot can leave a place
+    that is too tight.
 
     Attributes:
         costs: (R, C) in cells; infinite where there is no way.
     """
 
     def __init__(self, room: Array, first: tuple[int, int], least: float, wished: float) -> None:
-        """Find them, all cells at once, in as many sweeps as the longest way has cells.
+        """Compute them, all cells at once, in as many sweeps as the longest way has cells.
 
         Args:
             room: (R, C) m, distance of each cell from the nearest thing.
             first: row and column.
-            least: m, room that a way needs.
-            wished: m, room above which more is worth nothing.
+            least: m, clearance that a way needs.
+            wished: m, clearance above which more has no value.
         """
         self._room, self._least = room, least
         lack = np.clip((wished - room) / (wished - least), 0.0, 1.0)

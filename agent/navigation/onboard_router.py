@@ -1,4 +1,4 @@
-"""A way through the robot's own map, for when no map server answers."""
+"""Routes on the robot's own map, used when no map server answers."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def onboard_route(
     goal: NodeId,
     blocked: Collection[tuple[NodeId, NodeId]] = (),
 ) -> RouteAnswer:
-    """Find the cheapest way between two nodes of the own map.
+    """Find the cheapest route between two nodes of the own map.
 
-    Relative poses are those of the edges: nothing is optimised here, so a long way is as exact as its
+    Relative poses are those of the edges: nothing is optimised here, so a long route is as precise as its
     hops together.
 
     Args:
         own_map: of this robot.
-        start: node that the robot knows itself by.
-        goal: where it shall be.
+        start: node by which the robot is localized.
+        goal: the node to reach.
         blocked: pairs of nodes, in either order, between which the robot cannot drive.
     """
     route = find_route(own_map, start, goal, blocked=blocked, closed=closed_edges(own_map))

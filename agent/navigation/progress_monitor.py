@@ -1,4 +1,4 @@
-"""Whether the robot gets any nearer to where it wants to be."""
+"""Whether the robot gets nearer to its target."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass
 class ProgressMonitor:
-    """How near the robot has come, and how long ago that was.
+    """The least distance to the target, and its age.
 
     Attributes:
         step: m, nearer by this counts.

@@ -280,7 +280,7 @@ class Journal:
                 return dropped.rowcount
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with self._lock:
             self._database.close()
 

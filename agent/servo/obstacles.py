@@ -14,7 +14,7 @@ class ObstacleMemory:
     """Obstacle points in one fixed frame, one a cell, forgotten after a while."""
 
     def __init__(self, cell: float = 0.05, life_ticks: int = 600, most: int = 400) -> None:
-        """Begin with nothing.
+        """Start with no map.
 
         Args:
             cell: m, two points in one square of this size are one.

@@ -16,15 +16,6 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Array
 
-HALF_PX = 7
-"""A patch reaches this far from its point in each direction."""
-SIGMA_PX = 4.0
-"""Of the Gaussian by which pixels far from the point count less: they are on another surface, or on a
-slanted one, more often than those near it."""
-MOST_SCALE = 1.7
-"""Once a patch has grown or shrunk by more than this it is cut again from the present image."""
-
-
 Floats = NDArray[np.float32]
 
 FAINT = 0.5
@@ -35,7 +26,7 @@ RIDGE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class TemplateSettings:
+class TemplateCriteria:
     """How tracks are held to the patches in which they were first seen.
 
     Attributes:
@@ -54,26 +45,26 @@ class Templates:
     """N patches in columns. Values: nothing in them is ever changed.
 
     Attributes:
-        looks: (N, P) grey, of mean 0 and deviation 1 by the pixels' weights.
+        patches: (N, P) grey, of mean 0 and deviation 1 by the pixels' weights.
         slopes: (N, 3, P) weighted derivative of the patch by (shift right px, shift down px, growth), without
             what brightness and contrast could do as well.
         solve: (N, 3, 3) inverse of the normal equations of these.
         scales: (N,) how large the patch is now, 1 as it was cut.
     """
 
-    looks: Floats
+    patches: Floats
     slopes: Floats
     solve: Floats
     scales: Floats
 
     def __len__(self) -> int:
         """How many."""
-        return len(self.looks)
+        return len(self.patches)
 
     @property
     def columns(self) -> tuple[Floats, Floats, Floats, Floats]:
         """Patches, slopes, solve and scales."""
-        return self.looks, self.slopes, self.solve, self.scales
+        return self.patches, self.slopes, self.solve, self.scales
 
     def chosen(self, which: NDArray[np.bool_]) -> Templates:
         """Those that a (N,) mask selects."""
@@ -102,12 +93,21 @@ class Match:
     templates: Templates
 
 
+HALF_PX = 7
+"""A patch reaches this far from its point in each direction, px."""
+SIGMA_PX = 4.0
+"""Standard deviation of the Gaussian by which pixels far from the point count less, px: they are on another
+surface, or on a slanted one, more often than those near it."""
+MOST_SCALE = 1.7
+"""Once a patch has grown or shrunk by more than this factor it is cut anew from the present image."""
+
+
 class TemplateMatcher:
     """Cuts patches and finds them again, moved, grown and lit differently."""
 
-    def __init__(self, settings: TemplateSettings | None = None) -> None:
+    def __init__(self, settings: TemplateCriteria | None = None) -> None:
         """Lay out the patch."""
-        self._settings = settings or TemplateSettings()
+        self._settings = settings or TemplateCriteria()
         side = np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32)
         self._spots = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
         weights = np.exp(-(self._spots**2).sum(axis=1) / (2 * SIGMA_PX**2))
@@ -135,20 +135,20 @@ class TemplateMatcher:
         grey = image.astype(np.float32)
         at, scales = raw.astype(np.float32), templates.scales.copy()
         for _ in range(s.iterations):
-            off = self._normalised(self._sampled(grey, at, scales))[0] - templates.looks
+            off = self._normalised(self._sampled(grey, at, scales))[0] - templates.patches
             step = np.einsum("nij,nj->ni", templates.solve, np.einsum("nip,np->ni", templates.slopes, off))
             # Inverse composition: the step moves the patch as it was cut, and is undone on the present one.
             scales = scales / np.clip(1.0 + step[:, 2], 0.5, 2.0)
             at = at - scales[:, None] * step[:, :2]
-        looks, _ = self._normalised(self._sampled(grey, at, scales))
-        correlation = np.einsum("np,np,p->n", looks, templates.looks, self._weights)
+        patches, _ = self._normalised(self._sampled(grey, at, scales))
+        correlation = np.einsum("np,np,p->n", patches, templates.patches, self._weights)
         held = correlation >= s.least_correlation
         held &= np.linalg.norm(at - raw, axis=1) <= s.agree_px
         reach = (HALF_PX * scales)[:, None]
         held &= ((at >= reach) & (at <= np.array(image.shape[::-1], np.float32) - 1 - reach)).all(axis=1)
         found = np.where(held[:, None], at.astype(np.float64), raw)
         scales = np.where(held, scales, templates.scales)
-        now = Templates(templates.looks, templates.slopes, templates.solve, scales)
+        now = Templates(templates.patches, templates.slopes, templates.solve, scales)
         return Match(found, held, self._renewed(now, held, grey, found))
 
     def _renewed(self, templates: Templates, held: NDArray[np.bool_], grey: Floats, raw: Array) -> Templates:
@@ -166,7 +166,7 @@ class TemplateMatcher:
 
     def _cut(self, grey: Floats, raw: Array) -> Templates:
         at, ones = raw.astype(np.float32).reshape(-1, 2), np.ones(len(raw), np.float32)
-        looks, spread = self._normalised(self._sampled(grey, at, ones))
+        patches, spread = self._normalised(self._sampled(grey, at, ones))
         right, down = (
             (self._sampled(grey, at + half, ones) - self._sampled(grey, at - half, ones)) / spread
             for half in (np.array([0.5, 0.0], np.float32), np.array([0.0, 0.5], np.float32))
@@ -175,11 +175,11 @@ class TemplateMatcher:
         slopes = np.stack([right, down, growth], axis=1)
         # A change along 1 or along the patch itself is one of brightness or contrast, and no motion.
         slopes = slopes - np.einsum("nip,p->ni", slopes, self._weights)[..., None]
-        alike = np.einsum("nip,np,p->ni", slopes, looks, self._weights)
-        slopes = slopes - alike[..., None] * looks[:, None]
+        alike = np.einsum("nip,np,p->ni", slopes, patches, self._weights)
+        slopes = slopes - alike[..., None] * patches[:, None]
         weighted = slopes * self._weights
         normal = np.einsum("nip,njp->nij", weighted, slopes) + RIDGE * np.eye(3, dtype=np.float32)
-        return Templates(looks, weighted, np.linalg.inv(normal).astype(np.float32), ones)
+        return Templates(patches, weighted, np.linalg.inv(normal).astype(np.float32), ones)
 
     def _sampled(self, grey: Floats, at: Floats, scales: Floats) -> Floats:
         """(N, P) grey levels of the patches around points, bilinear; beyond the border that of the border."""

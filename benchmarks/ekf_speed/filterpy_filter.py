@@ -2,7 +2,7 @@
 
 State [x, y, heading, (a, b, w) of each landmark] as in mapweave.agent.ekf.mapping_state, as a user of
 FilterPy would write it: dense F, Q and H in numpy, all landmarks at once, no gates, no step linearised
-twice. The formulas are written here anew and share no code with mapweave.agent.ekf.
+twice. The formulas are written here again and share no code with mapweave.agent.ekf.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python -m benchmarks.ekf_variants [--runs N] [--steps N] [--seed N] [--jobs N] [--json]
 
 Every filter gets the same runs as in benchmarks.ekf: 50 s at 10 Hz in four shapes, 30 landmarks, wheels that
-slip, no wrong tracks. Its error is told as a ratio to that of the batch optimum. NEES (3 degrees of freedom,
+slip, no wrong tracks. Its error is given as a ratio to that of the batch optimum. NEES (3 degrees of freedom,
 of the pose and of a landmark in the filter's own coordinates) is averaged over the runs that have not
 diverged: to diverge is to be ten times as far off as the optimum, or to end without a number.
 """
@@ -27,7 +27,8 @@ from scipy.stats import chi2
 from benchmarks.ekf_speed.benchmark import one_thread
 from benchmarks.ekf_variants.coordinates import Points, Rays
 from benchmarks.ekf_variants.textbook import Choice, TextbookFilter
-from mapweave.agent.ekf.mapping_filter import FilterSettings
+from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
+from mapweave.agent.settings import FilterSettings
 from synthetic.mapping_error import error, filter_error, follow, landmark_nees
 from synthetic.mapping_optimum import batch_optimum
 from synthetic.mapping_run import SHAPES, MappingRun, draw_run
@@ -98,8 +99,7 @@ def try_ours(run: MappingRun, relinearisations: int, best: float) -> Outcome:
 def try_run(seed: int, trial: int, steps: int) -> dict[str, Outcome]:
     """All filters on one run."""
     run = draw_run(np.random.default_rng([seed, trial]), SHAPES[trial % len(SHAPES)], steps)
-    prior = FilterSettings()
-    pose_vector, points = batch_optimum(run, prior.prior_depth, prior.prior_spread)
+    pose_vector, points = batch_optimum(run, PRIOR_DEPTH, PRIOR_SPREAD)
     best = error(run, np.arange(len(run.points)), pose_vector, points)
     outcomes = {name: try_textbook(run, choice, best) for name, choice in TEXTBOOK.items()}
     return outcomes | {name: try_ours(run, again, best) for name, again in OURS.items()}
@@ -142,8 +142,8 @@ def main() -> None:
     table = Table("filter", "median", "p90", "pose", "marks", "diverged", title=title)
     table.caption = "error over the optimum's: median, p90; NEES: pose, landmarks"
     for name, row in figures.items():
-        told = [f"{row[key]:.3g}" if row[key] >= 10 else f"{row[key]:.2f}" for key in list(row)[:4]]
-        table.add_row(name, *told, f"{100 * row['diverged']:.0f} %")
+        cells = [f"{row[key]:.3g}" if row[key] >= 10 else f"{row[key]:.2f}" for key in list(row)[:4]]
+        table.add_row(name, *cells, f"{100 * row['diverged']:.0f} %")
     console.print(table)
     if arguments.json:
         keys = next(iter(figures.values()))

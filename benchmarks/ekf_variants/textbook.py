@@ -1,4 +1,4 @@
-"""An extended Kalman filter that is told where to keep its landmarks and where to linearise.
+"""An extended Kalman filter with a choice of landmark coordinates and linearisation points.
 
 For comparison, not for robots: dense matrices, derivatives by complex step, no gates.
 """

@@ -25,11 +25,9 @@ from benchmarks.relocalize.score import RIGHT_DEG, RIGHT_M, errors
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.mapserver.relocalization.calibration import COEFFICIENTS, HypothesisSupport, probabilities
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import supported
-from mapweave.mapserver.relocalization.relocalizer import (
-    RELOCALIZATION_CANDIDATES,
-    Relocalizer,
-)
+from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
 PULL = 1.0
@@ -60,13 +58,9 @@ def gather(seed: int, nodes: int, queries: int, bar: Progress) -> Seen:
     relocalizer = Relocalizer(index, lambda node: truth[node].node, joined(places, seed))
     found: Seen = []
     for query in asked:
-        ranked = index.query(query.picture.view, RELOCALIZATION_CANDIDATES)
-        sightings = relocalizer.look(query.picture.view, ranked)[0]
-        doubled = []
-        if sightings:
-            best = max(sightings, key=lambda one: one.recognition.inliers)
-            doubled = relocalizer.doubled(query.picture.view, best, ranked)
-        seen = relocalizer.judge.places([*sightings, *doubled])
+        ranked = index.query(query.picture.view, MOST_COMPARED)
+        registration = relocalizer.registration.register(Candidates(query.picture.view, ranked))
+        seen = relocalizer.selection.places(registration)
         off = [errors(query, truth.get(place.best.node), place.best_from_robot) for place in seen]
         found.append((supported(seen), [m <= RIGHT_M and deg <= RIGHT_DEG for m, deg in off]))
     bar.update(task, completed=nodes + (len(KINDS) + 2) * queries)
@@ -90,15 +84,16 @@ def fit(seen: Seen) -> Array:
 
 
 def reliability(seen: Seen, weights: Array) -> list[dict[str, float]]:
-    """In each bin of told probability: how many, told on average, right in truth."""
-    told = np.array([p for supports, _ in seen for p in probabilities(supports, weights.tolist())])
+    """In each bin of predicted probability: count, mean prediction, share that is right."""
+    predicted = np.array([p for supports, _ in seen for p in probabilities(supports, weights.tolist())])
     true = np.array([there for _, right in seen for there in right], dtype=np.float64)
     rows = []
     for low, high in pairwise(BINS):
-        inside = (told >= low) & ((told < high) | (high == 1.0))
+        inside = (predicted >= low) & ((predicted < high) | (high == 1.0))
         n = int(inside.sum())
         rows.append({
-            "from": low, "to": high, "places": n, "told": float(told[inside].mean()) if n else float("nan"),
+            "from": low, "to": high, "places": n,
+            "predicted": float(predicted[inside].mean()) if n else float("nan"),
             "right": float(true[inside].mean()) if n else float("nan"),
         })  # fmt: skip
     return rows
@@ -134,7 +129,7 @@ def main() -> None:
         "fitted": reliability(others, weights), "as_shipped": rows,
     }  # fmt: skip
     title = f"shipped weights, {len(others)} other views"
-    table = Table("told from", "to", "places", "told", "right", title=title)
+    table = Table("predicted from", "to", "places", "predicted", "right", title=title)
     for row in rows:
         table.add_row(*(f"{value:.3g}" for value in row.values()))
     console.print(table)

@@ -5,7 +5,7 @@
 Pairs of views of the same thing: of a folder of photographs of one scene (a match is right if it agrees with
 the others on one fundamental matrix), or, without one, images that no table was trained on under known warps,
 and simulated rooms (there it is right if it is). At most 150 features a view, chosen as robots choose them;
-all ways keep the same ones, except ORB, which has its own, and JPEG, after which they are found anew.
+all ways keep the same ones, except ORB, which has its own, and JPEG, after which they are detected again.
 
 `bytes_per_node` is a whole node on the wire, framing included, at 150 landmarks;
 `inliers_ratio_to_float_sift` the right matches as a share of those that SIFT in floats (RootSIFT, the same

@@ -40,7 +40,7 @@ class Pair:
         second: likewise.
         camera: that took the first.
         right: tells how many matches are right.
-        depths: tells the depth of pixels (N, 2) of the first image, (N,) m; None if nobody knows.
+        depths: gives the depth of pixels (N, 2) of the first image, (N,) m; None if unknown.
     """
 
     source: str

@@ -81,7 +81,7 @@ def features(image: Image, camera: Camera) -> tuple[Array, NDArray[np.float32]]:
 def pack(pixels: Array, sift: NDArray[np.float32], pair: Pair, rng: np.random.Generator) -> Packed:
     """A node as a robot sends it, with 16 rangers.
 
-    Depths are the simulator's, off by what a robot's are; of photographs nobody knows them, so they are
+    Depths are the simulator's, with a robot's errors; of photographs they are unknown, so they are
     drawn.
     """
     drawn = np.exp(rng.normal(np.log(2.0), 0.6, len(pixels)))

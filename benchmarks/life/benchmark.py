@@ -3,9 +3,9 @@
     python -m benchmarks.life [--drives N] [--seed N] [--stops N] [--moved SHARE] [--queries N] [--json]
 
 Two rooms of random landmarks on their walls (nothing is rendered). On every drive, a new epoch of the map, a
-robot goes through both: N stops at places that are drawn anew, at each it looks all around. Its changes go
-through the server's own merger one by one, with a merge after every drive. Told are the nodes that no others
-stand for, after each drive; and how many of the views that are taken anywhere in the rooms, and of those that
+robot goes through both: N stops at newly drawn places, with a full turn at each. Its changes go
+through the server's own merger one by one, with a merge after every drive. Printed are the active
+nodes after each drive; and how many of the views that are taken anywhere in the rooms, and of those that
 are taken again where a drive stopped, are answered rightly (within 0.25 m and 8 degrees of the truth) from
 the first drive's map, from the whole map without superseded nodes, and from all nodes. Between two drives
 furniture may be moved: a share of the landmarks then is elsewhere for good, and queries are taken of the
@@ -43,9 +43,9 @@ from synthetic.world import take_map, take_view
 
 CLOSE, CLOSE_TURN = 0.25, math.radians(8.0)
 ROUTES = 40
-"""Pairs of living nodes between which a route is asked for."""
-UNTOLD = Superseded(NodeId("nobody", 0, 0), 0, 0.0, 0.0)
-"""Stands for nodes that are left out of a comparison."""
+"""Pairs of active nodes between which a route is asked for."""
+LEFT_OUT = Superseded(NodeId("none", 0, 0), 0, 0.0, 0.0)
+"""Marks nodes that are left out of a comparison."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Drive:
     """What the map is after a drive.
 
     Attributes:
-        nodes: that no others stand for.
+        nodes: active ones.
         superseded: the others.
         components: of the merged map.
         node_ms: what it took to take in a node with its edges and to compare it, ms.
@@ -156,7 +156,7 @@ def answered(
     truth: Mapping[NodeId, Pose2],
 ) -> tuple[float, float]:
     """Shares of views that are answered rightly and wrongly; the others are not answered."""
-    shown = replace(merged, superseded=dict.fromkeys(hidden, UNTOLD))
+    shown = replace(merged, superseded=dict.fromkeys(hidden, LEFT_OUT))
     index = PlaceIndex()
     index.extend(node for one in merger.maps.values() for node in one.nodes.values() if node.id not in hidden)
     places = ActiveNodes(index, merger.node, shown)
@@ -173,13 +173,13 @@ def answered(
 
 
 def routes_found(merged: MergedMap, rng: np.random.Generator) -> float:
-    """Share of pairs of living nodes of one component between which there is a way over living nodes."""
+    """Share of pairs of active nodes of one component between which there is a way over active nodes."""
     router = Router(merged)
-    living = [node for node in sorted(merged.poses) if node not in merged.superseded]
+    active = [node for node in sorted(merged.poses) if node not in merged.superseded]
     found = tried = 0
     for _ in range(ROUTES):
-        start, goal = (living[int(k)] for k in rng.choice(len(living), 2))
+        start, goal = (active[int(k)] for k in rng.choice(len(active), 2))
         if merged.component_of(start) == merged.component_of(goal):
             legs = router.route(start, goal).legs
-            tried, found = tried + 1, found + bool(legs and {leg.node.id for leg in legs} <= set(living))
+            tried, found = tried + 1, found + bool(legs and {leg.node.id for leg in legs} <= set(active))
     return round(found / max(tried, 1), 4)

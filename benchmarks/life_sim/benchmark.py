@@ -3,13 +3,13 @@
     python -m benchmarks.life_sim [--seed N] [--drives N] [--rooms N] [--stops N] [--queries N] [--json]
 
 An office is mapped by one drive; then a third of its furniture stands elsewhere, and N drives follow, each a
-new epoch with stops drawn anew, looking all around at each. The simulator's camera takes the images and the
+new epoch with newly drawn stops, with a full turn at each. The simulator's camera takes the images and the
 robot's own eyes find the features; depths are true but for noise as a robot's, and so is the way. All goes
-through the server's own merger, with a merge after every drive. Told are, after each later drive, shares of
-the first drive's landmarks in nodes that no others stand for that have faded: of those on what was moved, of
-these those that views of two later drives or more should have shown, and of all others. And how many of the
-views taken beside nodes that show what was moved, and beside the others, are answered rightly (within 0.25 m
-and 8 degrees) in the end, with fading and without. Truth is for scoring alone. Takes about a minute.
+through the server's own merger, with a merge after every drive. Printed are, after each later drive, shares
+of the first drive's landmarks in active nodes that have faded: of those on what was moved, of these those
+that views of two later drives or more should have shown, and of all others. And how many of the views taken
+beside nodes that show what was moved, and beside the others, are answered rightly (within 0.25 m and 8
+degrees) in the end, with fading and without. Truth is for scoring alone. Takes about a minute.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ NEAR = 0.05
 
 @dataclass(frozen=True)
 class Faded:
-    """What has faded after a drive, of the first drive's landmarks in nodes that no others stand for.
+    """What has faded after a drive, of the first drive's landmarks in active nodes.
 
     Attributes:
         moved: landmarks on what was moved.
@@ -78,7 +78,7 @@ class Fleet:
     """One robot that maps an office again and again, and the truth about it."""
 
     def __init__(self, seed: int, rooms: int, stops: int) -> None:
-        """Build the office; nobody has been there.
+        """Build the office; it is unmapped.
 
         Args:
             seed: of everything.
@@ -231,14 +231,14 @@ def main() -> None:
         merged = fleet.drive(epoch)
         curve.append(fleet.faded(merged))
     names = "moved", "faded", "shown twice", "faded", "others", "faded"
-    table = Table("drive", *names, title=f"seed {a.seed}: landmarks of the first drive in living nodes")
+    table = Table("drive", *names, title=f"seed {a.seed}: landmarks of the first drive in active nodes")
     for number, one in enumerate(curve, start=1):
         table.add_row(str(number), *(str(count) for count in one.__dict__.values()))
     console.print(table)
     last = curve[-1]
     figures: dict[str, object] = {
         "nodes": len(merged.poses),
-        "living": len(merged.poses) - len(merged.superseded),
+        "active": len(merged.poses) - len(merged.superseded),
         "components": len(merged.components),
         "moved_faded": [_share(one.moved_faded, one.moved) for one in curve],
         "shown_twice_faded": [_share(one.seen_faded, one.seen) for one in curve],

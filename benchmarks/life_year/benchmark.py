@@ -3,9 +3,9 @@
     python -m benchmarks.life_year [--drives N] [--seed N] [--false SHARE] [--nodes N] [--alone] [--json]
 
 Only poses are drawn and links, true and false (`synthetic.drives`); a merge follows every drive.
-Side by side: what was decided stands, as on the map server, and everything is decided with every drive. Told
-are seconds of the processor a merge, links that the two do not have in common, false links that are believed,
-and how far living nodes are from the truth. With `--alone` only the first is run.
+Side by side: what was decided stands, as on the map server, and everything is decided with every drive.
+Printed are seconds of the processor a merge, links that the two do not have in common, false links that are
+believed, and the error of active nodes. With `--alone` only the first is run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from synthetic.drives import Drive, DriveSettings, drives
 from synthetic.fleet import FleetSettings
 
 LAST = 10
-"""Drives over which the last merges are told."""
+"""Drives over which the last merges are averaged."""
 
 
 @dataclass
@@ -114,8 +114,8 @@ def run(
         truth |= today.truth
         for way in ways:
             way.take(today)
-    figures: dict[str, float] = {"nodes": len(truth), "living": len(truth) - len(today.past)}
-    for way, name in zip(ways, ("", "anew_"), strict=False):
+    figures: dict[str, float] = {"nodes": len(truth), "active": len(truth) - len(today.past)}
+    for way, name in zip(ways, ("", "fresh_"), strict=False):
         links = {link.pair for link in way.merged.links}
         figures |= {
             f"{name}merge_s": round(statistics.median(way.seconds[-LAST:]), 3),
@@ -125,7 +125,7 @@ def run(
             f"{name}links": len(links),
             f"{name}links_false": len(links - true),
             f"{name}links_missed": len(true - links),
-            f"{name}living_error_m": round(error(way.merged, truth, today.past), 4),
+            f"{name}active_error_m": round(error(way.merged, truth, today.past), 4),
         }
     if not alone:
         one, two = ({link.pair for link in way.merged.links} for way in ways)
@@ -134,14 +134,14 @@ def run(
 
 
 def error(merged: MergedMap, truth: dict[NodeId, Pose2], past: frozenset[NodeId]) -> float:
-    """Root mean square, m, of the living nodes, each component laid upon the truth."""
+    """Root mean square error, m, of the active nodes, each component aligned with the truth."""
     squares: list[float] = []
     for component in merged.components:
-        living = sorted(component - past)
-        if len(living) > 2:
+        active = sorted(component - past)
+        if len(active) > 2:
             found, real = (
                 np.array([(pose.x, pose.y) for pose in poses])
-                for poses in ([merged.pose(n) for n in living], [truth[n] for n in living])
+                for poses in ([merged.pose(n) for n in active], [truth[n] for n in active])
             )
             squares += np.square(align(found, real).apply(found) - real).sum(axis=1).tolist()
     return float(np.sqrt(np.mean(squares))) if squares else 0.0

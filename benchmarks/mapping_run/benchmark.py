@@ -3,7 +3,7 @@
     python -m benchmarks.mapping_run [--seed N] [--out DIR] [--world arena|office] [--json]
 
 50 s at 10 Hz back and forth before a wall: rendered pictures, SIFT features, Lucas-Kanade tracks and the
-mapping EKF, as a robot runs them. First the paper's line; the same again while somebody walks past; then an
+mapping EKF, as a robot runs them. First the paper's line; the same again while a person walks past; then an
 arc and a weave. Each run is compared with the simulator's pose and with the wheels alone, and each
 landmark, as it was known last, with where the ray of its first pixel meets the world. Pictures of the line
 lie in DIR, those of the other runs in folders below it: fig7 pose, fig8 encoders, landmarks, map, view.
@@ -32,7 +32,7 @@ from benchmarks.mapping_run.score import Figures, figures
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 
 RUNS = {"line": ("line", False), "person": ("line", True), "arc": ("arc", False), "weave": ("weave", False)}
-"""Shape of the drive, and whether somebody walks past, by name of the run."""
+"""Shape of the drive, and whether a person walks past, by name of the run."""
 LEAST_STEPS = 30
 
 
@@ -101,18 +101,18 @@ def _run(arguments: argparse.Namespace, console: Console) -> tuple[dict[str, Fig
 
 def notes(results: dict[str, Figures], abandoned: dict[str, str]) -> list[str]:
     """What a reader must know before he compares the runs."""
-    told = []
+    notes = []
     for name, one in results.items():
         if abandoned[name]:
             reason = abandoned[name]
-            told.append(f"{name}: the robot would have dropped this episode ({reason}); it was ended there")
+            notes.append(f"{name}: the robot would have dropped this episode ({reason}); it was ended there")
         if RUNS[name][1] and not one["person_in_view_s"]:
-            told.append(f"{name}: nobody came into view, there was no room ahead; take another seed")
+            notes.append(f"{name}: no person came into view, there was no room ahead; take another seed")
         if not one["landmarks_left"]:
-            told.append(
+            notes.append(
                 f"{name}: no landmark was left at the end; since the last the wheels were trusted alone"
             )
-    return told
+    return notes
 
 
 def _make(folder: Path) -> None:

@@ -19,8 +19,8 @@ from mapweave.hybridmap.pose import Array, wrap_angle
 
 ESTIMATE, TRUTH, WHEELS, GREEN, PERSON = "#1f77b4", "#222222", "#d95f02", "#2a9d4b", "#f3d9d6"
 COLOURS = ("#1f77b4", "#d95f02", "#2a9d4b", "#8e44ad", "#c0392b", "#16a0a0")
-TRAIL = 40
-"""A track's trail is as long as this many ticks."""
+TRACK_LENGTH = 40
+"""Ticks of a track that are drawn."""
 
 
 def draw(run: MappingDrive, out: Path) -> tuple[Path, ...]:
@@ -175,16 +175,18 @@ def _draw_map(run: MappingDrive, path: Path) -> None:
 
 
 def _draw_view(run: MappingDrive, path: Path) -> None:
-    """Three images with the tracks' trails; colours tell how far a track is from its true point."""
+    """Three images with the last positions of tracks; colours show the distance from the true point."""
     with _sheet(run, "what the camera saw, and where its points went", path, (16, 4.6)) as figure:
         axes = np.atleast_1d(figure.subplots(1, len(run.images)))
         shade: Any = None
         for at, (number, image) in zip(axes, sorted(run.images.items()), strict=True):
             moment = run.moments[number]
             at.imshow(image, cmap="gray", vmin=0, vmax=255)
-            for track, trail in _trails(run, number).items():
+            for track, positions in _recent_tracks(run, number).items():
                 held = track in moment.landmarks.ids
-                at.plot(trail[:, 0], trail[:, 1], color="#ffd34d" if held else "#7fb3d5", linewidth=0.8)
+                at.plot(
+                    positions[:, 0], positions[:, 1], color="#ffd34d" if held else "#7fb3d5", linewidth=0.8
+                )
             off = np.linalg.norm(track_errors(run, moment), axis=1)
             size = np.where(np.isin(moment.ids, moment.landmarks.ids), 26, 9)
             shade = at.scatter(*moment.pixels.T, c=off, s=size, cmap="plasma", vmin=0, vmax=2)
@@ -197,11 +199,11 @@ def _draw_view(run: MappingDrive, path: Path) -> None:
 
 
 def _shade(run: MappingDrive, at: Any) -> None:
-    """Mark when somebody is in view."""
+    """Mark when a person is in view."""
     there = np.array([not math.isnan(m.person) for m in run.moments])
     if there.any():
         at.fill_between(run.seconds, 0, 1, where=there, color=PERSON, linewidth=0, zorder=0,
-                        transform=at.get_xaxis_transform(), label="somebody in view")  # fmt: skip
+                        transform=at.get_xaxis_transform(), label="person in view")  # fmt: skip
 
 
 def _sigmas_in_anchor(covariance: Array, heading: float) -> Array:
@@ -248,10 +250,10 @@ def _history(run: MappingDrive, track: int) -> tuple[Array, Array]:
     return believed, true
 
 
-def _trails(run: MappingDrive, number: int) -> dict[int, Array]:
+def _recent_tracks(run: MappingDrive, number: int) -> dict[int, Array]:
     """The last pixels (K, 2) of each track alive at a moment; NaN where it was not."""
     alive = run.moments[number].ids
-    recent = run.moments[max(0, number - TRAIL) : number + 1]
+    recent = run.moments[max(0, number - TRACK_LENGTH) : number + 1]
     pixels = np.full((len(alive), len(recent), 2), np.nan)
     for k, moment in enumerate(recent):
         _, rows, there = np.intersect1d(alive, moment.ids, return_indices=True)

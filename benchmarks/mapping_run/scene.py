@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from benchmarks.images.surface_points import Surfaces
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
-from mapweave.agent.ekf.mapping_filter import FilterSettings
 from mapweave.agent.exploration.behaviours import DRIVE, LEAST_FEATURES
 from mapweave.agent.mapping.anchored_keyframe import HERE
-from mapweave.agent.mapping.mapper import DEPTHS_PER_HEIGHT, MapperSettings
+from mapweave.agent.mapping.mapper import DEPTHS_PER_HEIGHT
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.view import View
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.servo.image_drive import ImageDrive, ImageDriveSettings
+from mapweave.agent.servo.image_drive import ImageDrive
+from mapweave.agent.settings import AgentSettings, FilterSettings
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.sim.events import Walk
@@ -44,7 +44,7 @@ SPEED = 0.15
 NEAREST, FARTHEST = 1.5, 5.0
 """What the robot looks at is so far ahead, m."""
 WALK_FROM, WALK_FOR = 0.3, 0.4
-"""Somebody walks past after this share of the run, and for this share of it."""
+"""A person walks past after this share of the run, and for this share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Moment:
         ids: (N,) tracks alive.
         pixels: (N, 2) px, where they are.
         believed: whether the image was taken for a continuation of the one before.
-        person: bearing of somebody in view, rad, positive to the left; NaN if nobody is.
+        person: bearing of a person in view, rad, positive to the left; NaN without one.
         step_ms: wall time of tracking and filtering.
     """
 
@@ -90,7 +90,7 @@ class MappingDrive:
         flat: (N,) whether the patch of a track is on one surface, so that it is one point.
         filter_settings: of the filter that ran.
         moments: one a tick; the first is the anchor.
-        images: (H, W) by the number of the moment: at the anchor, where somebody is in the middle of the
+        images: (H, W) by the number of the moment: at the anchor, where a person is in the middle of the
             view or else farthest from the anchor, at the end.
         given_up: why the robot would have dropped the episode, in words; then the run ends there.
     """
@@ -139,7 +139,7 @@ def drive(
         kind: of world, see mapweave.sim.worlds.catalog.
         shape: of the drive, one of synthetic.mapping_run.SHAPES.
         steps: ticks.
-        person: whether somebody walks past.
+        person: whether a person walks past.
         progress: called once a tick.
 
     Raises:
@@ -180,9 +180,9 @@ class _Run:
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
         self.robot = simulation.describe(NAME)
-        settings, lens = MapperSettings(), Lens(self.robot.camera, self.robot.distortion)
-        self.tracking = Tracking(self.robot, lens, settings.tracking)
-        self.filter_settings = settings.tracking.filter
+        settings, lens = AgentSettings(), Lens(self.robot.camera, self.robot.distortion)
+        self.tracking = Tracking(self.robot, lens, settings)
+        self.filter_settings = settings.filter
         # One tick for the wheels to settle on the floor.
         simulation.step({})
         observation = simulation.step({})[NAME]
@@ -198,7 +198,7 @@ class _Run:
         """Drive back and forth; the shape adds turns to those that the image asks for."""
         turns = speeds(shape, steps)[1]
         reach = DRIVE
-        controller = ImageDrive(self.robot, ImageDriveSettings(speed=SPEED))
+        controller = ImageDrive(self.robot, SPEED)
         controller.start(reach)
         observation: Observation | None = None
         aside = 0.0
@@ -221,8 +221,9 @@ class _Run:
             self.wheels = self.wheels @ observation.odometry.motion()
             self._write(observation, step_ms)
             progress()
-            if self.tracking.carried_off or self.tracking.disputed:
-                self.given_up = "carried off" if self.tracking.carried_off else "wheels against image"
+            if self.tracking.acceptance.carried_off or self.tracking.disputed:
+                carried_off = self.tracking.acceptance.carried_off
+                self.given_up = "carried off" if carried_off else "wheels against image"
                 return
 
     def recorded(self, name: str) -> MappingDrive:
@@ -237,7 +238,7 @@ class _Run:
             tuple(self.moments), self._telling(), self.given_up,
         )  # fmt: skip
 
-    def _begin(self, observation: Observation, sift: Sift, settings: MapperSettings) -> View:
+    def _begin(self, observation: Observation, sift: Sift, settings: AgentSettings) -> View:
         """Make the image the anchor view of an episode, as the mapper does."""
         if observation.image is None:
             raise InvalidValue("the camera gave no first image")
@@ -252,22 +253,22 @@ class _Run:
         moment = Moment(
             observation.odometry, self.world_from_anchor.inverse() @ world_from_robot, self.wheels,
             self.tracking.pose, self.tracking.landmarks(), self.tracking.ids.copy(),
-            self.tracking.pixels.copy(), not self.tracking.doubtful,
+            self.tracking.pixels.copy(), not self.tracking.acceptance.doubtful,
             self._person(world_from_robot), step_ms,
         )  # fmt: skip
         self.moments.append(moment)
         self.images.append(observation.image)
 
     def _telling(self) -> dict[int, NDArray[np.uint8]]:
-        """The first image, the last, and one between: somebody in the middle of it, or the end of a way."""
+        """The first image, the last, and one between: a person in the middle of it, or the end of a way."""
         numbers = [k for k, image in enumerate(self.images) if image is not None]
         between = max(numbers, key=lambda k: self._worth(self.moments[k]))
         return {k: image for k, image in enumerate(self.images) if image is not None and k in
                 (numbers[0], between, numbers[-1])}  # fmt: skip
 
     def _worth(self, moment: Moment) -> float:
-        nobody = math.isnan(moment.person)
-        return math.hypot(moment.true.x, moment.true.y) if nobody else 10.0 - abs(moment.person)
+        alone = math.isnan(moment.person)
+        return math.hypot(moment.true.x, moment.true.y) if alone else 10.0 - abs(moment.person)
 
     def _person(self, world_from_robot: Pose2) -> float:
         """Bearing of the nearest actor whose middle is in view, rad; NaN if there is none."""

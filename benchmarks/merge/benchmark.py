@@ -77,7 +77,7 @@ def main() -> None:
         if arguments.scale is not None:
             _scale(arguments, console)
             return
-        # What cannot be read shall be told before the long work.
+        # Unreadable files are reported before the long work.
         folders = {str(folder): kept_links(folder) for folder in arguments.robots}
         graphs = {path.stem: read_g2o(path) for path in arguments.g2o}
         with Progress(console=console) as progress:

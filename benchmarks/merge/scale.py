@@ -59,7 +59,7 @@ def at_size(nodes: int, seed: int, progress: Progress, measured: int = MEASURED)
     Args:
         nodes: of all maps together, a multiple of NODES_A_MAP.
         seed: of the building.
-        progress: told how far it is.
+        progress: called with the progress.
         measured: nodes that come while the clock runs.
     """
     robots = nodes // NODES_A_MAP
@@ -67,14 +67,14 @@ def at_size(nodes: int, seed: int, progress: Progress, measured: int = MEASURED)
     building = Building.draw(robots, NODES_A_MAP, seed)
     active = min(ACTIVE, robots)
     first_new = NODES_A_MAP - measured // active
-    told = np.ones(building.rooms.shape, np.bool_)
-    told[:active, first_new:] = False
+    active_nodes = np.ones(building.rooms.shape, np.bool_)
+    active_nodes[:active, first_new:] = False
     read: list[tuple[MapId, ChangeBody]] = []
     coming: dict[int, list[list[tuple[MapId, ChangeBody]]]] = {}
     for robot in range(robots):
         for map_id, body in building.log(robot):
             number = _node(body).number // 2
-            if told[robot, number]:
+            if active_nodes[robot, number]:
                 read.append((map_id, body))
             elif isinstance(body, NodePut):
                 coming.setdefault(number, []).append([(map_id, body)])
@@ -84,7 +84,7 @@ def at_size(nodes: int, seed: int, progress: Progress, measured: int = MEASURED)
     before = _resident_mb()
     merger = Merger()
     began = time.perf_counter()
-    merger.read(read, *building.knowledge(told))
+    merger.read(read, *building.knowledge(active_nodes))
     read_s = time.perf_counter() - began
     del read
     began = time.perf_counter()

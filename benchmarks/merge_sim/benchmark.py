@@ -3,7 +3,7 @@
     python -m benchmarks.merge_sim [--runs N] [--seed N] [--workers N] [--scenarios NAME ...] [--json]
 
 Each run is a whole trial (`mapweave sim run NAME --one-process`): robots that explore, a server that merges
-while they do, and the truth, which nobody but the score knows. Run k has the seed 1000 * SEED + k, so each
+while they do, and the truth, which only the score uses. Run k has the seed 1000 * SEED + k, so each
 can be looked at by itself with `mapweave sim run NAME --seed ...`.
 
 | scenario | what |
@@ -18,14 +18,14 @@ the merged map, median; `whole`: share of the runs that became one map. `false_m
 ended up joined wrongly (by more than 0.5 m or 15 degrees), of all runs; `false_links`: links that are off by
 as much. `link_recall`: of all pairs of nodes of different maps that truly share a view (each shows at least
 half of what the other one shows, by rays in the world), the share that a true link joins; null where no two
-maps share a view. Most of these pairs look at each other along a corridor, and its walls look alike to nobody
-who sees them from the other end. So `link_recall_one_side` counts only what both see from directions within
-45 degrees of each other, and `verified_one_side` which of these pairs are recognised when one asks for them:
-what lies between the two is what candidates and consistency cost. `place_recall` is the share of the chances
-to join a node's place to another map's that are taken (median). Each figure is an object by scenario.
+maps share a view. Most of these pairs look at each other along a corridor, and its walls have no common
+features who sees them from the other end. So `link_recall_one_side` counts only what both see from directions
+within 45 degrees of each other, and `verified_one_side` which of these pairs are recognised when one asks for
+them: what lies between the two is what candidates and consistency cost. `place_recall` is the share of the
+chances to join a node's place to another map's that are taken (median). Each figure is an object by scenario.
 
 A run takes one to three minutes on a core of its own; 10 runs of all four scenarios on two cores 35 to 50
-minutes. A run that fails or is killed is told, is under `failed`, and makes the exit status 1.
+minutes. A run that fails or is killed is reported, is under `failed`, and makes the exit status 1.
 """
 
 from __future__ import annotations

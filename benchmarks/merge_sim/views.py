@@ -3,7 +3,7 @@
 A grid of rays goes through each image to the nearest surface. The point where it ends is seen by another
 camera too if it lies in that one's image and the ray from there to it ends at it, not before. If both shall
 see it from one side, the two rays also meet at no more than a given angle: the walls of a corridor are seen
-from either end, and look alike to nobody. Robots hide nothing here: a moment later they were elsewhere.
+from either end, without common features. Robots hide nothing here: a moment later they were elsewhere.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ again and again at random poses from which no image was taken, and sent to a ran
 edges away. Agent, server and messages are the fleet's own, in one process; images are rendered, wheels slip.
 Errors are against where the goal's image was truly taken. A drive succeeds if the robot says within 240 s
 that it has arrived, is then within 5 cm and 5 degrees, and has touched nothing. The shortest way is that of a
-robot that knows the floor. Of the map it is told what the drives have measured and how far its nodes are off
+robot that knows the floor. Of the map it prints what the drives have measured and how far its nodes are off
 before and after them. DIR gets fig11.png (desired and reached views), drives.png, and the map, which a
 later call with the same DIR, seed and rooms takes up again.
 """
@@ -118,7 +118,7 @@ def _run(arguments: argparse.Namespace, console: Console) -> tuple[list[Outcome]
         if not (folder / TRUTH).exists():
             _map(folder, arguments, progress)
         task = progress.add_task("driving", total=arguments.runs, doing="")
-        # Another day: the robot is switched on with the map on its disk, and nobody tells it where it is.
+        # Another day: the robot is switched on with the map on its disk, and must localize.
         with Office(folder, arguments.seed, arguments.rooms) as office:
             mapped, plan, before = office.mapped(), office.control.plan(), office.merged()
             floor = Floor.of(plan, RobotSetup("r0").describe().radius)

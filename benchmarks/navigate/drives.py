@@ -37,7 +37,7 @@ class Outcome:
         error_deg: likewise.
         collisions: on the way.
         driven: length of the way, m.
-        story: what the robot did, with the time of each change, s.
+        events: what the robot did, with the time of each change, s.
         desired: picture from where the goal's image was truly taken.
         reached: what the robot saw at last.
         track: (N, 2) m, its way in world.
@@ -52,7 +52,7 @@ class Outcome:
     error_deg: float
     collisions: int
     driven: float
-    story: tuple[tuple[float, str], ...]
+    events: tuple[tuple[float, str], ...]
     desired: NDArray[np.uint8]
     reached: NDArray[np.uint8]
     track: Array
@@ -82,14 +82,14 @@ def drive(office: Office, plot: Plot, on_time: Callable[[float, str], None]) -> 
     office.advance(0.1)
     before, begin = office.control.status().robots[ROBOT].collisions, office.ticks
     office.command(GoTo(plot.goal))
-    found_s, story = None, list[tuple[float, str]]()
+    found_s, events = None, list[tuple[float, str]]()
     while True:
         status = office.advance(LOOK_EVERY).status
         time_s = (office.ticks - begin) * 0.1
         if found_s is None and status.fix_node is not None:
             found_s = time_s
-        if not story or story[-1][1].partition(":")[0] != status.doing:
-            story.append((time_s, f"{status.doing}: {status.detail}"))
+        if not events or events[-1][1].partition(":")[0] != status.doing:
+            events.append((time_s, f"{status.doing}: {status.detail}"))
         on_time(time_s, status.doing)
         if status.finished or time_s >= PATIENCE:
             break
@@ -108,7 +108,7 @@ def drive(office: Office, plot: Plot, on_time: Callable[[float, str], None]) -> 
         error_deg,
         collisions,
         float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum()),
-        tuple(story),
+        tuple(events),
         desired,
         _picture(office),
         track,

@@ -90,7 +90,7 @@ class Ways:
 
 
 def _shifted(number: NDArray[np.int64], rows: int, columns: int) -> tuple[NDArray[np.int64], ...]:
-    """Every cell and the one that lies so many rows and columns further, flat; both on the grid."""
+    """Every cell and the cell so many rows and columns further, flat; both on the grid."""
     height, width = number.shape
     left, right = max(-columns, 0), width - max(columns, 0)
     first = number[: height - rows, left:right]

@@ -5,16 +5,16 @@
 A thousand places are real: simulated buildings (offices, a warehouse, a ring corridor, rooms with twins)
 looked at with the robot's camera and eyes and made into nodes as uncertain as a robot's. Beyond these, places
 are made of real views of other buildings (benchmarks.relocalize.distractors). Asked are views near mapped
-poses, then disturbed ones, views of twin rooms, and views of buildings that nobody has mapped: to the last
+poses, then disturbed ones, views of twin rooms, and views of unmapped buildings: to the last
 two "here" is always a false answer. The ceiling compares views with every node by whole SIFT descriptors,
 up to 10 000 nodes (of a larger fleet the first so many), every so manyth view where that is much; what the
-index has lost is told of the very same views. A bag of visual words answers the same questions through the
+index has lost is measured on the same views. A bag of visual words answers the same questions through the
 same verification.
 
 With `--nodes 1000 10000 100000 --queries 200` it takes about a quarter of an hour on one core, and the first
 time of a seed some minutes more for its pictures, which it keeps in the folder for temporary files.
 
-A server has its nodes ready; here those beyond the real ones are made when somebody looks at them, and the
+A server has its nodes ready; here those beyond the real ones are made on demand, and the
 time for that is not counted, neither in an answer's nor in the index's.
 """
 
@@ -33,8 +33,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from mapweave.mapserver.relocalization.relocalizer import RELOCALIZATION_CANDIDATES
-
 # Small matrices gain nothing from more threads, and wait for each other where other programs run.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -48,6 +46,7 @@ from benchmarks.relocalize.peer import WordIndex
 from benchmarks.relocalize.queries import KINDS
 from benchmarks.relocalize.score import figures, recall_by_kind, spent, wrong_by_kind
 from mapweave.hybridmap.node import Node
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
@@ -55,7 +54,7 @@ REAL = 1000
 """Places that are real, at most."""
 AT_ONCE = 4096
 """Nodes that are added to an index at once."""
-CANDIDATES = RELOCALIZATION_CANDIDATES
+CANDIDATES = MOST_COMPARED
 PEER_AT_MOST = 100_000
 """Beyond, the bag of words is left out: it is not what is asked."""
 

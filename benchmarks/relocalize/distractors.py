@@ -65,7 +65,7 @@ class Distractors:
     seed: int
 
     def place(self, number: int) -> Place:
-        """A place, with whole descriptors too; where it truly is nobody knows."""
+        """A place, with whole descriptors too; its true pose is unknown."""
         rng = np.random.default_rng([self.seed, 0xD157, number])
         i, j = rng.choice(len(self.donors), 2, replace=False).tolist()
         left, right = self.donors[i], self.donors[j]

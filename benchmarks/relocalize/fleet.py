@@ -110,7 +110,7 @@ class Bench:
             judge: of what was recognised; it is that of the index.
             replies: by the index, to all queries.
         """
-        told: dict[str, Any] = {"exhaustive_nodes": min(size, AT_MOST)}
+        values: dict[str, Any] = {"exhaustive_nodes": min(size, AT_MOST)}
         ours = {id(reply.query): reply for reply in replies}
         for kind in kinds:
             chosen = asked_of([query for query in self.queries if query.kind == kind], min(size, AT_MOST))
@@ -118,11 +118,11 @@ class Bench:
             with self.task(f"{size} nodes: exhaustive, {kind}", min(size, AT_MOST) + len(chosen)) as step:
                 answers = exhaustive.answers(chosen, step)
             theirs = [judged(q, answer, self.truth) for q, answer in zip(chosen, answers, strict=True)]
-            told.setdefault("exhaustive", {})[kind] = share(theirs, lambda r: r.recalled)
+            values.setdefault("exhaustive", {})[kind] = share(theirs, lambda r: r.recalled)
             if kind == "near":
-                told["recall_exhaustive"] = told["exhaustive"][kind]
-                told |= lost([ours[id(query)] for query in chosen], theirs)
-        return told
+                values["recall_exhaustive"] = values["exhaustive"][kind]
+                values |= lost([ours[id(query)] for query in chosen], theirs)
+        return values
 
     def hardness(self) -> dict[str, dict[str, float]]:
         """How much the best wrong node looks like a view from nowhere, among real nodes and made ones."""

@@ -41,7 +41,7 @@ from mapweave.vision.sift import Sift
 
 FOLDER = Path(tempfile.gettempdir()) / "mapweave-relocalize"
 VERSION = 1
-"""Of what this file does; another one makes all pictures anew."""
+"""Of what this file does; another version makes all pictures again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Disturbance:
     """What is between a robot and a good picture.
 
     Attributes:
-        person: whether somebody hides about a third of the view.
+        person: whether a person hides about a third of the view.
         gain: factor on the brightness.
         gamma: bend of the tone curve. The simulator's pictures are grey, and what another white balance does
             to a grey picture is another curve.
@@ -134,7 +134,7 @@ class Photographer:
         """(H, W) grey."""
         sets, d = [self._still], wish.disturbance
         if d.person:
-            sets.append(_somebody(wish.number))
+            sets.append(_person(wish.number))
         scene = Scene(sets)
         if d.person:
             scene.place(1, *upright(wish.place @ _before(self.camera, wish.number)))
@@ -169,7 +169,7 @@ class Photographer:
 
 
 @lru_cache(maxsize=16)
-def _somebody(number: int) -> PanelSet:
+def _person(number: int) -> PanelSet:
     return figure_panels("person", (number, 0x9E50))
 
 

@@ -78,7 +78,7 @@ def mapped_sites(seed: int) -> tuple[Site, ...]:
 
 
 def unknown_sites(seed: int) -> tuple[Site, ...]:
-    """What nobody has mapped."""
+    """Unmapped buildings."""
     base = 40_050 + 100 * seed
     return (
         Site("office", base, 0.4), Site("office", base + 1, 0.2), Site("warehouse", base + 2, 0.2),
@@ -100,7 +100,7 @@ class Query:
     Attributes:
         kind: near, far, person, exposure, blur, furniture, camera, nowhere or twins.
         picture: what is asked.
-        site: number of the mapped building in which it was taken, -1 in one that nobody has mapped.
+        site: number of the mapped building in which it was taken, -1 in an unmapped one.
     """
 
     kind: str

@@ -1,4 +1,4 @@
-"""Views of mapped places, undisturbed and disturbed, of twin rooms, and of where nobody has been."""
+"""Views of mapped places, undisturbed and disturbed, of twin rooms, and of unmapped places."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Query:
     Attributes:
         kind: one of KINDS, `nowhere` or `twins`.
         picture: what is asked.
-        site: number of the mapped building in which it was taken, -1 in one that nobody has mapped.
+        site: number of the mapped building in which it was taken, -1 in an unmapped one.
     """
 
     kind: str
@@ -107,7 +107,7 @@ def beside(place: Pose2, world: World, far: bool, rng: np.random.Generator) -> P
 
 
 def nowhere(count: int, seed: int, progress: Progress) -> list[Query]:
-    """Views from anywhere in buildings that nobody has mapped."""
+    """Views from anywhere in unmapped buildings."""
     queries: list[Query] = []
     for number, site in enumerate(unknown_sites(seed)):
         rng = np.random.default_rng([seed, 0x0DD, number])
@@ -120,7 +120,7 @@ def nowhere(count: int, seed: int, progress: Progress) -> list[Query]:
 def twins(
     count: int, sites: Sequence[Site], places: Sequence[Place], seed: int, progress: Progress
 ) -> list[Query]:
-    """Views in rooms that have a twin: nobody can know in which of the two they were taken."""
+    """Views in rooms that have a twin: which of the two cannot be known."""
     queries: list[Query] = []
     numbers = [k for k, site in enumerate(sites) if site.kind == "twins"]
     for k in numbers:

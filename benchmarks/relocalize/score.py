@@ -16,7 +16,7 @@ from mapweave.hybridmap.pose import Array, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 
 RIGHT_M, RIGHT_DEG = 0.25, 5.0
-"""A place is recalled if it is told that well."""
+"""A place is recalled if its answer is this precise."""
 STRANGERS = ("nowhere", "twins")
 """Kinds of queries to which "here" is never the right answer."""
 
@@ -77,9 +77,9 @@ def ask(
     for query in queries:
         view = query.picture.view
         began = spent() - aside()
-        told = answer(view)
+        answered = answer(view)
         ms, cpu_ms = 1e3 * (spent() - aside() - began)
-        replies.append(replace(judged(query, told, truth), ms=float(ms), cpu_ms=float(cpu_ms)))
+        replies.append(replace(judged(query, answered, truth), ms=float(ms), cpu_ms=float(cpu_ms)))
         progress()
     return replies
 
@@ -89,18 +89,18 @@ def spent() -> Array:
     return np.array([time.perf_counter(), time.process_time()])
 
 
-def judged(query: Query, told: RelocalizeAnswer, truth: Mapping[NodeId, Place]) -> Reply:
+def judged(query: Query, answered: RelocalizeAnswer, truth: Mapping[NodeId, Place]) -> Reply:
     """Compare an answer with the truth."""
-    if not told.candidates:
-        return Reply(query, told.certainty, 0.0, math.inf, math.inf, math.nan)
-    best = told.candidates[0]
+    if not answered.candidates:
+        return Reply(query, answered.certainty, 0.0, math.inf, math.inf, math.nan)
+    best = answered.candidates[0]
     place = truth.get(best.node)
     error_m, error_deg = errors(query, place, best.node_from_robot)
     nees = math.nan
     if place is not None and place.site == query.site:
         true = place.world_from_node.inverse() @ query.picture.world_from_robot
         nees = best.node_from_robot.mahalanobis2(true)
-    return Reply(query, told.certainty, best.probability, error_m, error_deg, nees)
+    return Reply(query, answered.certainty, best.probability, error_m, error_deg, nees)
 
 
 def errors(query: Query, place: Place | None, node_from_robot: PoseGaussian) -> tuple[float, float]:
@@ -147,7 +147,7 @@ def recall_by_kind(replies: Sequence[Reply]) -> dict[str, float]:
 
 
 def wrong_by_kind(replies: Sequence[Reply]) -> dict[str, float]:
-    """Share of each kind of view that was told "here" wrongly; of strangers any such answer is wrong."""
+    """Share of each kind of view that was answered "here" wrongly; of strangers any such answer is wrong."""
     kinds = dict.fromkeys(r.query.kind for r in replies)
     return {
         kind: share(

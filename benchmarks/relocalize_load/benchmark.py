@@ -1,17 +1,17 @@
-"""Many lost robots at once: how soon a map server answers, and whom it asks to come again.
+"""Many lost robots at once: how soon a map server answers, and which questions it refuses.
 
     python -m benchmarks.relocalize_load [--robots N] [--seconds S] [--nodes N] [--seed N] [--json]
 
 A real `mapweave server` process, over Zenoh on loopback, holds a map of synthetic rooms (descriptors with the
 spread of real ones). Each robot has a session of its own and asks without a pause where it is, always about
-another view; a robot that is told to come again does so after that time. Meanwhile one more asks for a route,
+another view; a refused robot asks again at its retry time. Meanwhile one more asks for a route,
 ten times a second. Robots and server share this machine's cores.
 
 For each server: `p50_ms` and `p95_ms` from asking to a found, ambiguous or unknown answer; `refused_share` of
 the questions; `answers_per_s`; `wait_p95_ms` from a robot's first asking about a view to its answer, pauses
 included; `route_p95_ms`; `right_share` of the answers (within 0.25 m and 5 degrees); `lost`, questions that
-nobody answered or refused. Side by side: the desk as it is by default, and a server that answers everybody
-in turn (one worker, nobody refused).
+without answers and refusals. Side by side: the default admission control, and a server that answers all
+in turn (one worker, no refusals).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from rich.table import Table
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
-from mapweave.hybridmap.query import View
+from mapweave.hybridmap.query import RelocalizeAnswer, RouteRequest, View
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.store import Store
 from mapweave.scenarios.children import Children, free_port
@@ -43,7 +43,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
-from mapweave.wire.messages import RouteRequest, decode_relocalize_answer, encode_route_request, encode_view
+from mapweave.wire.messages import decode, encode, encode_view
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.world import World, room, take_map, take_view
 
@@ -52,7 +52,7 @@ ROOM_NODES = 20
 """Nodes a room, one robot each."""
 PATIENCE = 10.0
 """Longest wait for an answer, s."""
-RIVALS = {"desk": "", "in_turn": "[desk]\nworkers = 1\nin_time = 1000.0\n"}
+RIVALS = {"desk": "", "in_turn": "[admission_control]\nworkers = 1\nin_time = 1000.0\n"}
 """Settings of the servers."""
 
 
@@ -146,18 +146,20 @@ def ask_on(bus: ZenohBus, building: Building, queries: list[tuple[View, MapId, P
 
 def is_right(building: Building, query: tuple[View, MapId, Pose2], payload: bytes) -> bool:
     """Whether the best candidate is within 0.25 m and 5 degrees."""
-    candidates = decode_relocalize_answer(payload).candidates
+    candidates = decode(payload, RelocalizeAnswer).candidates
     if not candidates:
         return False
     _, _, true = query
-    told = building.truth[candidates[0].node] @ candidates[0].node_from_robot.mean
-    return told.distance(true) < 0.25 and abs(wrap_angle(told.heading - true.heading)) < math.radians(5)
+    answered = building.truth[candidates[0].node] @ candidates[0].node_from_robot.mean
+    return answered.distance(true) < 0.25 and abs(wrap_angle(answered.heading - true.heading)) < math.radians(
+        5
+    )
 
 
 def ask_routes(bus: ZenohBus, building: Building, stop: threading.Event) -> list[float]:
     """Ten routes a second; how long each took, s."""
     ids = sorted(building.truth)
-    payload = encode_route_request(RouteRequest(ids[0], ids[min(ROOM_NODES, len(ids)) - 1]))
+    payload = encode(RouteRequest(ids[0], ids[min(ROOM_NODES, len(ids)) - 1]))
     times = []
     while not stop.wait(0.1):
         asked = time.monotonic()
@@ -226,7 +228,7 @@ def wait_until_merged(bus: ZenohBus, nodes: int, children: Children) -> None:
 
 
 def figures(total: Tally, routes: list[float], took: float) -> dict[str, float]:
-    """The numbers that are told."""
+    """The numbers that are printed."""
     asked = len(total.answered) + total.refused + total.lost
     answered = 1e3 * np.array(total.answered or [math.nan])
     return {

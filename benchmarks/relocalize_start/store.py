@@ -46,7 +46,7 @@ def fill(
         places: real nodes.
         distractors: make the others.
         total: nodes wanted.
-        progress: is told how many nodes are new.
+        progress: called with the number of new nodes.
     """
     store = Store(path)
     for number in sorted({place.site for place in places}):

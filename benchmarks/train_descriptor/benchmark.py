@@ -107,7 +107,7 @@ def train() -> LandmarkTables:
     mean, basis = telling_axes(root_sift(images).astype(np.float64), changes)
     bare = np.full((DIMENSIONS, SYMBOLS), (1 << TOTAL_BITS) // SYMBOLS)
     tables = LandmarkTables(mean, basis, STEP, bare, share_frequencies(), cell_frequencies())
-    # As many of both kinds: a robot sees rooms, but nobody knows which.
+    # As many of both kinds: a robot sees rooms, but it is unknown which.
     codes = [quantise(project(sift, tables), tables) for sift in (images, room_descriptors())]
     shares = [np.array([np.bincount(c[:, k], minlength=SYMBOLS) for k in range(DIMENSIONS)]) for c in codes]
     counts = sum(s / s.sum(axis=1, keepdims=True) for s in shares) / 2

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import json
 import logging
 import socket
 import threading
@@ -20,6 +19,7 @@ from types import TracebackType
 from typing import Any
 
 import h11
+import msgspec
 import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -39,7 +39,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""What pages may load: files of this server, nothing inline, nothing of others."""
+"""Content security policy of the pages: files of this server only, nothing inline."""
 HEADERS = {
     "Connection": "close",
     "Cache-Control": "no-store",
@@ -68,7 +68,7 @@ class Limits:
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
     """One line."""
-    return json.dumps(content).encode() + b"\n"
+    return msgspec.json.encode(content) + b"\n"
 
 
 class Connection(H11Protocol):
@@ -221,7 +221,7 @@ class HttpThread:
         self.close()
 
     def close(self) -> None:
-        """Stop serving; connections end. Twice is no error."""
+        """Stop serving; connections end. Idempotent."""
         self._server.should_exit = True
         self._thread.join(10.0)
 

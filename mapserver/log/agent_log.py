@@ -1,4 +1,4 @@
-"""What the ingest knows of one agent's log, and when the next piece of it should be pulled."""
+"""State of one agent's log at the ingest, and when the next piece of it should be pulled."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class AgentLog:
         self.refusals = (*self.refusals, *applied.refusals)[-MAX_REFUSALS:]
 
     def heard(self, now: float) -> None:
-        """The agent is there: no need to wait long for the next attempt."""
+        """The agent is reachable: shorten the wait for the next attempt."""
         self._pause = min(self._pause, self.settings.first_pause)
         if self.newest > self.watermark or self.damaged:
             self.pull_at = min(self.pull_at, now + self._pause)
@@ -119,7 +119,7 @@ class AgentLog:
         self.pull_at = now + self._pause
 
     def commit_failed(self, now: float, wait: float) -> None:
-        """The disk did not take it: forget what came, it will be pulled."""
+        """The commit failed: drop the changes ahead, they will be pulled."""
         self.ahead.clear()
         self._pause = wait
         self.pull_at = now + wait

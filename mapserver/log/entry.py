@@ -42,7 +42,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """What became of a batch.
+    """Result of a batch.
 
     Attributes:
         changes: that are new, in order; they are on the disk.
@@ -69,7 +69,7 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What a map has cost on the wire, each change counted once.
+    """Wire bytes of a map, each change counted once.
 
     Attributes:
         nodes: distinct nodes that were put.

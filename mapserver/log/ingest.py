@@ -30,10 +30,6 @@ from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import MAX_ROWS, Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, Refusal
 
-PULLS_AT_ONCE = 4
-"""Of different logs."""
-
-
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT = 3600.0
@@ -57,15 +53,19 @@ class IngestSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Pulled:
-    """What came back for a range of a log."""
+    """Answer for a range of a log."""
 
     map: MapId
     asked: LogRequest
     replies: list[Reply]
 
 
+PULLS_AT_ONCE = 4
+"""Logs that are pulled at once."""
+
+
 class Ingest:
-    """Keeps a store complete. One thread applies; a few more wait for agents' answers."""
+    """Keeps a store complete. One thread applies changes; a few more wait for agents' answers."""
 
     def __init__(
         self,
@@ -128,7 +128,7 @@ class Ingest:
         ]
 
     def counters(self) -> IngestCounters:
-        """What has happened since the start."""
+        """Counters since the start."""
         return self._counters
 
     @property
@@ -137,7 +137,7 @@ class Ingest:
         return self._failure
 
     def close(self) -> None:
-        """Stop listening; what has come is applied, what is missing will be pulled next time."""
+        """Stop listening; received changes are applied, missing ones will be pulled next time."""
         for declared in self._declared:
             declared.close()
         self._declared = []
@@ -169,7 +169,7 @@ class Ingest:
                         self._pullers.submit(self._pull, agent_log.map, asked)
 
     def _drain(self, due: float) -> list[Sample | _Pulled]:
-        """Wait for something to come until a pull is due; take what waits, for one transaction a log."""
+        """Wait for items until a pull is due; take all that wait, for one transaction a log."""
         items: list[Sample | _Pulled] = []
         try:
             item = self._work.get(timeout=min(max(0.0, due - time.monotonic()), LONGEST_WAIT))
@@ -274,7 +274,7 @@ class Ingest:
                 self._count(damaged=1)
                 log.warning("%s from %d: %s", agent_log.map, asked.first, error)
                 if asked.first == asked.last:
-                    # It was asked for alone and cannot even be carried.
+                    # It was asked for alone and does not fit into a message.
                     return [Entry(asked.first, b"", str(error))], asked.first
                 agent_log.chunk = max(1, (asked.last - asked.first + 1) // 4)
                 continue
@@ -312,7 +312,7 @@ class Ingest:
             log.warning("refused %s %d: %s", agent_log.map, refusal.sequence, refusal.reason)
         self._count(applied=len(applied.changes), refused=len(applied.refusals))
         self._pass_on(applied.changes)
-        # Last: a robot whose changes are acknowledged may ask at once what has become of them.
+        # Last: a robot may ask about its changes as soon as they are acknowledged.
         self._acknowledge(agent_log)
 
     def _commit_failed(self, agent_log: AgentLog, error: MapweaveError) -> None:

@@ -1,4 +1,4 @@
-"""What an ingest has seen."""
+"""Counters of an ingest."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, slots=True)
 class IngestCounters:
-    """What has happened since the start.
+    """Counters since the start.
 
     Attributes:
         messages: changes that were published to this server.
@@ -34,5 +34,5 @@ class IngestCounters:
     failures: int = 0
 
     def plus(self, **more: int) -> IngestCounters:
-        """With some of them raised."""
+        """The same with some of them raised."""
         return replace(self, **{name: getattr(self, name) + by for name, by in more.items()})

@@ -1,4 +1,4 @@
-"""Rows of the store that are not what was written are found by their checksums and taken out.
+"""Damaged rows of the store are found by their checksums and removed.
 
 A flipped bit costs the row that it hits, not the store: the good rows are copied into a fresh table, and for
 each lost change the part of its log that must be pulled from its robot again is recorded. A damaged key is

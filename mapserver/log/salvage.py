@@ -1,4 +1,4 @@
-"""What can still be read of a store that does not open any more."""
+"""Salvage of a store that does not open any more."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from mapweave.wire.codec import decode_body
 
 @dataclass(frozen=True)
 class Salvage:
-    """What was found.
+    """Result of a salvage.
 
     Attributes:
         maps: the replay of the changes that are good, by their map.
         changes: how many these are.
-        damaged: rows that are not what was written.
+        damaged: rows with wrong checksums.
         whole: whether all pages could be read.
     """
 
@@ -35,7 +35,7 @@ class Salvage:
 
 
 def salvage(path: Path) -> Salvage:
-    """Read all changes that are what was written; the file stays as it is.
+    """Read all undamaged changes; the file is not modified.
 
     Raises:
         InvalidFile: nothing in it can be read.

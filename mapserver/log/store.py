@@ -1,4 +1,4 @@
-"""The server's disk: every agent's log, exactly once and in order, and what the server itself has decided."""
+"""The server's disk: every agent's log, exactly once and in order, and the server's own results."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Store:
     """All logs in one SQLite file. Its methods may be called from any thread.
 
     Attributes:
-        id: drawn by chance when the store was made, see mapweave.wire.log_messages.Ack.
+        id: random, drawn when the store was made, see mapweave.wire.log_messages.Ack.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,12 +82,12 @@ class Store:
         return nodes
 
     def watermark(self, map_id: MapId) -> int:
-        """Up to which change the log is settled, 0 if nothing is known."""
+        """Up to which change the log is settled, 0 without a log."""
         rows = self._read("SELECT watermark FROM log WHERE agent = ? AND epoch = ?", map_id)
         return int(rows[0][0]) if rows else 0
 
     def log_id(self, map_id: MapId) -> int | None:
-        """Which log goes by this name, None if nothing is known."""
+        """Id of the log of this name, None without one."""
         rows = self._read("SELECT log_id FROM log WHERE agent = ? AND epoch = ?", map_id)
         return int(rows[0][0]) if rows else None
 
@@ -236,7 +236,7 @@ class Store:
             insert(rows, "ruling", (newest + 1, body))
 
     def put_result(self, name: str, value: bytes) -> None:
-        """Keep something else that the server has worked out.
+        """Store another result of the server.
 
         Raises:
             InvalidFile: the disk does not take it.
@@ -245,12 +245,12 @@ class Store:
             insert(rows, "result", (name, value))
 
     def result(self, name: str) -> bytes | None:
-        """What was kept under this name."""
+        """The result of this name."""
         rows = self._read("SELECT value FROM result WHERE name = ?", (name,))
         return bytes(rows[0][0]) if rows else None
 
     def close(self) -> None:
-        """Let go of the file. Twice is no error."""
+        """Close the file. Idempotent."""
         with self._lock:
             self._database.close()
 
@@ -293,7 +293,7 @@ class Store:
         return bool(self._read(query, (*change.map, change.sequence, number, *retired)))
 
     def _objection(self, change: Change) -> str:
-        """Why a change that decodes still cannot be taken; empty if it can."""
+        """Why a decoded change is refused; empty if it is accepted."""
         if isinstance(change.body, EdgePut) and len(change.body.edge.shared):
             edge = change.body.edge
             for end, highest in zip((edge.a, edge.b), edge.shared.max(axis=0), strict=True):

@@ -31,7 +31,7 @@ class _Failure:
 class Isolation:
     """Which maps are set apart. One is tried again when it has changed: once, twice, four times ... .
 
-    To find out with which map a merge fails takes many merges, so who breaks it again and again waits longer.
+    To find the map with which a merge fails takes many merges, so a map that fails repeatedly waits longer.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Isolation:
 def leave_out(
     maps: Sequence[MapId], attempt: Callable[[Collection[MapId]], T]
 ) -> tuple[T, dict[MapId, Exception]]:
-    """Do something with as many maps as it works with.
+    """Attempt something with as many maps as possible.
 
     All together first, else the first half and then the second, each with what works already. Of two maps
     with which it fails together the later one is left out. One bad map of N takes about 2 log2 N attempts.
@@ -83,7 +83,7 @@ def leave_out(
         attempt: fails by any exception.
 
     Returns:
-        What came of it, and the maps that were left out.
+        The result, and the maps that were left out.
 
     Raises:
         Exception: it fails with no map at all.

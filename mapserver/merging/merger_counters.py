@@ -1,4 +1,4 @@
-"""What a merger has done since it started, in numbers."""
+"""Counters of a merger."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass
 class MergerCounters:
-    """What the merger has done since it started.
+    """Counters of the merger since its start.
 
     Attributes:
         changes: taken in.

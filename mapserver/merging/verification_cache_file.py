@@ -1,4 +1,4 @@
-"""The findings as a file (see mapweave.mapserver.checksummed_file), so that a server that starts again need
+"""The verification cache as a file (see mapweave.mapserver.checksummed_file), so that a restarted server need
 not compare again.
 
 header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON), links ...

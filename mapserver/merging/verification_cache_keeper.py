@@ -24,7 +24,7 @@ WORTHWHILE = 0.02
 
 
 class VerificationCacheKeeper:
-    """Brings them back at the start, and saves them after merges. Only the merging thread may call it."""
+    """Loads the cache at the start, and saves it after merges. Only the merging thread may call it."""
 
     def __init__(self, path: Path, fresh: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
         """Take note of where they lie.
@@ -65,7 +65,7 @@ class VerificationCacheKeeper:
             last: there is no later call: save anything new.
         """
         if merger.recollecting:
-            return  # The file knows more than this process yet.
+            return  # The file has more than this process yet.
         now, least = merger.compared, 0.0 if last else WORTHWHILE
         new = max(abs(count - before) for count, before in zip(now, self._saved, strict=True))
         if not new or new < least * max(now) or (self._clock() < self._rest_until and not last):
@@ -81,5 +81,4 @@ class VerificationCacheKeeper:
 
 
 def _made_by(merger: Merger) -> str:
-    settings = merger.settings
-    return f"{version('mapweave')} {settings.candidates} {settings.verification} {settings.merging}"
+    return f"{version('mapweave')} {merger.settings}"

@@ -83,12 +83,13 @@ def run(arguments: argparse.Namespace) -> int:
         mission=Carried(),
         server=network.server,
         total=len(robot),
+        trajectories=True,
         patience=0.0 if arguments.offline else arguments.patience,
     )
     stop = stop_on_signals()
     bus, keys = connect(network)
     try:
-        run_agent(robot, bus, keys, settings.pipeline, options, stop)
+        run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
         bus.close()
     return 0

@@ -37,7 +37,7 @@ class Children:
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Children:
-        """Nothing runs yet."""
+        """Prepare; nothing runs yet."""
         return self
 
     def __exit__(

@@ -81,7 +81,7 @@ class Film:
         self.frames += 1
 
     def close(self) -> None:
-        """Finish the film; without frames there is none. Twice is no error.
+        """Finish the film; without frames there is none. Idempotent.
 
         Raises:
             InvalidFile: OpenCV could not encode a frame.

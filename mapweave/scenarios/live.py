@@ -79,7 +79,7 @@ class Live:
         self._latest = (1 if self._latest is None else self._latest[0] + 1, frame)
 
     def close(self) -> None:
-        """Stop serving; every viewer's stream ends. Twice is no error."""
+        """Stop serving; every viewer's stream ends. Idempotent."""
         self._closed = True
         self._http.close()
 

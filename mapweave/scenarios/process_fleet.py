@@ -29,7 +29,7 @@ class ProcessFleet:
     """
 
     def __init__(self, stage: Stage) -> None:
-        """Nothing runs yet."""
+        """Prepare; nothing runs yet."""
         self._stage = stage
         self.keys = Keys(FLEET)
         self._fleet_port, self._simulator_port = free_port(), free_port()

@@ -91,7 +91,7 @@ def _hang(rng: np.random.Generator, start: Point, end: Point, spacing: float, he
     """Prints, signs and doors along a face at irregular distances.
 
     Args:
-        rng: where chance comes from.
+        rng: random numbers.
         start: where the face begins; the floor is to its left.
         end: where it ends.
         spacing: of prints on the average, m.

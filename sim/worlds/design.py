@@ -98,7 +98,7 @@ class Furniture:
     """A box that stands on the floor.
 
     Attributes:
-        name: what it is.
+        name: of the thing.
         at: its middle.
         length: along its own x axis.
         width: along its own y axis.
@@ -176,7 +176,7 @@ class Design:
         background: grey above the walls.
         start_rooms: names of the rooms in which robots start; by default those called "room ...", or if no
             room is, all that are larger than a door opening.
-        look_along: whether robots start looking along the longer side of their room.
+        look_along: whether robots start facing along the longer side of their room.
         rooms: at least one.
         walls: solid.
         furniture: solid.

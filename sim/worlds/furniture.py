@@ -40,7 +40,7 @@ def furnish(
     """Put furniture into a room: as much of what is wanted as leaves every way open.
 
     Args:
-        rng: where chance comes from.
+        rng: random numbers.
         plan: with the furniture so far.
         room: upright, of the plan.
         stock: what to choose from.

@@ -107,5 +107,5 @@ def home() -> World:
 
 @pytest.fixture(scope="module")
 def own_map(home: World) -> HybridMap:
-    """Three nodes in a row in it, each 1.2 m before the one before."""
+    """Three nodes in a row in it, 1.2 m apart."""
     return home_map(home)

@@ -34,7 +34,7 @@ def rangers(pose: Pose2) -> np.ndarray:
 
 
 def live(walls, pipeline: Pipeline, ticks: int) -> tuple[list[Observation], list[Step], list[Pose2]]:
-    """Let a pipeline drive a body that does exactly what it is told."""
+    """Let a pipeline drive a base that executes its commands exactly."""
     pose, moved = Pose2(), Odometry(0.0, 0.0)
     observations, steps, poses = [], [], []
     for tick in range(ticks):

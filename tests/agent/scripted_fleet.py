@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from mapweave.agent.mission import Answer, Question
-from mapweave.agent.navigation.navigator import Navigator, NavigatorSettings
+from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
@@ -36,7 +37,7 @@ def home_world() -> World:
 
 
 def home_map(home: World) -> HybridMap:
-    """Three nodes in a row, each 1.2 m before the one before."""
+    """Three nodes in a row, 1.2 m apart."""
     nodes, edges = take_map(home, MapId("r0", 1), TOUR, np.random.default_rng(2), sigma_xy=0.002)
     return HybridMap([*map(NodePut, nodes), *map(EdgePut, edges)])
 
@@ -55,7 +56,7 @@ class Eyes:
 
 
 class Trial:
-    """A navigator, a body that does what it is told unless it is held, and a scripted fleet."""
+    """A navigator, a base that executes its commands unless it is held, and a scripted fleet."""
 
     def __init__(
         self, navigator: Navigator, eyes: Eyes, fleet: Fleet, proximity: np.ndarray = FREE, held: bool = False
@@ -88,7 +89,8 @@ class Trial:
 def navigator(
     eyes: Eyes, own: HybridMap, goal: NodeId, settings: NavigatorSettings | None = None
 ) -> Navigator:
-    return Navigator(BODY, Lens(BODY.camera, BODY.distortion), eyes, own, goal, settings)  # type: ignore[arg-type]
+    every = AgentSettings(navigation=settings or NavigatorSettings())
+    return Navigator(BODY, Lens(BODY.camera, BODY.distortion), eyes, own, goal, every)  # type: ignore[arg-type]
 
 
 def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:

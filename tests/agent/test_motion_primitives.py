@@ -48,7 +48,7 @@ def test_a_busy_server_is_asked_again_at_its_time() -> None:
     answer, asked = ask(fleet)
     assert isinstance(answer.content, RouteAnswer)
     assert len(asked) == 3
-    # An answer is heard a tick after the question; a tick is the finest that time is told apart.
+    # An answer is received a tick after the question; a tick is the resolution of time.
     assert asked[1] - asked[0] == pytest.approx(0.9, abs=0.11)
     assert asked[2] - asked[1] == pytest.approx(2.1, abs=0.11)
 

@@ -13,7 +13,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from mapweave.agent.observation import RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid, OccupancyGridSettings
+from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.agent.settings import OccupancyGridSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 
@@ -278,7 +279,7 @@ def test_no_way_out_of_a_trap_leads_through_a_wall():
 
 
 def test_a_shifted_grid_keeps_its_overlap():
-    """Against a floor that never rolls, cell by cell, wherever both reach."""
+    """Against a grid that is never shifted, cell by cell, where both reach."""
     rng = np.random.default_rng(4)
     whole, small = OccupancyGrid(ROBOT, SETTINGS), OccupancyGrid(ROBOT, OccupancyGridSettings(side=7.0))
     at = np.zeros(2)

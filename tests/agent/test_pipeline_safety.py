@@ -16,7 +16,7 @@ from tests.agent.ranged_body import BEARINGS, BODY, ROOM, live, on, still
 
 @pytest.fixture
 def reckless(monkeypatch):
-    """An explorer that wants something whatever is in the way."""
+    """An explorer that drives against any obstacle."""
 
     def want(command: Command) -> Pipeline:
         monkeypatch.setattr(Explorer, "step", lambda self, *seen: (command, []))

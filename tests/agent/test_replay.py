@@ -291,7 +291,7 @@ WRONG_IMAGES = {
 
 
 def refused(action) -> str:
-    """The one line with which something is refused."""
+    """The one line of a refusal."""
     with pytest.raises(DeviceError) as error:
         action()
     assert "\n" not in str(error.value)

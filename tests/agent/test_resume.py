@@ -26,7 +26,7 @@ ROBOT = "r0"
 SEED = 3
 
 LOOKS = 30.0
-"""Seconds: two looks that agree, where it was killed, and a view mapped."""
+"""Seconds: two views that agree, where it was killed, and a view mapped."""
 
 
 class Life:
@@ -183,7 +183,7 @@ def test_resuming_again_is_the_same_to_the_last_bit(
 
 
 def moved(begun: Begun) -> Pose2:
-    """1 m away, in whichever direction there is room, and turned by 40 degrees."""
+    """1 m away, in any direction with room, and turned by 40 degrees."""
     here = begun.standing
     for angle in np.arange(0.0, math.tau, 0.3):
         away = Pose2(here.x + math.cos(angle), here.y + math.sin(angle), here.heading + math.radians(40.0))
@@ -193,14 +193,14 @@ def moved(begun: Begun) -> Pose2:
 
 
 def test_an_agent_that_was_killed_and_moved(begun: Begun, tmp_path: Path) -> None:
-    """How long it looks around until two looks agree is luck; that they do, and are right, is not."""
+    """The time until two views agree is luck; that they do, and are right, is not."""
     life, _ = resumed(begun, tmp_path, moved(begun), 1.0)
     life.map_on(90.0)
     check_resumed(begun, life, begun.truth | life.truth())
 
 
 def test_nothing_is_appended_where_nothing_is_recognised(begun: Begun, tmp_path: Path) -> None:
-    """It wakes up in a room that it has never seen, looks around there, and adds nothing."""
+    """It starts in a room that it has never seen, turns there, and adds nothing."""
     rooms = [
         r for r in begun.world.plan.rooms if math.hypot(r.x - begun.standing.x, r.y - begun.standing.y) > 3
     ]
@@ -212,7 +212,7 @@ def test_nothing_is_appended_where_nothing_is_recognised(begun: Begun, tmp_path:
     assert life.made() == []
     assert life.said == ["looking for a place of its own map"]
     turned = np.ptp(np.unwrap(life.sim.trajectory(ROBOT)[1][:, 2]))
-    assert turned > math.pi, "it looks around"
+    assert turned > math.pi, "it turns around"
 
 
 def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path: Path) -> None:

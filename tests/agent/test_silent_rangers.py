@@ -27,7 +27,7 @@ NAN: Broken = lambda readings: np.where(np.arange(len(readings)) == 3, np.nan, r
 
 
 class Drive:
-    """A body that does what it is told, among the photographs, with rangers that may break."""
+    """A base that executes its commands, among the photographs, with rangers that may fail."""
 
     def __init__(self, walls, pipeline: Pipeline) -> None:
         self.walls, self.pipeline = walls, pipeline

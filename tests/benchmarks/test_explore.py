@@ -43,7 +43,7 @@ def test_a_node_shows_what_is_visible_in_its_field_of_view(pose: Pose2) -> None:
             and abs(math.remainder(off, math.tau)) <= 0.5
             and PLAN.clearances(line).min() > 0.0
         )
-        # Lines that only just miss a corner are left to the one or the other.
+        # Lines that only just miss a corner may differ.
         if PLAN.clearances(line).min() > 0.01 or PLAN.clearances(line).min() == 0.0:
             assert found == seen
     assert 0.01 < shown.mean() < 0.5
@@ -132,7 +132,7 @@ def test_figures_by_hand(tmp_path) -> None:
 
 
 def test_a_short_race() -> None:
-    """One robot for some seconds: both strategies run in the same office; nobody is there to be asked."""
+    """One robot for some seconds: both strategies run in the same office, without a fleet."""
     done = measure([1], 3, 0.16, 1, spread=False, quiet=True)
     assert set(done["ours"]) == set(done["random"]) == {1}
     assert not done["fleet"]

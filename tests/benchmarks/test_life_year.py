@@ -28,6 +28,6 @@ def test_links_lead_to_active_nodes() -> None:
 
 def test_both_ways_of_merging_find_the_same() -> None:
     figures = run(7, 2, 0.0, 30, alone=False, console=Console(quiet=True))
-    assert figures["components"] == figures["anew_components"] == 1
+    assert figures["components"] == figures["fresh_components"] == 1
     assert figures["links_apart"] == figures["links_false"] == figures["links_missed"] == 0
-    assert figures["living_error_m"] < 0.2
+    assert figures["active_error_m"] < 0.2

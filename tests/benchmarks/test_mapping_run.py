@@ -17,8 +17,8 @@ from benchmarks.mapping_run.benchmark import main, notes
 from benchmarks.mapping_run.scene import MappingDrive, Moment, drive
 from benchmarks.mapping_run.score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
-from mapweave.agent.ekf.mapping_filter import FilterSettings
 from mapweave.agent.observation import Odometry
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.camera import WEBCAM
 from mapweave.sim.robots import RobotSetup
@@ -89,7 +89,7 @@ def test_mismatched_comparisons_are_reported() -> None:
     told = notes({"line": seen, "person": unseen}, {"line": "carried off", "person": ""})
     assert [line.split(":")[0] for line in told] == ["line", "person", "person"]
     assert "carried off" in told[0]
-    assert "nobody came into view" in told[1]
+    assert "no person came into view" in told[1]
     assert "no landmark was left" in told[2]
 
 
@@ -114,7 +114,7 @@ def test_a_person_in_the_view_changes_nothing_else() -> None:
     assert np.isfinite(bearings).sum() > 5
     assert all(math.isnan(m.person) for m in alone.moments)
     first = int(np.isfinite(bearings).argmax())
-    # Somebody's edge comes into view before the middle does.
+    # A landmark's edge comes into view before its middle does.
     assert alone.moments[first - 8].pose.mean == passed.moments[first - 8].pose.mean
     assert len(passed.moments[-1].ids) < len(alone.moments[-1].ids)
     assert figures(passed)["person_in_view_s"] == pytest.approx(0.1 * np.isfinite(bearings).sum())
@@ -129,7 +129,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(run: MappingD
 
 def test_true_points_are_on_the_surfaces_of_the_picture(run: MappingDrive) -> None:
     """A true point, seen from the end of the way, shows what the anchor showed around it: the truth moves
-    with the picture as the robot does, whatever trackers and filters think.
+    with the picture as the robot does, independent of trackers and filters.
     """
     camera = run.robot.camera
     number = max(range(len(run.moments)), key=lambda k: run.moments[k].true.x if k in run.images else -1.0)
@@ -190,7 +190,7 @@ def test_a_patch_across_an_edge_is_no_point() -> None:
 
 
 def test_the_score_of_a_known_error_is_that_error() -> None:
-    """A robot that is 3 cm and 2 deg off, with landmarks whose errors are drawn from what is believed."""
+    """A robot that is 3 cm and 2 deg off, with landmarks whose errors are drawn from the covariance."""
     rng = np.random.default_rng(1)
     robot = RobotSetup("r0").describe()
     camera, n = robot.camera, 4000

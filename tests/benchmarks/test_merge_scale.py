@@ -1,4 +1,4 @@
-"""The merge at scale: the building is what it says, and a small fleet goes through whole."""
+"""The merge at scale: the building is as specified, and a small fleet is merged completely."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from synthetic.building import Building
 
 
 def test_links_that_are_drawn_are_those_that_would_be_found() -> None:
-    """Verification confirms most pairs that are said to show the same, and where they stand."""
+    """Verification confirms most pairs that are specified to show the same, with their relative poses."""
     building = Building.draw(3, 24, 5)
     told = np.ones(building.rooms.shape, np.bool_)
     nodes = {b.node.id: b.node for r in range(3) for _, b in building.log(r) if isinstance(b, NodePut)}

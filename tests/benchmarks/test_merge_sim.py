@@ -1,4 +1,4 @@
-"""Merging in the simulator: rays against the renderer, wrong joins, and runs that fail are told."""
+"""Merging in the simulator: rays against the renderer, wrong joins, and failing runs are reported."""
 
 import json
 import signal

@@ -27,7 +27,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.floorplan import FloorPlan, Rectangle
-from mapweave.sim.ground_truth_client import RobotStatus, SimStatus
+from mapweave.sim.ground_truth_messages import RobotStatus, SimStatus
 from mapweave.sim.snapshot import Snapshot
 from synthetic.world import room, take_map
 
@@ -198,7 +198,7 @@ def test_a_drive_is_timed_measured_and_ended(arrives: bool) -> None:
     assert one.driven == pytest.approx(2.0) and one.path_over_shortest == pytest.approx(1.25)
     assert (one.error_m, one.error_deg) == pytest.approx((0.01, math.degrees(0.02)), abs=1e-3)
     assert one.desired[0, 0] == 30 and one.reached[0, 0] == 30
-    assert [words.split(":")[0] for _, words in one.story][:2] == ["looking", "driving"]
+    assert [words.split(":")[0] for _, words in one.events][:2] == ["looking", "driving"]
     if arrives:
         assert one.success and one.time_s == pytest.approx(21.5, abs=0.6)
     else:

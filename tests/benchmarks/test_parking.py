@@ -46,7 +46,7 @@ def test_parking_is_judged_by_the_truth(scene):
     assert math.hypot(x, y) < 0.02
     exact = first.error_m <= 0.01 and first.error_deg <= 1.0
     assert first.success == (exact and min(first.record.seen) >= LEAST_VISIBLE and not first.collisions)
-    # The servo believes what is so: better than a robot that only counts the turns of its wheels.
+    # The servo gets the truth: better than a robot that only counts the turns of its wheels.
     assert first.believed_m == pytest.approx(first.error_m, abs=0.02)
 
 

@@ -219,7 +219,7 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
     assert np.allclose(found, weights, atol=0.5)
     for row in reliability(seen, found):
         if row["places"] > 200:
-            assert row["right"] == pytest.approx(row["told"], abs=0.05)
+            assert row["right"] == pytest.approx(row["predicted"], abs=0.05)
 
 
 def test_the_benchmarks_own_work_is_not_timed() -> None:

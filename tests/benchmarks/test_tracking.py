@@ -44,7 +44,7 @@ def drive(request: pytest.FixtureRequest) -> Drive:
 
 
 def test_the_truth_agrees_with_the_pictures(drive: Drive):
-    """Features found anew in a later picture, by SIFT alone, are where the truth has those of the first."""
+    """Features found again in a later picture, by SIFT alone, are where the truth has those of the first."""
     lens = Lens(drive.description.camera, drive.description.distortion)
     first, last = (Sift(lens).extract(drive.images[k]) for k in (0, -1))
     truth = drive.truth(first.pixels)

@@ -37,7 +37,7 @@ def test_contents_are_a_log_of_the_same_map(log: list[ChangeBody]) -> None:
     again = HybridMap(first.contents())
     assert set(first.nodes) == set(again.nodes)
     assert first.edges == again.edges
-    # Graph and edges tell the same story at every moment.
+    # Graph and edges agree at every moment.
     keys = {key for _, _, key in first.graph.edges(keys=True)}
     assert keys == set(first.edges)
     for key, one in first.edges.items():

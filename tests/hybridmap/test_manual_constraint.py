@@ -1,4 +1,4 @@
-"""Rulings: the last one counts, the whole record stays."""
+"""Manual constraints: the last one counts, the whole record stays."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_depths_beyond_use_are_unknown() -> None:
 
 
 def test_snapped_landmarks_keep_their_order() -> None:
-    """Edges of a node refer to its landmarks by number, also where a node is told anew."""
+    """Edges of a node refer to its landmarks by number, also where a node is written again."""
     random = np.random.default_rng(6)
     pixels = (random.uniform(0, 1, (50, 2)) * [319, 239]).astype(np.float32)
     codes = random.integers(0, 64, (50, 32)).astype(np.uint8)

@@ -38,14 +38,14 @@ class MappedRoom:
     truth: dict[NodeId, Pose2]
 
     def view(self, node: NodeId, seed: int = 5) -> View:
-        """What is seen a little beside a node."""
+        """A view a little away from a node."""
         pose = self.truth[node] @ Pose2(0.1, 0.05, 0.05)
         return take_view(self.world, pose, np.random.default_rng(seed))[0]
 
 
 @pytest.fixture(scope="session")
 def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], MappedRoom]:
-    """Makes a store anew at each call."""
+    """Makes a new store at each call."""
     rng = np.random.default_rng(4)
     world = room(0, 0, 5, 4, 600, rng)
     stops = [Pose2(2.2 + 0.1 * k, 1.8 + 0.05 * k, 0.9 * k) for k in range(7)]
@@ -83,7 +83,7 @@ def server(hub: MemoryHub, tmp_path: Path) -> Iterator[Server]:
 
 @pytest.fixture
 def agent(hub: MemoryHub) -> Iterator[HandAgent]:
-    """Who speaks to it."""
+    """The client of it."""
     agent = HandAgent(hub)
     yield agent
     agent.bus.close()

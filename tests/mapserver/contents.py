@@ -42,7 +42,7 @@ def covariance(rng: np.random.Generator) -> Array:
 
 
 def camera(rng: np.random.Generator) -> Camera:
-    """The usual one, or any that a message can tell of."""
+    """The usual one, or any that a message can hold."""
     if rng.random() < 0.7:
         return CAMERA
     focal = 10.0 ** rng.uniform(-3, 6, 2)

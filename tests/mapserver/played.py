@@ -27,7 +27,7 @@ def message(sequence: int, map_id: MapId = MAP) -> bytes:
 
 
 class HandAgent:
-    """Does exactly what the test says."""
+    """Does exactly what the test scripts."""
 
     def __init__(self, hub: MemoryHub, map_id: MapId = MAP, log_id: int = LOG_ID) -> None:
         self.bus = MemoryBus(hub)
@@ -50,7 +50,7 @@ class HandAgent:
     def serve(
         self, newest: int, answer: Callable[[LogRequest], LogAnswer | bytes | str] | None = None
     ) -> None:
-        """Answer for the log 1 .. newest, or as told; text refuses."""
+        """Answer for the log 1 .. newest, or as scripted; text refuses."""
         self.log = {sequence: message(sequence, self.map) for sequence in range(1, newest + 1)}
 
         def handle(request: Request) -> None:

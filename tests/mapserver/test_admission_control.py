@@ -1,4 +1,4 @@
-"""The desk: in time or refused, and who is refused comes back when there is room."""
+"""Admission control: in time or refused, and refused questions come back when there is room."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import Busy, SettingsError
-from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
+from mapweave.mapserver.admission_control import LONGEST_PAUSE, AdmissionControl, AdmissionSettings
 from mapweave.mapserver.schedule import LockstepSchedule
+from mapweave.storage.settings_file import build
 
 
 class Clock:
@@ -24,7 +25,7 @@ class Clock:
 
 
 class Counter:
-    """A desk whose workers are all held up until they are let go."""
+    """An admission control whose workers are all held up until released."""
 
     def __init__(self, settings: AdmissionSettings) -> None:
         self.clock = Clock()
@@ -82,7 +83,7 @@ def test_a_free_worker_takes_a_job_of_any_cost() -> None:
 
 
 def test_a_refused_crowd_comes_back_in_sequence() -> None:
-    """Fifty ask at once and keep to what they are told: the queue never fills again."""
+    """Fifty ask at once and keep to their retry times: the queue never fills again."""
     workers, seconds = 2, 0.05
     settings = AdmissionSettings(workers, in_time=0.5, first_guess=seconds)
     counter = Counter(settings)
@@ -91,7 +92,7 @@ def test_a_refused_crowd_comes_back_in_sequence() -> None:
     assert pauses == sorted(pauses)
     gaps = [b - a for a, b in itertools.pairwise(pauses)]
     assert gaps == pytest.approx([seconds / workers] * len(gaps))
-    # By hand: from now on one is done each 25 ms, and the refused come as they were told.
+    # By hand: from now on one is done each 25 ms, and the refused come at their retry times.
     open_ones = counter.taken
     step = seconds / workers
     for k, pause in enumerate(pauses):
@@ -102,9 +103,9 @@ def test_a_refused_crowd_comes_back_in_sequence() -> None:
 
 
 class Simulated:
-    """A desk whose time is simulated: each question takes as long, and every robot asks on and on.
+    """An admission control in simulated time: each question takes as long, and every robot asks on and on.
 
-    Only the desk's own rules are used; who is at work and when it ends is told by hand.
+    Only its own rules are used; the workers and their ends are simulated.
     """
 
     def __init__(self, robots: int, seconds: float, keep: bool, rng: np.random.Generator) -> None:
@@ -160,7 +161,7 @@ def test_all_get_a_turn() -> None:
     whole_round = robots * seconds
     assert max(*fair.waits, fair.longest) < 1.5 * whole_round
     assert unfair.longest > 3.0 * whole_round, "without them, who comes first goes on coming first"
-    # The worker is never without work for long, and nobody comes in vain more than about once.
+    # The worker is never without work for long, and no question is refused again more than about once.
     assert len(fair.waits) > 0.95 * 100.0 / seconds
     assert fair.refusals < 1.1 * len(fair.waits)
 
@@ -173,7 +174,7 @@ def test_an_appointment_has_precedence_and_expires() -> None:
     assert pause > 0.0
     assert counter.ask(ticket=88) > pause
     counter.clock.now += pause
-    # Nobody was served meanwhile: one more would be too late, but who was told to come is taken on.
+    # None was served in between: one more would be too late, but an appointment is accepted.
     assert counter.ask(ticket=99) > 0.0
     assert counter.ask(ticket=77) == 0.0
     counter.clock.now += 30.0
@@ -224,7 +225,7 @@ def test_questions_that_waited_too_long_are_refused() -> None:
     assert waited == pytest.approx([0.0, 0.4])
     for refusal in refusals[2:]:
         assert isinstance(refusal, Busy)
-        assert 0.0 < refusal.retry_after <= settings.longest_pause
+        assert 0.0 < refusal.retry_after <= LONGEST_PAUSE
     assert refusals[:2] == [None, None]
     assert desk.counters()["busy"] == 3
     assert desk.counters()["open"] == 0
@@ -234,11 +235,11 @@ def test_questions_that_waited_too_long_are_refused() -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [("workers", -1), ("workers", 65), ("in_time", 0.0), ("in_time", float("nan")), ("too_late", 0.5),
-     ("first_guess", 0.0), ("longest_pause", -1.0), ("smoothing", 0.0), ("smoothing", 1.5)],
+     ("first_guess", 0.0), ("smoothing", 0.0), ("smoothing", 1.5)],
 )  # fmt: skip
 def test_settings_that_cannot_work(name: str, value: float) -> None:
-    with pytest.raises(SettingsError, match=f"{value:g}|{name}"):
-        AdmissionSettings(**{name: value})
+    with pytest.raises(SettingsError, match=f"^file: {name}: .*{value}"):
+        build(AdmissionSettings, {name: value}, "file")
 
 
 def test_closing_finishes_accepted_jobs() -> None:

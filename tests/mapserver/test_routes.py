@@ -64,7 +64,7 @@ def test_the_first_leg_leads_from_the_node_that_the_robot_knows(row: tuple[Route
 
 
 def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> None:
-    """Two robots see one wall from three metres apart; then somebody drives from the one to the other."""
+    """Two robots see one wall from three metres apart; then a robot drives from one to the other."""
     rng = np.random.default_rng(1)
     world, other = room(0, 0, 9, 4, 1400, rng), MapId("b", 1)
     merger, ends = Merger(), []

@@ -1,4 +1,4 @@
-"""Nobody's map ends the fleet: what a robot may legally send, and what it may not, also over restarts."""
+"""No map ends the fleet: what a robot may legally send, and what it may not, also over restarts."""
 
 from __future__ import annotations
 
@@ -34,11 +34,10 @@ from mapweave.merge.outlier_rejection import decision_cache
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Reply, Request
 from mapweave.wire.codec import decode_change, encode_body, encode_change, wrap_body
-from mapweave.wire.explanation_messages import encode_ruling
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import decode_relocalize_answer, encode_view
+from mapweave.wire.messages import decode, encode, encode_view
 from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.contents import content
 from tests.waiting import eventually
@@ -80,7 +79,7 @@ def stored(path: Path, logs: dict[MapId, list[bytes]]) -> Store:
 
 
 def node(number: int, landmarks: int = 100) -> Node:
-    """Of a place that nobody else has seen, with at most so many landmarks."""
+    """Of a place that no other robot has seen, with at most so many landmarks."""
     rng = np.random.default_rng(3)
     (some,), _ = take_map(room(0, 0, 5, 4, 600, rng), BAD, TOUR[:1], rng)
     return replace(some, id=NodeId(*BAD, number), landmarks=some.landmarks.take(np.arange(landmarks)))
@@ -118,7 +117,7 @@ def attacks() -> dict[str, list[bytes]]:
 
 
 class Fleet:
-    """A server, and somebody at the bus who plays all robots and people."""
+    """A server, and a client at the bus that plays all robots and people."""
 
     def __init__(self, path: Path) -> None:
         hub = MemoryHub()
@@ -135,9 +134,9 @@ class Fleet:
         return dict(decode_record(self.ask(KEYS.server_status("s0"), b"").payload))
 
     def where(self) -> list[RelocalizeAnswer]:
-        """What lost robots are told."""
+        """Answers to lost robots."""
         replies = [self.ask(KEYS.relocalize("s0"), encode_view(view)) for view in views()]
-        return [decode_relocalize_answer(reply.payload) for reply in replies]
+        return [decode(reply.payload, RelocalizeAnswer) for reply in replies]
 
     def tell(self, map_id: MapId, log: list[bytes]) -> None:
         """Have the server pull a log, and wait until it has."""
@@ -199,7 +198,7 @@ def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path: Path) -> No
 
 
 def fails_with(monkeypatch: pytest.MonkeyPatch, bad: MapId) -> None:
-    """Let the merge fail with a map, by a defect that nobody knows yet."""
+    """Let the merge fail with a map, by an unknown defect."""
     real = decision_cache.fragments_of
 
     def fails(maps: dict[MapId, HybridMap], *more: Any) -> Any:
@@ -234,16 +233,14 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         # It was said before.
         assert [one.words for one in fleet.server.history()].count(words) == 1
         retire = ManualConstraint((BAD, BAD), True, "anna", 10**18, "it is mad")
-        reply = fleet.ask(KEYS.rule("s0"), encode_ruling(retire))
+        reply = fleet.ask(KEYS.rule("s0"), encode(retire))
         assert not reply.error
         assert fleet.server.settle(30)
         status = fleet.status()
         assert (status["set_apart"], status["links"], status["rulings"]) == (0, links, 1)
         assert status["event"] == "map bad.1 is no longer set apart"
         assert told(fleet.where()) == places
-        never = fleet.ask(
-            KEYS.rule("s0"), encode_ruling(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1))
-        )
+        never = fleet.ask(KEYS.rule("s0"), encode(ManualConstraint((MapId("x", 9),) * 2, True, "anna", 1)))
         assert "there is no map x.9" in never.error
 
 
@@ -261,16 +258,14 @@ def test_a_map_can_be_retired_when_nothing_can_be_merged(
         patch.setattr(Merger, "apart", fails)
         with serving(path) as fleet:
             assert not fleet.status()["nodes"]
-            reply = fleet.ask(
-                KEYS.rule("s0"), encode_ruling(ManualConstraint((BAD, BAD), True, "anna", 10**18))
-            )
+            reply = fleet.ask(KEYS.rule("s0"), encode(ManualConstraint((BAD, BAD), True, "anna", 10**18)))
             assert not reply.error, reply.error
     with serving(path) as fleet:
         assert fleet.status()["rulings"] == 1
 
 
 class Beside:
-    """Two sound robots, merged anew with the content of a third one, which a store has taken in."""
+    """Two correct robots, merged again with the content of a third one, which is in the store."""
 
     def __init__(self, folder: Path) -> None:
         self.store = stored(folder / "s0.sqlite", sound_logs())
@@ -333,7 +328,7 @@ def test_300_random_legal_contents_change_nothing_for_sound_robots(part: int, be
 
 
 def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
-    """They are linked with sound maps, and may move these; nothing fails by them, and nobody is unheard."""
+    """They are linked with correct maps, and may move these; nothing fails, and no map is left out."""
     seen = [body.node for _, body in beside.sound if isinstance(body, NodePut)]
     linked = 0
     for seed in range(30):

@@ -1,4 +1,4 @@
-"""The command line as tests use it: what a command that fails says, and which commands there are."""
+"""The command line as tests use it: messages of failing commands, and the list of commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CAMERA = "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m 
 
 
 def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What a command that fails says: exactly one line."""
+    """The message of a failing command: exactly one line."""
     assert main([str(a) for a in arguments]) == 1
     said = capfd.readouterr().err.splitlines()
     assert len(said) == 1, said

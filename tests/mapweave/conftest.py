@@ -1,4 +1,4 @@
-"""What the tests of commands need: a recording, a taken port, an endpoint where nobody is."""
+"""What the tests of commands need: a recording, a taken port, an unused endpoint."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def port() -> Iterator[int]:
 
 @pytest.fixture
 def nobody() -> str:
-    """An endpoint where nobody listens."""
+    """An endpoint without a listener."""
     return f"tcp/127.0.0.1:{free_port()}"
 
 
@@ -54,6 +54,6 @@ def recording(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def simulator() -> None:
-    """PyBullet greets whoever loads it first; that is not what is tested."""
+    """PyBullet prints a line when it is loaded first; that is not what is tested."""
     if INSTALLED:
         import mapweave.sim.simulation  # noqa: F401

@@ -1,4 +1,4 @@
-"""The command line and files: one line on stderr for whatever is wrong with one."""
+"""The command line and files: one line on stderr for each error."""
 
 from __future__ import annotations
 

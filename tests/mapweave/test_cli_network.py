@@ -1,4 +1,4 @@
-"""The command line and the network: one line on stderr where nobody is, or somebody else."""
+"""The command line and the network: one line on stderr without a server, or with another program."""
 
 from __future__ import annotations
 

@@ -67,14 +67,14 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
                 stamps = [a.stamp_ns for a in agents().values()]
                 return len(stamps) == 2 and min(stamps) >= EXPLORE * 1e9
 
-            wait_for(explored, 240, children, "nobody explores")
+            wait_for(explored, 240, children, "no robot explores")
             for name in ("r0", "r1"):
                 assert bus.ask(keys.mission(name), encode_mission(Idle()), 10)[0].payload == b"ok"
 
             def idle():
                 return {a.status.mission for a in agents().values()} == {"idle"}
 
-            wait_for(idle, 20, children, "nobody stops")
+            wait_for(idle, 20, children, "no robot stops")
             mapped = sum(a.status.nodes for a in agents().values())
 
             def settled():
@@ -91,7 +91,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
             assert len(whole.nodes) >= 12
             assert score.ate < 0.10
 
-            # The robot is turned around and carried a little; it is not told.
+            # The robot is turned around and carried a little, unnoticed.
             own = [n for n in whole.nodes.values() if n.id.agent == "r0" and len(n.landmarks) >= 30]
             goal = own[0].id
             place = truth[goal] @ Pose2(-0.1, 0.15, 2.0)

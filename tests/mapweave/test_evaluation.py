@@ -43,7 +43,7 @@ def render(world_from_robot: Pose2) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One robot drives ahead; another one later, beside it, then looks back at a blank wall."""
+    """One robot drives ahead; another one later, next to it, then faces a blank wall behind."""
     folder = tmp_path_factory.mktemp("recordings") / "drive"
     (folder / "images").mkdir(parents=True)
     first = [Pose2(0.03 * k, 0.0, 0.0) for k in range(36)]

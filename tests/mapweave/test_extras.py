@@ -44,6 +44,8 @@ CASES: list[tuple[str, str, str]] = [
     ("sim serve", "office --connect {nobody}", SIM),
     ("server", "--listen {nobody} --data {tmp}", SERVER),
     ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its robot
+    ("robots", "", "koala"),
+    ("router", "--listen nowhere", "endpoints look like"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
     ("relocalize", "{recording}/images/0.png --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),
@@ -87,7 +89,7 @@ def merged() -> MergedMap:
 
 @pytest.fixture
 def filled(merged: MergedMap, recording: Path, nobody: str, tmp_path: Path) -> dict[str, object]:
-    """What stands for the braces in CASES."""
+    """The values of the braces in CASES."""
     own, whole = tmp_path / "own.mapweave", tmp_path / "merged.mapweave"
     write_map_file(own, MapFile("agent", "r0.1", tuple(merged.maps[MapId("r0", 1)].contents())))
     write_map_file(whole, map_file_of(merged))

@@ -40,7 +40,7 @@ WAY = [*np.arange(0.0, 1.2, 0.02), *np.arange(1.2, 0.0, -0.02)]
 
 
 class Body:
-    """A camera that somebody carries back and forth, as fast as its agent asks."""
+    """A camera that a person carries back and forth, as fast as its agent asks."""
 
     def __init__(self, bus: ZenohBus) -> None:
         walls = PhotoWalls()
@@ -119,7 +119,7 @@ def test_agents_that_are_killed_begun_afresh_and_robbed_of_their_disk_lose_no_ma
     assert len(of_first.nodes) >= first.status.nodes
     children.kill("r0")
 
-    # Idle: one that is to map on would look for itself, in vain here, and begin a third map.
+    # Idle: one that is to map on would try to localize, without success here, and begin a third map.
     start("--resume", "r0.1", "--mission", "idle")
     eventually(lambda: (now := report()) is not None and now.epoch == 1 and now.status.nodes >= 2, PATIENCE)
     children.end("r0")

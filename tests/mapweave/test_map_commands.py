@@ -96,7 +96,7 @@ def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_pa
     path.write_text("[merge.consistency]\nleast_links = 1000\noverwhelming_inliers = 1000\n")
     told = said("map", "merge", *files[:3], "-o", out, "--json", "--settings", path)
     assert json.loads(told)["links"] == 0
-    path.write_text("[merge]\nstrain = 'least squares'\n")
+    path.write_text("[merge.consistency]\ngate = 'much'\n")
     assert main(["map", "merge", *map(str, files[:3]), "-o", str(out), "--settings", str(path)]) == 1
 
 
@@ -178,7 +178,7 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     kinds = [line.split("UTC  ")[1][:10].strip() for line in lines]
     assert kinds == ["ruled", "parted", "ruled", "joined"]
     assert all("anna" in line and "two kitchens" in line for line in lines[:2]) and "bob" in lines[2]
-    # What a file tells goes on into what is made of it, once.
+    # The history of a file is kept in files made of it, once.
     said("map", "merge", path, files[3], "-o", tmp_path / "again.mapweave")
     assert said("map", "history", "--map", tmp_path / "again.mapweave").splitlines() == lines
     assert said("map", "history", "--map", files[3]).startswith("nothing has joined")
@@ -353,7 +353,7 @@ def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Sa
         out = said("map", "unmerge", "r0.1", "r1.1", "--undo", *at)
         assert "r0.1 and r1.1 are one map: " in out
         history = json.loads(said("map", "history", "--json", *at))["history"]
-        # What the first server saw, too; what was one is not told again by one that starts again.
+        # What the first server saw, too; a restarted server does not report joined maps again.
         assert [one["kind"] for one in history] == ["joined", "ruled", "parted", "ruled", "joined"]
         assert "two kitchens" in history[1]["words"] and "two kitchens" in history[2]["words"]
         assert [one["stamp_ns"] for one in history] == sorted(one["stamp_ns"] for one in history)

@@ -21,7 +21,7 @@ TOUR = [Pose2(2.5, 2.0, h) for h in np.arange(0, 2 * math.pi, math.pi / 3)]
 
 
 def changes(agent: str) -> list[ChangeBody]:
-    """A look around in a room."""
+    """A full turn in a room."""
     rng = np.random.default_rng(0)
     nodes, edges = take_map(room(0, 0, 5, 4, 700, rng), MapId(agent, 1), TOUR, rng)
     return [*map(NodePut, nodes), *map(EdgePut, edges)]
@@ -37,7 +37,7 @@ def agent_file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def merged_file(tmp_path: Path) -> Path:
-    """Two robots' maps that are joined, and a node of nobody's component."""
+    """Two robots' maps that are joined, and a node without a component."""
     bodies = [*changes("r0"), *changes("r1")]
     nodes = [body.node for body in bodies if isinstance(body, NodePut)]
     near = PoseGaussian.from_sigmas(Pose2(), 0.02, 0.02)

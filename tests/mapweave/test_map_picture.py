@@ -49,7 +49,7 @@ def test_nodes_edges_and_links_are_in_the_picture(tmp_path):
     for colour in COLOURS[:2]:
         assert share_of(image, colour) > 1e-4, "each robot has its colour"
     assert share_of(image, COLOURS[2]) == 0
-    assert share_of(image, "#e6007e") > 0 or share_of(image, "#e81a8b") > 1e-4, "links stand out"
+    assert share_of(image, "#e6007e") > 0 or share_of(image, "#e81a8b") > 1e-4, "links are visible"
     assert share_of(image, "#ffffff") < 0.995
 
 

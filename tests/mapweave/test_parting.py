@@ -66,7 +66,7 @@ def lives(seed: int) -> dict[MapId, list[list[ChangeBody]]]:
 
 
 class Robot:
-    """What of an agent speaks with the server."""
+    """The part of an agent that talks to the server."""
 
     def __init__(self, map_id: MapId, folder: Path, endpoint: str, life: list[list[ChangeBody]]) -> None:
         self.map, self.life = map_id, life
@@ -88,7 +88,7 @@ class Robot:
             self.sender.submit(bodies, k)
 
     def frames(self) -> set[NodeId]:
-        """Of the components in which its first nodes lie, as it was told."""
+        """The components of its first nodes, as published."""
         found = [self.poses.of(NodeId(*self.map, 2 * k + 1)) for k in range(FIRST)]
         return {NodeId("?", 0, 0) if one is None else one.frame for one in found}
 
@@ -132,7 +132,7 @@ def test_a_merge_that_loses_its_support_is_undone_and_reported(
 
     for robot in robots:
         robot.maps(slice(FIRST))
-    # Nobody can tell yet that the rooms are two: the robots have not moved at the same time.
+    # The rooms cannot be distinguished yet: the robots have not moved at the same time.
     eventually(holds(nodes=2 * FIRST, components=1, settled=True))
     assert str(status()["event"]).startswith("r0.1 and r1.1 are one map now, by ")
     eventually(lambda: all(robot.frames() == {NodeId(*R0, 1)} for robot in robots))
@@ -145,7 +145,7 @@ def test_a_merge_that_loses_its_support_is_undone_and_reported(
     event = str(status()["event"])
     assert re.match(r"r0\.1 and r1\.1 are no longer one map: \d+ links refused \(r0 and r1 would have", event)
     assert "at the same place at the same time" in event
-    # The one whose frame it was lies where it lay; the other one is told where it lies now.
+    # The robot whose frame it was keeps its poses; the other gets new ones.
     eventually(lambda: [robot.frames() for robot in robots] == [{NodeId(*R0, 1)}, {NodeId(*R1, 1)}])
     explained = said("explain", R0, R1)
     assert explained.startswith("r0.1 and r1.1 are not one map: ") and "at the same place" in explained
@@ -161,7 +161,7 @@ def test_a_merge_that_loses_its_support_is_undone_and_reported(
     stamped = r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d "
     assert re.search(stamped + re.escape(event), logged, re.M)
 
-    # Killed without a word and started again, it knows what happened and when, and tells it once.
+    # Killed and started again, it has the history with dates, and reports it once.
     children.kill("server")
     children.start("server", serve)
     eventually(holds(nodes=2 * ALL, components=2, settled=True))

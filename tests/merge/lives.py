@@ -1,4 +1,4 @@
-"""Random lives of fleets, whose merges from what stood are held against merges made anew."""
+"""Random lives of fleets, whose merges from standing decisions are compared with fresh merges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Merging from what stood against merging anew, over random lives of fleets."""
+"""Merging from standing decisions against fresh merges, over random lives of fleets."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge import islands as islands_module
 from mapweave.merge.islands import Islands
-from mapweave.merge.merging import MergeSettings
 from mapweave.merge.pose_graph import component_solver
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import MergeSettings
 from tests.merge.lives import DENSE, Life
 
 
@@ -35,7 +35,7 @@ def told(merged: MergedMap) -> tuple[object, ...]:
     ("seed", "false_share"), [(0, 0.0), (1, 0.3), (2, 0.3), (3, 0.5), (4, 0.0), (5, 0.6)]
 )
 def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> None:
-    """Whatever happens in whatever order: the outcome is that of a merge made anew, to the last bit."""
+    """For any changes in any order: the outcome is that of a fresh merge, to the last bit."""
     life, islands = Life(seed, false_share), Islands()
     for _ in range(45):
         life.step()
@@ -90,7 +90,7 @@ def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pyt
 
 @pytest.mark.parametrize(("seed", "false_share"), [(46, 0.0), (47, 0.3), (48, 0.3)])
 def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int, false_share: float) -> None:
-    """Nodes, links, rulings and retired maps come and go."""
+    """Nodes, links, manual constraints and retired maps come and go."""
     life, islands = Life(seed, false_share), Islands(exact=0)
     apart = links = 0
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""What a person has ruled out is not merged, whatever comes, until it is taken back."""
+"""Excluded links are not merged, after any change, until the constraint is withdrawn."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) 
     assert all("all links between a.1 and b.1" in r.reason for r in apart.refused if r.link is not None)
     node = merger.node(min(apart.components[0]))
     assert node is not None
-    merger.on_change(Change(node.id.map, 99, 0, NodePut(node)))  # known better: its links are found anew
+    merger.on_change(Change(node.id.map, 99, 0, NodePut(node)))  # refined: its links are searched again
     assert not merger.merged().joined(A, B)
 
 

@@ -148,7 +148,7 @@ def test_a_room_that_is_just_like_another_is_not_taken_for_it() -> None:
 
 
 def test_a_room_that_fits_two_others_equally_is_joined_to_neither() -> None:
-    """One robot saw two alike rooms, the other one of them: both stories have the same support."""
+    """One robot saw two similar rooms, the other one of them: both sets have the same support."""
     rng = np.random.default_rng(7)
     left = room(0, 0, 5, 4, 600, rng)
     own_a, own_b = room(5, 0, 5, 4, 600, rng), room(-5, 0, 5, 4, 600, rng)

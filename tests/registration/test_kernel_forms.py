@@ -1,4 +1,4 @@
-"""The compiled kernels of recognition beside the same in NumPy."""
+"""The compiled kernels of recognition against the same in NumPy."""
 
 import numpy as np
 import pytest

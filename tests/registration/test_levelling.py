@@ -80,7 +80,7 @@ def test_the_scale_is_a_share_of_the_way_to_the_photograph() -> None:
 
 @pytest.mark.parametrize("scale", [0.75, 1.3])
 def test_a_measured_node_gives_a_photograph_its_scale(scale: float) -> None:
-    """Registered with a node whose depths are measured, a photograph stands where it truly stands."""
+    """Registered with a node whose depths are measured, a photograph has its true pose."""
     rng = np.random.default_rng(5)
     world, at, off = room(0.0, 0.0, 6.0, 5.0, 900, rng), Pose2(2.0, 2.5, 0.1), Pose2(-0.4, 0.2, -0.1)
     node = take_node(world, NodeId("p0", 1, 1), at, HERE, rng, SHARP)

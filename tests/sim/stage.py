@@ -103,7 +103,7 @@ class FakeSimulation:
 
 
 class Stage:
-    """A bridge that runs in a thread, and buses for whoever plays with it."""
+    """A bridge that runs in a thread, and buses for its clients."""
 
     def __init__(self) -> None:
         self.hub = MemoryHub()

@@ -1,4 +1,4 @@
-"""Time that passes only when somebody asks for it, and robots that meet between two ticks."""
+"""Time that passes only on request, and rendezvous of robots between two ticks."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def test_an_ideal_lens_leaves_the_picture_alone(stand) -> None:
     st.floats(130.0, 400.0),
 )
 def test_a_lens_is_refused_or_can_be_inverted(lens: tuple[float, ...], focal: float) -> None:
-    """Whatever the coefficients: the rays of an accepted lens fall back onto their pixels."""
+    """For any coefficients: the rays of an accepted lens fall back onto their pixels."""
     camera = Camera(width=320, height=240, fx=focal, fy=focal, cx=159.5, cy=119.5, mount_height=0.3)
     try:
         CameraSetup(camera, lens)

@@ -110,7 +110,7 @@ def test_unknown_robots_rooms_and_places_are_refused(office: World) -> None:
 
 
 def test_kidnapped_robots_are_put_on_free_floor_away_from_others(office: World) -> None:
-    """Wherever they are sent, also where another robot stands already."""
+    """Anywhere, also where another robot is already."""
     with Simulation(office, ["r0", "r1"], 2) as simulation:
         room = office.plan.room("room 2")
         other = simulation.truth("r1")

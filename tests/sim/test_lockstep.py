@@ -1,4 +1,4 @@
-"""Whom time waits for, without threads or clocks."""
+"""Which robots time waits for, without threads or clocks."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_the_silent_robot_stands_still_until_it_asks_again(caplog: pytest.LogCap
     table.ask("a", 1)
     table.ask("b", 1)
     table.tick(0.0)
-    # b thinks for a minute, but nobody waits for it until a asks.
+    # b takes a minute, but no robot waits for it until a asks.
     table.ask("a", 2, now=60.0)
     assert table.due(79.9) == []
     assert table.tick(80.0) == ["a"]

@@ -71,7 +71,7 @@ def test_every_room_can_be_reached(offices: list[World], seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_robots_start_free_and_in_their_rooms(offices: list[World], seed: int) -> None:
-    """Robot i in room i, the fourth wherever there is place, nobody near another."""
+    """Robot i in room i, the fourth where there is place, none near another."""
     world = offices[seed]
     drawing = Drawing(world)
     rooms = sum(r.name.startswith("room") for r in world.plan.rooms)

@@ -62,7 +62,7 @@ def mark_shifts(image: np.ndarray, pixels: np.ndarray, places: np.ndarray) -> np
 def test_marks_agree_with_the_camera_model(
     distance: float, slant_deg: float, size_px: tuple[int, int], stand
 ) -> None:
-    """Corners of a board at known places, whatever the board's resolution."""
+    """Corners of a board at known places, for any resolution of the board."""
     robot = Pose2(2.0, -1.0, 0.7)
     frame = robot @ Pose2(CAMERA.mount_forward + distance, 0.03, math.radians(slant_deg))
     width, height = 1.0, 0.8

@@ -146,7 +146,7 @@ WRONG = [
     (ROOM.replace("4.0", "inf"), r"rooms\[0\]: high.*no float"),
     (ROOM.replace("4.0", "4e9"), r"rooms\[0\]: high is 4000000000.0; use -1000 to 1000"),
     (ROOM.replace("[4.0, 3.0]", "[900.0, 900.0]"), "too large"),
-    (ROOM.replace("[4.0, 3.0]", "[4.0]"), "must be a list of 2"),
+    (ROOM.replace("[4.0, 3.0]", "[4.0]"), "expected list of length 2"),
     (ROOM.replace('"room 0"', '""'), "name is ''"),
     (ROOM.replace('"room 0"', r'"a\u0007"'), "that can be printed"),
     (ROOM + "floor = 'parket'", r"rooms\[0\]: no texture 'parket'"),
@@ -164,7 +164,7 @@ WRONG = [
     (ROOM + FURNITURE.replace("0.5", "0"), r"furniture\[0\]: length is 0"),
     (ROOM + FURNITURE.replace("height", "hight"), "did you mean 'height'"),
     (ROOM + FURNITURE.replace("height = 0.6", ""), r"furniture\[0\]: height is missing"),
-    (ROOM + FURNITURE + "ends = ['wood']", "must be a list of 2"),
+    (ROOM + FURNITURE + "ends = ['wood']", "expected list of length 2"),
     (ROOM + FURNITURE + "texture = 'grey 256'", "use grey and 0 to 255"),
     (ROOM + FURNITURE + "texture = 'rack full'", "use rack, or rack changed"),
     (ROOM + FURNITURE + "texture = 'mine.png'", r"furniture\[0\]: no picture .*mine.png"),
@@ -275,7 +275,7 @@ TOP = st.dictionaries(st.sampled_from([field.name for field in dataclasses.field
     DESIGNS, st.dictionaries(st.sampled_from([f.name for f in dataclasses.fields(Design)]), ODD, max_size=1)
 )
 def test_any_table_makes_a_world_or_one_line(lists: dict[str, Any], top: dict[str, Any]) -> None:
-    """Whatever stands in the file; and what is built can be asked for poses, and moved."""
+    """Any content of the file; and a built world has poses, and can be rearranged."""
     try:
         table = {**lists, **top}
         for name, cls in ITEMS.items():

@@ -1,4 +1,4 @@
-"""What every bus must do when somebody closes, dies or is cut off, on both implementations."""
+"""What every bus must do when a peer closes, dies or is cut off, on both implementations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refusals as bytes: every word and number comes back, and whatever comes is read without harm."""
+"""Refusals as bytes: every word and number round-trips, and any bytes are read without harm."""
 
 from __future__ import annotations
 

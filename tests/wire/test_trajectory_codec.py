@@ -1,4 +1,4 @@
-"""Wakes on the wire."""
+"""Trajectory segments on the wire."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapweave.agent.ekf.gating import believe, chi_squares, one_point_consensus, pixel_gate
+from mapweave.agent.ekf.gating import chi_squares, one_point_consensus, pixel_gate, select_inliers
 from mapweave.agent.ekf.innovations import leave_one_out, whiten
 
 
@@ -37,7 +37,7 @@ def test_single_and_leave_one_out_distances() -> None:
 def test_a_shared_error_is_no_outlier() -> None:
     rng = np.random.default_rng(1)
     gate = pixel_gate(0.999)
-    kept = [believe(*joint(20, 30.0, rng), gate)[0].mean() for _ in range(50)]
+    kept = [select_inliers(*joint(20, 30.0, rng), gate)[0].mean() for _ in range(50)]
     assert np.mean(kept) > 0.99
 
 
@@ -50,7 +50,7 @@ def test_outliers_hidden_by_a_shared_error_are_found() -> None:
         # Too small to be seen alone beside the shared 30 px.
         angle = rng.uniform(0, 2 * np.pi, 8)
         innovations[wrong] += rng.uniform(12, 25, (8, 1)) * np.column_stack([np.cos(angle), np.sin(angle)])
-        accepted, whitening, _ = believe(innovations, s, gate)
+        accepted, whitening, _ = select_inliers(innovations, s, gate)
         assert not accepted[wrong].any()
         assert accepted.sum() >= 11
         chosen = np.flatnonzero(np.repeat(accepted, 2))
@@ -81,6 +81,6 @@ def test_consensus_is_that_of_the_best_single_landmark() -> None:
 
 def test_nothing_plausible_means_nothing_accepted() -> None:
     innovations = np.full((4, 2), 100.0) * np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
-    accepted, whitening, _ = believe(innovations, np.eye(8), pixel_gate(0.999))
+    accepted, whitening, _ = select_inliers(innovations, np.eye(8), pixel_gate(0.999))
     assert not accepted.any()
     assert whitening.shape == (0, 0)

@@ -213,7 +213,7 @@ def test_a_few_good_among_wrong_tracks_are_named() -> None:
     report = filter_.update(world.ids, pixels)
     assert not report.healthy
     assert report.reason.endswith(f"of {len(wrong) + 2} landmarks agree")
-    # Two of so many prove nothing: nobody is believed.
+    # Two of so many prove nothing: none is accepted.
     assert not report.accepted.any()
     assert filter_.state is before
 
@@ -255,7 +255,7 @@ def test_ids_come_only_once() -> None:
 
 
 def test_prior_keeps_its_convention() -> None:
-    """A right perturbation goes in and comes out as it was, whatever the heading."""
+    """A right perturbation round-trips for any heading."""
     prior = PoseGaussian(
         Pose2(1.0, 2.0, 2.2), np.array([[0.04, 0.01, 0.0], [0.01, 0.02, 0.003], [0.0, 0.003, 0.01]])
     )

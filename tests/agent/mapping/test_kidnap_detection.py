@@ -1,4 +1,4 @@
-"""Whether an image continues the one before: on photographs, in the dark, and behind somebody's back."""
+"""Whether an image continues the one before: on photographs, in the dark, and behind a person's back."""
 
 from __future__ import annotations
 
@@ -9,17 +9,10 @@ import skimage.data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.mapping.kidnap_detection import (
-    FrameOverlap,
-    KidnapDetector,
-    KidnapDetectorSettings,
-    relit,
-    turned,
-)
-from mapweave.agent.mapping.mapper import Mapper, MapperSettings
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
+from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit, turned
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry
-from mapweave.agent.vision.tracker import TrackerSettings
+from mapweave.agent.settings import AgentSettings, TrackerSettings, TrackingSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -35,7 +28,6 @@ def continuity(description) -> KidnapDetector:
         Lens(description.camera, description.distortion),
         description.camera,
         TrackerSettings(),
-        KidnapDetectorSettings(),
     )
 
 
@@ -146,7 +138,7 @@ def watch(mapper: Mapper, images, forward: float = 0.0) -> None:
 @pytest.fixture
 def mapper(walls, description) -> Mapper:
     """It has seen the walls for a moment."""
-    patient = MapperSettings(tracking=TrackingSettings(patience=10, blank_patience=30))
+    patient = AgentSettings(tracking=TrackingSettings(patience=10, blank_patience=30))
     mapper = Mapper(MapId("r0", 1), description, patient)
     watch(mapper, [walls.render(HERE)] * 3)
     assert mapper.tracked > 40
@@ -176,7 +168,7 @@ def test_passing_objects_leave_the_tracks_alone(walls, mapper, elsewhere, what):
 
 @pytest.mark.parametrize("frozen", [False, True])
 def test_a_camera_that_hangs_stops_the_robot_and_not_its_wheels(walls, mapper, frozen):
-    """The same image again while the wheels turn is none: else it would speak against the wheels."""
+    """The same image again while the wheels turn is not a new image: else it would refute the wheels."""
     image = walls.render(HERE) if frozen else None
     watch(mapper, [image] * 3, forward=0.01)
     assert not mapper.doubtful, "a dropped image now and then is nothing to stop for"

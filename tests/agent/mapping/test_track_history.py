@@ -11,7 +11,7 @@ from mapweave.hybridmap.pose import Pose2
 
 
 def seen(*ids: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tracks and made-up pixels that tell them apart."""
+    """Tracks and distinct made-up pixels."""
     numbers = np.array(ids, np.int64)
     return numbers, np.column_stack([numbers * 10.0, numbers + 0.5])
 

@@ -1,4 +1,4 @@
-"""The journal: what was appended is there, whatever happens to the process or the file."""
+"""The journal: appended changes are there, whatever happens to the process or the file."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def edge(number: int, a: int, b: int) -> EdgePut:
 
 
 def kept_of(path: Path, log: list[ChangeBody], damage: tuple[int, ...] = ()) -> RetainedMap:
-    """What is kept of a log, after the bodies of some changes were damaged on the disk."""
+    """The rest of a log, after some changes were damaged on the disk."""
     journal = Journal(path, "r0")
     journal.append(journal.open_map(1), log, 0)
     journal.close()

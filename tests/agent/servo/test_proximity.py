@@ -1,4 +1,4 @@
-"""The guard in random worlds: whatever is commanded, the footprint touches nothing that rangers can see."""
+"""The guard in random worlds: for any command, the footprint touches nothing that rangers can see."""
 
 from __future__ import annotations
 

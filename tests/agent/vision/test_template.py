@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapweave.agent.vision.template import TemplateMatcher, TemplateSettings
+from mapweave.agent.vision.template import HALF_PX, SIGMA_PX, TemplateCriteria, TemplateMatcher
 
 SPOTS = np.array([[x + 0.37, y - 0.21] for x in range(60, 280, 40) for y in range(50, 200, 35)])
 
@@ -20,12 +20,11 @@ def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return (1 - v) * upper + v * lower
 
 
-def looks(image: np.ndarray, at: np.ndarray, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A patch of mean 0 and deviation 1, and its weights, as the settings say."""
-    s = TemplateSettings()
-    side = np.arange(-s.half_px, s.half_px + 1.0)
+def patches(image: np.ndarray, at: np.ndarray, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A patch of mean 0 and deviation 1, and its weights, as the product's."""
+    side = np.arange(-HALF_PX, HALF_PX + 1.0)
     x, y = (grid.ravel() for grid in np.meshgrid(side, side))
-    weights = np.exp(-(x**2 + y**2) / (2 * s.sigma_px**2))
+    weights = np.exp(-(x**2 + y**2) / (2 * SIGMA_PX**2))
     weights /= weights.sum()
     patch = bilinear(image, at[0] + scale * x, at[1] + scale * y)
     patch = patch - weights @ patch
@@ -54,11 +53,11 @@ def test_slopes_are_those_of_finite_differences(pictures, name):
     spots = textured(image)
     templates = TemplateMatcher().cut(image, spots)
     for number, at in enumerate(spots):
-        patch, weights = looks(image, at)
-        assert np.allclose(templates.looks[number], patch, atol=1e-3)
+        patch, weights = patches(image, at)
+        assert np.allclose(templates.patches[number], patch, atol=1e-3)
         h = 0.5
         expected = [
-            (looks(image, at + step)[0] - looks(image, at - step)[0]) / (2 * h)
+            (patches(image, at + step)[0] - patches(image, at - step)[0]) / (2 * h)
             for step in (np.array([h, 0]), np.array([0, h]))
         ]
         found = templates.slopes[number] / weights
@@ -66,7 +65,7 @@ def test_slopes_are_those_of_finite_differences(pictures, name):
             # Half a pixel is no small step: contrast changes a little over it, which slopes leave out.
             assert np.corrcoef(found[k], wanted)[0, 1] > 0.97
             assert np.linalg.norm(found[k]) == pytest.approx(np.linalg.norm(wanted), rel=0.15)
-        grown = (looks(image, at, 1.05)[0] - looks(image, at, 0.95)[0]) / 0.1
+        grown = (patches(image, at, 1.05)[0] - patches(image, at, 0.95)[0]) / 0.1
         assert np.corrcoef(found[2], grown)[0, 1] > 0.9
         assert np.abs(found @ (weights * patch)).max() < 2e-3, "contrast changes nothing"
         assert np.abs(found @ weights).max() < 2e-3, "nor does brightness"
@@ -80,19 +79,19 @@ def test_a_match_is_the_best_there_is(pictures, name):
     spots = textured(image)[::3]
     guess = pictures.mapped(motion, spots) + np.random.default_rng(4).uniform(-0.5, 0.5, spots.shape)
     # More steps than on a robot, where the next image corrects what is left of this one.
-    matcher = TemplateMatcher(TemplateSettings(iterations=8))
+    matcher = TemplateMatcher(TemplateCriteria(iterations=8))
     match = matcher.match(matcher.cut(image, spots), seen, guess)
     steps, growths = np.arange(-0.2, 0.21, 0.05), (0.97, 0.985, 1.0, 1.015, 1.03)
     checked = 0
     for spot, at, scale in zip(
         spots[match.held], match.raw[match.held], match.templates.scales[match.held], strict=True
     ):
-        wanted, weights = looks(image, spot)
+        wanted, weights = patches(image, spot)
         alike = [
-            (weights * wanted) @ looks(seen, at + np.array([dx, dy]), scale * growth)[0]
+            (weights * wanted) @ patches(seen, at + np.array([dx, dy]), scale * growth)[0]
             for dx in steps for dy in steps for growth in growths
         ]  # fmt: skip
-        found = (weights * wanted) @ looks(seen, at, scale)[0]
+        found = (weights * wanted) @ patches(seen, at, scale)[0]
         # Along an edge the optimum is flat, and Gauss and Newton's model of it is not exact.
         assert max(alike) - found < 0.004
         checked += 1

@@ -7,7 +7,8 @@ import copy
 import numpy as np
 import pytest
 
-from mapweave.agent.vision.tracker import Tracker, TrackerSettings
+from mapweave.agent.settings import TrackerSettings
+from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.vision.lens import Lens
@@ -199,7 +200,7 @@ def test_another_light_loses_no_point(pictures):
 
 
 def test_a_copy_goes_its_own_way(pictures):
-    """Whoever doubts an image tracks a copy into it, and may throw that away."""
+    """A caller that may reject an image tracks a copy into it, which it can drop."""
     image = pictures.photograph("coins")
     tracker = followed(image)
     before = [column.copy() for column in (tracker.ids, tracker.raw, tracker.ages, tracker.held)]

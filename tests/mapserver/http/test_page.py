@@ -71,7 +71,7 @@ def test_errors_are_shown_on_the_page(page: Browser, desk: Desk, image: Path) ->
     desk.refusal = InvalidValue("<b>this</b> is no place")
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "failed")
-    # As text, whatever it holds.
+    # As text, with any content.
     assert "<b>this</b> is no place" in page.run(RESULT)
     assert page.run("return document.querySelector('#result b')") is None
 

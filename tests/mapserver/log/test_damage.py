@@ -137,7 +137,7 @@ class Fleet:
         }
 
     def served(self) -> dict[MapId, list[bytes]]:
-        """What the rest of the server has been told, as maps."""
+        """What the rest of the server has received, as maps."""
         maps: dict[MapId, HybridMap] = {}
         for change in self.seen:
             maps.setdefault(change.map, HybridMap()).apply(change.body)
@@ -146,7 +146,7 @@ class Fleet:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What three robots have mapped, and a server has taken in and acknowledged; some rulings besides."""
+    """Maps of three robots, which a server has acknowledged, and some manual constraints."""
     fleet = Fleet(tmp_path_factory.mktemp("whole"))
     rng = np.random.default_rng(7)
     for name in ROBOTS:

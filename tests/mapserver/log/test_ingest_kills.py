@@ -71,7 +71,7 @@ journal.close()
 
 
 class Life:
-    """A process from its start to its end, and what it said."""
+    """A process from its start to its end, and its output."""
 
     def __init__(self, program: str, log: Path, *arguments: str) -> None:
         self.log = log

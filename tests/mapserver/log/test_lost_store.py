@@ -75,7 +75,7 @@ def test_a_server_with_a_deleted_store_reports_it_and_gets_everything_again(tmp_
         assert robot.unacknowledged() == 2
     with MapServer(server_bus, KEYS, path, "s0"):
         assert robot.wait_acknowledged(30)
-        # Acknowledged anew: not because it was before.
+        # Acknowledged again, not because it was before.
         eventually(lambda: robot.unacknowledged() == 0)
     kept = Store(path)
     eventually(lambda: kept.watermark(MAP) == 7)

@@ -1,4 +1,4 @@
-"""What a robot says of the nodes of others has no say in how these are merged."""
+"""A robot's edges between nodes of others do not change how these are merged."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def said(merged: MergedMap) -> tuple[object, ...]:
 
 
 def claims(log: Log, kind: EdgeKind, landmarks: int) -> Log:
-    """Edges of somebody else between all of their nodes, as wrong as can be."""
+    """Edges of another robot between all of their nodes, entirely wrong."""
     nodes = [body.node for _, body in log if isinstance(body, NodePut)]
     pairs = [(a, b) for k, a in enumerate(nodes) for b in nodes[:k]]
     shared = np.repeat(np.arange(landmarks)[:, None], 2, axis=1)

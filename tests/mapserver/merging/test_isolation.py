@@ -94,7 +94,7 @@ def merger_of(told: dict[MapId, Log], *maps: MapId) -> Merger:
 
 
 def alone_fails(monkeypatch: pytest.MonkeyPatch, *bad: MapId) -> None:
-    """Let the merge fail wherever any of these maps is cut into pieces."""
+    """Let the merge fail where any of these maps is cut into pieces."""
     real = decision_cache.fragments_of
 
     def fails(maps: dict[MapId, HybridMap], *more: Any) -> Any:
@@ -169,7 +169,7 @@ def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
         merged = merger_of(small, *order).merged()
         assert merged.set_apart.keys() == {WORSE}
         assert said(merged, R0, R1) == said(alone, R0, R1)
-    # Whoever was set apart by another process is so again.
+    # A map that another process set apart is set apart again.
     merger = merger_of(small, R0, R1, WORSE)
     merger.suspect([R1])
     assert merger.merged().set_apart.keys() == {R1}
@@ -239,7 +239,7 @@ def test_a_bad_map_is_left_out_before_comparing(
 def test_nodes_that_cannot_be_compared_are_not_linked(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    import mapweave.mapserver.merging.merger as module
+    import mapweave.mapserver.merging.node_comparisons as module
 
     real = module.verify
 
@@ -260,14 +260,14 @@ def test_a_node_whose_search_fails_holds_up_no_other(
     told: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     merger = merger_of(told, BAD, R0, R1)
-    real = merger.index.overlaps
+    real = merger.places.overlaps
 
     def fails(node: Any, *more: Any) -> Any:
         if node.id.map == BAD:
             raise IndexError("no such cell")
         return real(node, *more)
 
-    monkeypatch.setattr(merger.index, "overlaps", fails)
+    monkeypatch.setattr(merger.places, "overlaps", fails)
     merged = merger.merged()
     assert merger.uncompared == 0
     assert said(merged, R0, R1) == said(merger_of(told, R0, R1).merged(), R0, R1)

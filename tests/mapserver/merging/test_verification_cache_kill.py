@@ -1,4 +1,4 @@
-"""A server that is really killed, and starts again from what lies beside its store."""
+"""A server that is really killed, and starts again from the files next to its store."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ with MapServer(MemoryBus(MemoryHub()), Keys(), path, "s0") as server:
 
 
 def told_and_killed(store: Path) -> dict[str, Any]:
-    """What a server tells of its merged map; then it is killed."""
+    """A server prints its merged map; then it is killed."""
     process = subprocess.Popen([sys.executable, "-c", SERVER, str(store)], stdout=subprocess.PIPE)
     try:
         assert process.stdout is not None

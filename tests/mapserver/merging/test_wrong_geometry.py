@@ -1,4 +1,4 @@
-"""A robot with wrong geometry and true views takes nobody's answers, and two rooms alike stay two."""
+"""A map with wrong geometry and true views changes no answers, and two similar rooms stay two."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from mapweave.mapserver.merging.merger import Merger
 from synthetic.wrong_geometry import (
     ODD,
     SCENES,
+    AnswerOutcome,
     Fault,
     Fleet,
-    Told,
     draw_fleet,
     judged,
     lost_views,
@@ -24,7 +24,7 @@ from synthetic.wrong_geometry import (
 SEED, QUESTIONS = 21, 16
 
 
-def told(merger: Merger, fleet: Fleet, scene: str) -> Counter[Told]:
+def answer_outcomes(merger: Merger, fleet: Fleet, scene: str) -> Counter[AnswerOutcome]:
     """Answers to robots that are lost in the house."""
     answers = Answers.of(merger, merger.merged(), merger.node)
     views = lost_views(fleet, SCENES[scene], QUESTIONS, SEED)
@@ -33,17 +33,19 @@ def told(merger: Merger, fleet: Fleet, scene: str) -> Counter[Told]:
 
 def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
     fleet = draw_fleet(SEED, SCENES["room"], Fault.SLIP, stops=2)
-    alone = told(merged_fleet(fleet, frozenset({ODD})), fleet, "room")
+    alone = answer_outcomes(merged_fleet(fleet, frozenset({ODD})), fleet, "room")
     merger, chronicle = merged_fleet(fleet), MapHistory()
     merged = merger.merged()
     chronicle.follow(merged)
     assert chronicle.newest.startswith(f"map {ODD} contradicts r0.1, r1.1 and r2.1")
     sound = [{node.map for node in part} for part in merged.components if ODD not in {n.map for n in part}]
     assert sound == [{MapId(f"r{k}", 1) for k in range(3)}]
-    with_it = told(merger, fleet, "room")
-    assert alone[Told.RIGHT] >= 0.7 * QUESTIONS
-    assert with_it[Told.RIGHT] >= 0.9 * alone[Told.RIGHT] and not with_it[Told.WRONG]
-    # Told once, and the map counts again when a person has retired those that it contradicts.
+    with_it = answer_outcomes(merger, fleet, "room")
+    assert alone[AnswerOutcome.RIGHT] >= 0.7 * QUESTIONS
+    assert (
+        with_it[AnswerOutcome.RIGHT] >= 0.9 * alone[AnswerOutcome.RIGHT] and not with_it[AnswerOutcome.WRONG]
+    )
+    # Reported once, and the map counts again when a person has retired those that it contradicts.
     before = chronicle.happenings
     chronicle.follow(merged)
     assert chronicle.happenings == before
@@ -61,4 +63,4 @@ def test_a_correct_map_of_a_similar_room_is_not_wrong() -> None:
     fleet = draw_fleet(SEED, SCENES["twins"], Fault.NONE, stops=2)
     merger = merged_fleet(fleet)
     assert not merger.merged().wrong
-    assert not told(merger, fleet, "twins")[Told.WRONG]
+    assert not answer_outcomes(merger, fleet, "twins")[AnswerOutcome.WRONG]

@@ -11,13 +11,15 @@ import pytest
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, View
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.merge_worker import PREPARED_AT_ONCE, MergeWorker
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.relocalization.aliased_landmarks import between
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegionSettings
+from mapweave.mapserver.relocalization.candidates import Candidates
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
+from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapweave.merge.pose_graph.component import solve_graph
@@ -117,7 +119,7 @@ def test_unobserved_places_are_no_evidence() -> None:
     answer = asked(nodes, joined(nodes)).answer(VIEW)
     assert answer.certainty is Certainty.AMBIGUOUS
     assert answer.candidates[1].node in {one.id for one in there}
-    # Somebody who looks there and sees other things settles it; one who looks from elsewhere does not.
+    # A view of the same spot with other things decides; a view from elsewhere does not.
     for turn, told in ((0.0, Certainty.FOUND), (0.9, Certainty.AMBIGUOUS)):
         other = taken(19, STOP @ SEEN @ Pose2(0.05, 0.0, turn), AWAY, 30, world=OTHER)
         more = [*nodes, other]
@@ -163,13 +165,20 @@ def test_the_same_room_mapped_twice_is_one_place() -> None:
     assert asked(twice, joined(twice)).answer(VIEW).certainty is Certainty.FOUND
 
 
+def concluded(
+    service: Relocalizer, recognised: NodeMatch, ranked: list[tuple[NodeId, float]]
+) -> RelocalizeAnswer:
+    matches = service.registration.refined(VIEW, [recognised])
+    return service.conclude(Registration(Candidates(VIEW, ranked), matches))
+
+
 def test_maps_that_are_not_merged_have_their_own_frames() -> None:
     nodes = here_and_there(agent="r1")
     found = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
     assert found is not None
     ranked = [(nodes[0].id, 2.0), (nodes[1].id, 0.1), (nodes[2].id, 0.1)]
     service = asked(nodes, MergedMap.empty())
-    answer = service.conclude(VIEW, [NodeMatch(nodes[0].id, found)], ranked)
+    answer = concluded(service, NodeMatch(nodes[0].id, found), ranked)
     assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
     assert answer.candidates[1].node.agent == "r1" and answer.candidates[1].merged_from_robot is None
 
@@ -185,7 +194,7 @@ def test_aliasing_is_cached_and_kept_up_to_date() -> None:
 
     one, twin = nodes[1], nodes[3]
     assert of(one) == {twin.id} and of(one) == {twin.id} and index.asked == 1
-    # Made anew without any change, as nodes that have lost landmarks are: it still holds.
+    # Replaced by an equal node, as nodes that have lost landmarks are: it still holds.
     by_id[twin.id] = replace(twin, landmarks=twin.landmarks.take(np.arange(len(twin.landmarks))))
     assert of(replace(one)) == {twin.id} and index.asked == 1
     # A node that comes later is entered as soon as it is asked about itself.
@@ -194,7 +203,7 @@ def test_aliasing_is_cached_and_kept_up_to_date() -> None:
     index.index.add(late)
     assert of(late, MergedMap.empty()) >= {one.id, twin.id}
     assert of(one) == {twin.id, late.id} and index.asked == 2
-    # What has gone or changed is looked for no longer, or anew.
+    # Removed nodes are not searched, changed ones again.
     del by_id[late.id]
     assert of(one) == {twin.id}
     by_id[twin.id] = replace(twin, stamp_ns=twin.stamp_ns + 1)
@@ -267,5 +276,5 @@ def test_landmarks_without_depths_are_in_no_region() -> None:
             for k, one in enumerate(nodes)
         ]
         service = asked(fewer, joined(fewer))
-        answer = service.conclude(VIEW, [NodeMatch(nodes[0].id, found)], [(nodes[0].id, 2.0)])
+        answer = concluded(service, NodeMatch(nodes[0].id, found), [(nodes[0].id, 2.0)])
         assert answer.certainty is told

@@ -29,7 +29,7 @@ def test_a_landmark_belongs_to_the_nearest_of_the_nearest_family() -> None:
     own[whose[None] != family[:, None]] = np.inf
     expected = own.argmin(axis=1)
     for some in (means.nearest(vectors), means.nearest(vectors[: module.FEW - 1])):
-        # Equally near means may stand for each other.
+        # Equally near means are interchangeable.
         rows = np.arange(len(some))
         assert np.allclose(own[rows, some], own[rows, expected[: len(some)]], rtol=1e-4)
         assert (some == expected[: len(some)]).mean() > 0.99

@@ -98,7 +98,7 @@ def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids
     lists = cells._index
     for first in (0, 700, 2900):
         gone = codes[(ids >= first) & (ids < first + 100)]
-        # Whoever is wrong about the codes makes it slow, not false.
+        # Wrong assumptions about the codes make it slow, not wrong.
         cells.remove(first, first + 100, gone[::-1] if told == "all" else 63 - gone)
         searched.remove(first, first + 100)
     assert len(cells) == len(searched) == 2700

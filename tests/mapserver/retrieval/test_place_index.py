@@ -9,9 +9,10 @@ from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import place_index
+from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.mapserver.retrieval.inverted_file import InvertedFile
 from mapweave.mapserver.retrieval.landmark_index import MOST_WITHIN, LandmarkIndexSettings
-from mapweave.mapserver.retrieval.place_index import MOST_LANDMARKS, SLOT_BITS, PlaceIndex, PlaceIndexSettings
+from mapweave.mapserver.retrieval.place_index import SLOT_BITS, PlaceIndex, PlaceIndexSettings
 from mapweave.merge.pose_graph.candidates import overlaps
 from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
 
@@ -43,8 +44,8 @@ def brute_force(nodes: list[Node], view: View, s: PlaceIndexSettings) -> dict[No
         nearest = sorted((float(((feature - v) ** 2).sum()), node) for v, node in everything)[: s.votes]
         best: dict[NodeId, float] = {}
         for squared, node in nearest:
-            if squared < s.reach**2:
-                best[node] = max(best.get(node, 0.0), 1 - squared / s.reach**2)
+            if squared < place_index.REACH**2:
+                best[node] = max(best.get(node, 0.0), 1 - squared / place_index.REACH**2)
         for node, weight in best.items():
             scores[node] += weight / np.sqrt(len(best))
     return scores
@@ -103,7 +104,7 @@ def test_nodes_with_equal_landmarks_cost_no_more_than_others() -> None:
     assert len(index.landmarks) == 3 * MOST_LANDMARKS
     told = index.landmarks.within(nodes[0].landmarks.codes[:10], 0.5)
     assert told is not None and np.bincount(told[0]).max() <= MOST_WITHIN
-    # The first of equals are told: they need not be of every node.
+    # The first of equals are returned: they need not be of every node.
     assert index.overlaps(nodes[2], {}.get).keys() <= {nodes[0].id, nodes[1].id}
     index.remove(nodes[1].id, nodes[1].landmarks.codes)
     assert len(index.landmarks) == 2 * MOST_LANDMARKS

@@ -1,4 +1,4 @@
-"""Child processes: none is left behind, whatever becomes of who started them."""
+"""Child processes: none is left behind, whatever happens to their parent."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def runs(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    # Whose parent is gone may stay as an entry without a process until somebody takes it away.
+    # An orphan may stay as a zombie until it is reaped.
     state = Path(f"/proc/{pid}/stat")
     return not state.exists() or state.read_text().rpartition(")")[2].split()[0] != "Z"
 

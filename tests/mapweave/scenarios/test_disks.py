@@ -1,4 +1,4 @@
-"""Journals against the store: what is missing is counted, and a hash tells maps apart."""
+"""Journals against the store: missing changes are counted, and a hash distinguishes maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Expectations: what is accepted, and one line for whatever cannot be meant."""
+"""Expectations: what is accepted, and one line for each error."""
 
 from __future__ import annotations
 

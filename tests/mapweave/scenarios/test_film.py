@@ -53,7 +53,7 @@ def test_a_film_has_its_frames_in_order(tmp_path, capfd):
 
 
 def test_other_words_on_stderr_are_passed_on(tmp_path, capfd, monkeypatch):
-    """Only OpenCV's one expected line is kept off; whoever else speaks meanwhile is heard."""
+    """Only OpenCV's one expected line is suppressed; other output passes."""
     writer = cv2.VideoWriter
 
     def speaking(*arguments):

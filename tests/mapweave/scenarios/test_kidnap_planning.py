@@ -145,7 +145,7 @@ def test_nodes_without_truth_play_no_part():
 
 
 def test_a_goal_that_the_others_cut_off_is_none():
-    """r0 stands in the only gap between the two halves of a hall: nobody is sent through it."""
+    """r0 is in the only gap between the two halves of a hall: no robot is sent through it."""
     hall = FloorPlan(
         (
             Rectangle.spanning(0, 0, 4, 4, "room 0"),
@@ -164,7 +164,7 @@ def test_a_goal_that_the_others_cut_off_is_none():
 
 
 def test_a_goal_whose_only_mapped_way_is_blocked_is_not_chosen():
-    """There is room to drive around a robot that stands on the way, but nobody has mapped it."""
+    """There is room to drive around a robot on the way, but it is not mapped."""
     hall = FloorPlan((Rectangle.spanning(0, 0, 4, 6, "room 0"), Rectangle.spanning(4, 0, 8, 6, "room 1")), ())
     merged, components, truth = a_map({"r0": [(1, 3)], "r1": [(5, 3), (7, 3)]})
     aside = {"r0": Pose2(1, 1), "r1": Pose2(7, 1)}

@@ -1,5 +1,5 @@
-"""The same scenario and seed give the same maps and the same drive, to the last bit: whatever the machine's
-load, and whether the robots live in one process or in many.
+"""The same scenario and seed give the same maps and the same drive, to the last bit: under any load of the
+machine, with the robots in one process or in many.
 """
 
 from __future__ import annotations

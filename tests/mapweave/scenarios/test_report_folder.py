@@ -179,7 +179,7 @@ def test_an_empty_trial_has_a_folder(staged, tmp_path):
 
 
 def test_scoring_writes_no_file_at_home_and_prints_nothing(tmp_path):
-    """The programs of evo keep settings in the home directory and speak; its core does not."""
+    """The programs of evo keep settings in the home directory and print; its core does not."""
     program = (
         "import logging, sys\n"
         "import numpy as np\n"

@@ -37,7 +37,7 @@ def for_evo(trajectory: Trajectory) -> PoseTrajectory3D:
 
 
 def wandering(seed: int, noise: float = 0.02) -> tuple[Trajectory, Trajectory]:
-    """A way of 50 s and what a robot in a frame of its own believed of a part of it."""
+    """A trajectory of 50 s and a robot's estimate of a part of it, in its own frame."""
     rng = np.random.default_rng(seed)
     steps = np.column_stack([np.full(500, 0.03), np.zeros(500), rng.normal(0, 0.05, 500)])
     pose, poses = Pose2(*rng.uniform(-3, 3, 3)), []
@@ -250,7 +250,7 @@ def test_an_answer_in_terms_of_an_unknown_place_does_not_count(eventful):
 
 
 def test_a_photographs_truth_is_where_it_was_taken(eventful):
-    """A node of a map that no robot has made: the goal is where somebody has stood."""
+    """A node of a map that no robot has made: the goal is where a person was."""
     last = eventful.truth["r0"].poses[-1]
     stood = Pose2.from_vector(last) @ Pose2(0.3, 0.4)
     photo = eventful.add_node("r0", 5, Pose2(), epoch=7)

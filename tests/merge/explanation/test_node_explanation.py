@@ -27,13 +27,12 @@ from mapweave.merge.outlier_rejection.link_probability import (
     prior_odds,
     standpoints,
 )
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.verification import VerificationSettings
+from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.recognition import RecognitionSettings
 from synthetic.world import room, take_map
 
@@ -99,7 +98,7 @@ def test_the_misfit_is_the_difference_to_the_merged_poses(merged: MergedMap) -> 
 
 
 def without(merged: MergedMap, left_out: Link | None) -> PoseGaussian:
-    """The relative pose of a link's nodes in a graph that is solved anew without it."""
+    """The relative pose of a link's nodes in a graph that is solved again without it."""
     assert left_out is not None
     measurements = [m for fragment in fragments_of(merged.maps) for m in fragment.measurements]
     measurements += [
@@ -183,7 +182,7 @@ def test_refused_pairs_say_what_they_lack(merged: MergedMap) -> None:
 
 def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None:
     link = between(merged)[0]
-    strict = VerificationSettings(RecognitionSettings(least_inliers=12))
+    strict = RecognitionSettings(least_inliers=12)
     # One of the two nodes has kept eleven landmarks, all of which agree.
     shared = link.shared[:11]
     a = merged.maps[link.a.map].nodes[link.a]
@@ -192,7 +191,7 @@ def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None
     told = explain_nodes(both, *link.pair, strict)
     assert told.standing is Standing.UNCOMPARED and told.a_from_b is None
     assert "11 features match" in told.reason
-    told = explain_nodes(both, *link.pair, VerificationSettings(RecognitionSettings(least_cells=25)))
+    told = explain_nodes(both, *link.pair, RecognitionSettings(least_cells=25))
     assert told.reason.endswith("of 24 image cells") and told.a_from_b is not None
     assert len(told.shared) == told.evidence["inliers"] == len(told.residuals_px) >= 10
     assert {(int(shared[i, 0]), int(j)) for i, j in told.shared} <= set(map(tuple, shared.tolist()))
@@ -272,7 +271,7 @@ def test_manual_constraints_are_listed() -> None:
     told = explain_nodes(merger.merged(), *link.pair)
     assert told.standing is Standing.UNDONE and told.rulings == (ruling,)
     assert told.probability is not None and told.probability > 0.9, (
-        "a ruling changes nothing of what was seen"
+        "a manual constraint changes no measurement"
     )
     merger.rule(ManualConstraints([ManualConstraint((A, B), True, "anna", 0, "no")]))
     apart = explain_maps(merger.merged(), A, B)
@@ -299,7 +298,7 @@ def test_a_merge_that_loses_its_support_is_reported() -> None:
 
 
 def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
-    """A server that starts again joins all maps with one merge; it told some links twice."""
+    """A server that starts again joins all maps with one merge; it listed some links twice."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
     merger = Merger()

@@ -1,4 +1,4 @@
-"""Links by their nodes: whatever came before, the last links alone are told."""
+"""Links by their nodes: only the last links count."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def link(pair: Ends) -> Link:
 def test_the_last_links_are_returned_and_only_new_pairs_are_fresh(
     rounds: list[dict[Ends, int]],
 ) -> None:
-    # Two links of each pair: it may be measured anew.
+    # Two links of each pair: it may be measured again.
     links = [{pair: link(pair) for pair in PAIRS} for _ in range(2)]
     known, before = Adjacency(), set[Ends]()
     for chosen in rounds:

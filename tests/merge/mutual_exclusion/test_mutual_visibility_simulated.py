@@ -19,10 +19,9 @@ from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
-from mapweave.merge.mutual_exclusion.mutual_visibility import MutualVisibilitySettings
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import ExclusionSettings
 from mapweave.sim.events import Fail
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
@@ -105,13 +104,9 @@ def between_twins(seed: int) -> float:
     return first.x - second.x
 
 
-BLIND = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
-"""Robots that see nothing of each other."""
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_twins_should_have_seen_each_other(seed: int) -> None:
-    """Within five minutes, whatever the room: where little of it is free they are seldom in sight."""
+    """Within five minutes, in any room: where little floor is free they rarely see each other."""
     found = Walks("twins", seed, (0, 1), 150).clash(between_twins(seed))
     assert found is not None and found.where and found.evidence > 6.9
     assert f"{found.first} would have seen {found.second} " in found.reason
@@ -120,7 +115,7 @@ def test_twins_should_have_seen_each_other(seed: int) -> None:
 
 
 def with_wakes(walks: Walks, every: int = 5) -> None:
-    """Of each robot's nodes one in five stays; the others become moments of its wake."""
+    """Of each robot's nodes one in five stays; the others become moments of its trajectory segment."""
     kept = []
     for name in ("r0", "r1"):
         nodes = [node for node in walks.nodes if node.id.agent == name]
@@ -138,7 +133,7 @@ def with_wakes(walks: Walks, every: int = 5) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
-    """What nodes alone do not tell, or hardly, their wakes do; the same looks in other hands."""
+    """Nodes alone do not refute the merge, or hardly, segments do; the same scans of another robot."""
     walks = Walks("twins", seed, (0, 1), 150)
     all_nodes = walks.clash(between_twins(seed))
     with_wakes(walks)
@@ -164,7 +159,7 @@ def test_robots_that_are_in_one_room_are_not_refused(kind: str, seed: int) -> No
     """They come as near as they can, with furniture between, and rays that miss them."""
     walks = Walks(kind, seed, (0, 0))
     assert walks.clash() is None
-    # Not even by far: what is seen speaks for the merge. Nor does anything speak where nobody meets.
+    # Not even nearly: the scans are evidence for the merge. There is no evidence where no robots meet.
     loose = ExclusionSettings(doubt=0.9, least_witnesses=1)
     assert walks.clash(settings=loose) is None
     assert walks.clash(moved=20.0, settings=loose) is None
@@ -184,11 +179,13 @@ def test_broken_sensors_are_no_evidence(fails: str) -> None:
     assert walks.clash() is None
 
 
-def test_robots_without_a_radius_are_not_used_for_visibility() -> None:
+def test_robots_without_a_radius_are_not_used_for_visibility(monkeypatch: pytest.MonkeyPatch) -> None:
     walks = Walks("twins", 0, (0, 1))
     walks.nodes = [replace(node, radius=0.0) for node in walks.nodes]
-    blind = ExclusionSettings(sight=MutualVisibilitySettings(core=0.0))
-    assert walks.clash(between_twins(0)) == walks.clash(between_twins(0), blind)
+    seeing = walks.clash(between_twins(0))
+    # Robots that see nothing of each other.
+    monkeypatch.setattr("mapweave.merge.mutual_exclusion.mutual_visibility.CORE", 0.0)
+    assert seeing == walks.clash(between_twins(0))
 
 
 class Exploration:

@@ -14,11 +14,11 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.mutual_exclusion.refutation import Refutation
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import ExclusionSettings
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 EDGE_SIGMAS = np.array([0.006, 0.005, 0.005])
@@ -127,7 +127,7 @@ def test_closed_twins_stay_two(seed: int) -> None:
 
 @pytest.mark.parametrize(("clock", "late"), [("", 0.0), ("net", 500.0)])
 def test_without_a_clock_or_at_other_times_there_is_no_evidence(clock: str, late: float) -> None:
-    """A false story that nothing contradicts is believed; once the true one is told as well, neither is."""
+    """A false set without contradiction is kept; with the true one as well, neither is."""
     twins = Twins(1, clock, late)
     merged = merge_maps(twins.maps, twins.false)
     assert pairs(merged.links) == pairs(twins.false)

@@ -22,5 +22,5 @@ def test_joined_pieces_are_not_tested_again() -> None:
     assert pairs(joined(weights, {*weights, (K[1], K[2])})) == [(0, 1), (4, 5)]
     # 3 waits for what 2 says of it.
     assert pairs(joined(weights, weights)) == [(0, 1), (0, 2), (4, 5)]
-    # The weights of nobody's best join nothing.
+    # Weights that are no piece's best join nothing.
     assert pairs(joined(keys({(0, 1): 3.0, (1, 2): 2.0, (2, 3): 3.0}), ())) == [(0, 1), (2, 3)]

@@ -1,4 +1,4 @@
-"""Which landmarks tell a place: aisles of alike shelves, where only a few things are not everywhere."""
+"""Which landmarks identify a place: aisles of equal shelves, where only a few things are unique."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Aisle:
 
 
 def silent(links: Sequence[Link]) -> list[Link]:
-    """The same links, which do not tell their landmarks."""
+    """The same links, without their landmarks."""
     return [replace(link, shared=np.zeros((0, 2), np.int64)) for link in links]
 
 
@@ -142,7 +142,7 @@ def test_aliased_aisles_are_not_joined(seed: int) -> None:
 
 
 def test_a_view_of_one_bay_alone_is_ambiguous() -> None:
-    """One bay each, of another place: nothing shows that there are two of it. Then the merge is believed."""
+    """One bay each, of another place: nothing shows that there are two of it. Then the merge is accepted."""
     aisle = Aisle(5)
     aisle.drive("a", [0])
     aisle.drive("b", [3])

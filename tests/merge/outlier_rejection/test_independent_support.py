@@ -1,4 +1,4 @@
-"""How much links say that agree: witnesses by hand, chance against draws, mostly false fleets."""
+"""Independent support: places counted by hand, chance against Monte Carlo, mostly false fleets."""
 
 import math
 
@@ -47,7 +47,7 @@ def test_neighbours_at_both_ends_count_as_one_place() -> None:
     found = support_of([0, 1, 2, 4], np.ones(5, bool), np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
     assert found.places == pytest.approx(2.0) and found.coincidence == pytest.approx(0.01)
     assert found.others.tolist() == [1]
-    # What is found at other places too is no witness, on either side.
+    # Landmarks that occur at other places too do not count, on either side.
     telling = np.array([True, True, True, False, False])
     found = support_of([0, 1, 2, 4], telling, np.ones((5, 5), bool), near, np.full((5, 5), 0.01))
     assert found.places == pytest.approx(1.0) and found.others.tolist() == []
@@ -69,7 +69,7 @@ def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
 
 
 def test_the_number_of_chance_sets_agrees_with_the_prediction() -> None:
-    """Pairs of false witnesses that agree, against drawing them."""
+    """Pairs of false places that agree, against Monte Carlo."""
     rng = np.random.default_rng(2)
     n, coincidence = 12, 0.03
     false = ChanceSupport(40.0, np.array([60.0, 0.0, 0.0, 0.0]))

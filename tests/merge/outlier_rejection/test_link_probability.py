@@ -70,7 +70,7 @@ def test_probabilities_are_those_that_links_have(false_share: float) -> None:
     both = [fleet(seed, false_share) for seed in (1, 2, 3)]
     said, right = (np.concatenate(column) for column in zip(*both, strict=True))
     share = right.mean()
-    # Against somebody who knows only how many are right, and says so of each (Brier's score).
+    # Against the base rate as the probability of each (Brier's score).
     assert ((said - right) ** 2).mean() < 0.5 * share * (1.0 - share)
     assert abs(said.mean() - share) < 0.1
     sure = (said > 0.99) | (said < 0.01)

@@ -1,4 +1,4 @@
-"""Which links are believed: planted false links, alike rooms, cliques against brute force."""
+"""Which links are kept: planted false links, similar rooms, cliques against brute force."""
 
 from itertools import combinations
 
@@ -10,15 +10,12 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
-from mapweave.merge.outlier_rejection.pairwise_consistency import (
-    ConsistencySettings,
-    loop_distances2,
-    sort_links,
-)
+from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 
 
 def fragment(agent: str, tour: list[Pose2], rng: np.random.Generator, sigma: float = 0.02) -> Fragment:
@@ -58,7 +55,7 @@ class Two:
         return link(self.a, i, self.b, j, wrong, self.rng, inliers)
 
     def alike_room(self) -> list[Link]:
-        """Links that take the room at b's nodes 8 to 10, 6.4 m on, for the one at a's nodes 0 to 2."""
+        """Links that take the room at b's nodes 8 to 10, 6.4 m on, for the room at a's nodes 0 to 2."""
         shift = Pose2(-6.4, 0, 0)
         return [
             link(self.a, k, self.b, k + 8, self.tour_a[k].inverse() @ shift @ self.tour_b[k + 8], self.rng)
@@ -96,7 +93,7 @@ def test_an_aliased_room_is_refused_when_the_right_one_has_more_support() -> Non
     """Links between rooms that look alike agree with each other and are wrong."""
     two = Two(3)
     aliased = two.alike_room()
-    # They really close loops with each other: nothing but better support can tell that they are wrong.
+    # They really close loops with each other: only better support can show that they are wrong.
     assert (loop_distances2(aliased, two.a, two.b, ConsistencySettings()) < 11.34).mean() > 0.7
     right = [two.true_link(k, k) for k in range(0, 12, 2)]
     found = sort_links([*aliased, *right], two.a, two.b)
@@ -128,7 +125,7 @@ def test_one_place_with_many_links_is_rejected_if_another_contradicts_it() -> No
     found = sort_links([*alike, *true], two.a, two.b)
     assert not found.kept and len(found.rivals) == 2
     assert all("with 1.0 and 1.0 independent places" in one.reason for one in found.refused)
-    # One link that contradicts is no other story; and two further places decide between the two.
+    # One contradicting link is no other set; and two further places decide between the two.
     assert len(sort_links([*alike, true[0]], two.a, two.b).kept) == 5
     more = [two.true_link(k, k, 50) for k in (0, 1, 14, 15)]
     kept = {one.pair for one in sort_links([*alike, *true, *more], two.a, two.b).kept}

@@ -118,7 +118,7 @@ def test_a_single_loop_that_agrees_is_enough() -> None:
 
 
 def test_a_loop_that_only_other_loops_contradict_is_left_out() -> None:
-    """The way alone is too uncertain to tell; four loops that agree are not."""
+    """The drive alone is too uncertain; four loops that agree are not."""
     aisles = Aisles(2)
     for edge in list(aisles.map.edges.values()):
         loose = PoseGaussian(edge.a_from_b.mean, np.diag([0.2, 0.2, 0.1]) ** 2)
@@ -151,7 +151,7 @@ def test_of_bridges_that_contradict_each_other_the_better_supported_stay() -> No
 
 @pytest.mark.parametrize(("i", "j"), [(8, 9), (4, 8), (8, 29)])
 def test_a_drive_between_wrong_places_is_left_out_and_bends_nothing(i: int, j: int) -> None:
-    """Also between neighbours on the map's own way, and nobody shall drive by it."""
+    """Also between neighbours on the map's own way, and no robot shall drive by it."""
     aisles = Aisles(1)
     for pair in GOOD:
         aisles.loop(*pair)
@@ -209,7 +209,7 @@ def test_a_view_is_trusted_where_a_drive_contradicts_it() -> None:
 def test_no_set_of_loops_tears_a_map_apart_or_makes_it_depend_on_order(
     seed: int, loops: int, missing: int
 ) -> None:
-    """Whatever is claimed: what edges connect stays connected, and all claims are kept or named."""
+    """For any loop closures: connected nodes stay connected, and all closures are kept or named."""
     aisles = Aisles(seed, missing=12 * missing if missing else None)
     rng = np.random.default_rng(seed)
     made = [aisles.loop(20, 40, shift=float(rng.uniform(-3, 3)))]

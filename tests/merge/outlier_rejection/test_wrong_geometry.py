@@ -15,9 +15,9 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection import wrong_geometry
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, looked_through
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.25)
 STEP = 0.3
@@ -87,12 +87,12 @@ def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expect
     maps[MapId("c", 1)] = corridor("c", scale, gap, 12)
     ids = sorted(maps)
     links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
-    finder = WrongGeometrySearch(ConsistencySettings(), 25.0)
+    finder = WrongGeometrySearch(ConsistencySettings())
     wrong = finder.wrong(maps, links.__getitem__, links.keys())
     assert (set(wrong) == {ids[2]}) is expected
     if expected:
         assert wrong[ids[2]].reason == "map c.1 contradicts a.1 and b.1, which agree: its geometry is wrong"
-        # Nobody can say which of two is wrong; nor is anybody heard whose map is retired.
+        # Which of two is wrong cannot be decided; retired maps do not count.
         assert not finder.wrong(maps, links.__getitem__, (), [ids[0]])
         assert finder.wrong(maps, links.__getitem__, ()).keys() == wrong.keys()
 
@@ -110,5 +110,5 @@ def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.
         return real(links, *rest)
 
     monkeypatch.setattr(wrong_geometry, "link_sets", fails)
-    found = WrongGeometrySearch(ConsistencySettings(), 25.0).wrong(maps, links.__getitem__, links.keys())
+    found = WrongGeometrySearch(ConsistencySettings()).wrong(maps, links.__getitem__, links.keys())
     assert found.keys() == {ids[2]}
