@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import (
+    SOON,
     add_network,
     connect,
     network_of,
@@ -19,6 +21,7 @@ from mapweave.commands.network import (
 
 if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
+    from mapweave.agent.drivers.settings import RobotSettings
     from mapweave.agent.synchronization import Synchronization
     from mapweave.wire.bus import Bus
 
@@ -32,9 +35,7 @@ def add_to(commands: Any) -> None:
         "Without a network it goes on mapping; what it mapped is sent when a server can be reached.",
     )
     parser.add_argument("name", help="the robot's name in the fleet, for example r0")
-    parser.add_argument(
-        "--driver", choices=["remote"], default="remote", help="remote: a body behind Zenoh keys (simulator)"
-    )
+    add_robot(parser)
     parser.add_argument(
         "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
     )
@@ -47,9 +48,7 @@ def add_to(commands: Any) -> None:
         "--fresh", action="store_true", help="begin a new map; else the newest map of the journal goes on"
     )
     which.add_argument("--resume", metavar="MAP", help="go on with this map of the journal, for example r0.3")
-    parser.add_argument(
-        "--body", metavar="ENDPOINT", help="Zenoh endpoint of the robot's body (default: the fleet's)"
-    )
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record what the robot senses, as MCAP")
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
@@ -58,8 +57,23 @@ def add_to(commands: Any) -> None:
     parser.set_defaults(run=run)
 
 
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Declare which robot it is, and where it is reached."""
+    parser.add_argument(
+        "--robot", metavar="DRIVER",
+        help="a driver as `mapweave robots` lists them, or your own class, FILE.py:CLASS (default: [robot] "
+        "driver of the settings, else remote, a base behind Zenoh keys such as the simulator's)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--body", metavar="ENDPOINT", help="Zenoh endpoint of the robot's body (default: the fleet's)"
+    )
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
+    from mapweave.agent.drivers.checked import CheckedRobot
+    from mapweave.agent.drivers.claim import Claim
+    from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.agent.mission import Carried, Explore, Idle, Mission
     from mapweave.commands.map_ends import map_of
     from mapweave.hybridmap.errors import InvalidValue
@@ -77,14 +91,21 @@ def run(arguments: argparse.Namespace) -> int:
     network = network_of(arguments, settings)
     stop = stop_on_signals()
     bus, keys = connect(network)
-    body = bus
+    body, claim = bus, None
+    robot: Robot | None = None
     try:
         warn_without_router(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
-        robot, synchronization = _body(arguments, body, network.fleet, name)
+        if body.wait_connected(SOON):
+            claim = Claim(body, keys, name)
+        robot, synchronization = open_robot(
+            arguments, settings.robot, body, network.fleet, name, arguments.lockstep
+        )
+        if arguments.record is not None:
+            robot = RecordedRobot(robot, arguments.record, print_line=print_error)
         # Who is told to stop while it waits for its body stops waiting.
-        threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
+        threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
         missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
         options = AgentOptions(
             name=name,
@@ -97,27 +118,52 @@ def run(arguments: argparse.Namespace) -> int:
             synchronization=synchronization,
             server=network.server,
         )
-        run_agent(robot, bus, keys, settings.agent, options, stop)
+        run_agent(CheckedRobot(robot), bus, keys, settings.agent, options, stop)
     finally:
+        if robot is not None:
+            robot.close()
+        if claim is not None:
+            claim.close()
         if body is not bus:
             body.close()
         bus.close()
     return 0
 
 
-def _body(arguments: argparse.Namespace, bus: Bus, fleet: str, name: str) -> tuple[Robot, Synchronization]:
-    """The body behind Zenoh keys, and what the loop waits for: a simulation may be driven in lock-step."""
+def print_error(line: str) -> None:
+    """Print a line for people, beside the output proper."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def open_robot(
+    arguments: argparse.Namespace,
+    settings: RobotSettings,
+    bus: Bus,
+    fleet: str,
+    name: str,
+    lockstep: bool = False,
+) -> tuple[Robot, Synchronization]:
+    """The robot, and how the loop is synchronised: a simulation may run in lock-step."""
+    from mapweave.agent.drivers.registry import find_driver
     from mapweave.agent.drivers.remote import RemoteRobot
+    from mapweave.agent.drivers.settings import REMOTE
     from mapweave.agent.synchronization import FreeRunning, Lockstep
+    from mapweave.hybridmap.errors import SettingsError
 
-    if not arguments.lockstep:
+    driver = arguments.robot or settings.driver
+    if driver == REMOTE and not lockstep:
         return RemoteRobot(bus, fleet, name), FreeRunning()
-    from mapweave.sim.lockstep_robot import LockstepRobot
+    if driver == REMOTE:
+        from mapweave.sim.lockstep_robot import LockstepRobot
 
-    robot = LockstepRobot(bus, fleet, name)
-    return robot, Lockstep(robot.rendezvous)
+        robot = LockstepRobot(bus, fleet, name)
+        return robot, Lockstep(robot.rendezvous)
+    if lockstep or arguments.body:
+        raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
+    return find_driver(driver)(settings), FreeRunning()
 
 
-def _close_on(stop: threading.Event, robot: Robot) -> None:
+def close_on(stop: threading.Event, robot: Robot) -> None:
+    """Close a robot once the process is told to stop: who waits for an observation stops waiting."""
     stop.wait()
     robot.close()

@@ -31,7 +31,6 @@ class BodyTrajectory:
         times: (N,) s, ascending.
         radius: of the robot, m; 0 if not all nodes tell.
         looks: what its proximity sensors saw at each moment.
-        views: what its camera saw: the nodes themselves, in the order of time.
     """
 
     clock: str
@@ -40,17 +39,11 @@ class BodyTrajectory:
     times: Array
     radius: float
     looks: RangeScans
-    views: tuple[Node, ...]
 
     @property
     def agent(self) -> str:
         """Whose it is."""
         return self.nodes[0].agent
-
-    @property
-    def view_times(self) -> Array:
-        """(V,) s, ascending."""
-        return _seconds(self.views)
 
     @property
     def drifts(self) -> Array:
@@ -88,7 +81,7 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
         order = np.argsort(times, kind="stable")
         looks = RangeScans.of([node.ranges for node in known], [node.wake for node in known]).take(order)
         ids = tuple(known[k].id for k in teller[order])
-        trails.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, looks, tuple(known)))
+        trails.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, looks))
     return tuple(trails)
 
 

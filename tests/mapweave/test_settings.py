@@ -54,8 +54,8 @@ def test_given_values_replace_the_defaults(tmp_path):
     default = Settings()
     agent = default.agent
     expected = Settings(
-        dataclasses.replace(default.network, endpoints=("tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447")),
-        dataclasses.replace(
+        network=dataclasses.replace(default.network, endpoints=("tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447")),
+        agent=dataclasses.replace(
             agent,
             seed=7,
             navigation=dataclasses.replace(agent.navigation, speed=1.0),
@@ -120,8 +120,8 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[agent.filter]\nadaptation = 1.5", "agent.filter.adaptation: expected float <= 1.0; it is 1.5"),
         ("[admission_control]\nworkers = 65", "admission_control.workers: expected int <= 64; it is 65"),
         ("[agent.landmarks]\nmost_bytes = 100", "robot.toml: most_bytes: a node needs 660 at least, not 100"),
-        ("[merge]\nstrains = 9.0", "merge: no setting 'strains'; did you mean 'strain'?"),
-        ("[merge]\nstrain = 'much'", "merge.strain: expected float, got str"),
+        ("[merge]\nexclusions = 9.0", "merge: no setting 'exclusions'; did you mean 'exclusion'?"),
+        ("[merge.exclusion]\ndoubt = 'much'", "merge.exclusion.doubt: expected float, got str"),
         ("[merge.consistency]\nleast_links = 1.5", "merge.consistency.least_links: expected int, got float"),
         ("[network", "robot.toml: "),
         ("a = 1\na = 2", "robot.toml: "),
