@@ -192,11 +192,17 @@ class ZenohBus:
                 continue
             with self._owner.lock:
                 if not self._closed.is_set():
-                    for declared in self._owner.declared:
-                        declared.declare(session)
-                    self._session = session
-                    return
+                    try:
+                        for declared in self._owner.declared:
+                            declared.declare(session)
+                        self._session = session
+                        return
+                    except NotConnected:
+                        # The interpreter is ending; then nobody waits for this bus.
+                        if threading.main_thread().is_alive():
+                            raise
             session.close()  # type: ignore[no-untyped-call]
+            return
 
 
 def _open_router(settings: BusSettings) -> zenoh.Session:

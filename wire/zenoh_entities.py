@@ -57,13 +57,17 @@ class Declared:
         def declare() -> None:
             try:
                 outcome.append(self._declare_in(session))
-            except zenoh.ZError as error:
+            except (zenoh.ZError, RuntimeError) as error:
                 outcome.append(error)
 
         ordinary = threading.Thread(target=declare, name="zenoh-declare", daemon=False)
-        ordinary.start()
+        try:
+            ordinary.start()
+        except RuntimeError as error:
+            # From Python 3.12 on no thread starts once the interpreter is ending; nor do those of Zenoh.
+            raise NotConnected(f"{self.key}: {error}") from None
         ordinary.join()
-        if isinstance(outcome[0], zenoh.ZError):
+        if isinstance(outcome[0], (zenoh.ZError, RuntimeError)):
             raise NotConnected(f"{self.key}: {outcome[0]}")
         self._entity = outcome[0]
 
