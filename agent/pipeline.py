@@ -71,6 +71,7 @@ class Status:
         lost: whether it has given up localizing on its own map: a new map must be begun.
         astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
         tally: statistics of the drive so far.
+        located: whether `map_from_robot` comes from this observation.
     """
 
     doing: str
@@ -85,6 +86,7 @@ class Status:
     legs: int = 0
     lost: bool = False
     astray: bool = False
+    located: bool = False
     tally: DriveStatistics = NOTHING_DRIVEN
 
 
@@ -307,5 +309,6 @@ class Pipeline:
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
             astray=self._resumption is not None,
+            located=mapping and self._mapper.started and not self._mapper.astray,
             tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
         )

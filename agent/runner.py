@@ -26,7 +26,7 @@ class Runner:
         fleet: FleetClient,
         replicator: Replicator,
         synchronization: Synchronization | None = None,
-        on_step: Callable[[Step], None] = lambda step: None,
+        on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
     ) -> None:
         """Put the parts together.
 
@@ -59,7 +59,7 @@ class Runner:
         now = self._ticks % REPORT_EVERY == 0 or bool(step.questions)
         self._fleet.report(step.status, observation.stamp_ns, publish=now)
         self._ticks += 1
-        self._on_step(step)
+        self._on_step(observation, step)
         return step
 
     @property

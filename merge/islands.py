@@ -1,4 +1,4 @@
-"""The merge as maps grow: only what a change can bear on is merged anew.
+"""The merge as maps grow: only islands that a change affects are merged again.
 
 Maps that links tie together, directly or by way of others, are an island. Nothing in one island bears on
 another, so an island that nothing has touched is kept as it is.
@@ -60,7 +60,7 @@ class Islands:
             verdicts: on pairs of their nodes.
             touched: maps that were replaced, or with a node of which the verdicts have changed, since this
                 was called last.
-            rulings: of people.
+            rulings: manual constraints.
 
         Returns:
             What `merge_maps` makes of all maps; of large islands nearly so.

@@ -1,14 +1,14 @@
 """Maps and verified links become a merged map: the whole of the merge after verification, as one function.
 
-1. Maps are cut into pieces that their own edges connect; a robot's own claims must agree with its way.
+1. Maps are cut into pieces that their own edges connect; loop closures must agree with the robot's drive.
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
-3. Pieces are joined, best supported first, and the links between what is larger now are sorted anew. Links
-   that would join what is joined already must agree with it.
-4. Each component is optimised; a link that then strains more than it should is refused, worst first. Where
-   few are refused, each is tried once more by solving with it.
-5. Where two robots would have been at the same place at the same time, the links that make them so are
-   refuted, and it goes on at 2 with the rest.
-6. Drives of a robot among others' nodes are checked against the outcome.
+3. Pieces are joined, best supported first, and the links between the larger pieces are sorted again. Links
+   within one piece must agree with it.
+4. Each component is optimised; a link with too large a residual is refused, worst first. If few are refused,
+   each is tried once more by solving with it.
+5. Where two robots would have been at the same place at the same time, the links that cause this are
+   refuted, and the merge continues at 2 with the rest.
+6. Drives of a robot among others' nodes are checked against the result.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class MergeSettings:
     """How maps are merged.
 
     Attributes:
-        consistency: when links are believed.
+        consistency: when links are accepted.
         exclusion: when two robots would have been in one place.
         strain: chi-square with 3 degrees of freedom above which an optimised link is refused.
     """
@@ -80,7 +80,7 @@ def decide(
     memory: DecisionCache,
     before: StandingDecisions | None = None,
 ) -> tuple[MergedMap, StandingDecisions]:
-    """Merge, and tell what was decided, so that the next merge can begin from it.
+    """Merge, and return the decisions, so that the next merge can begin from them.
 
     Args:
         maps: by id; they are not changed.
@@ -88,11 +88,11 @@ def decide(
         refused: pairs that were refused before, to be kept with their reasons.
         settings: how.
         memory: of merges with the same settings; what they have found out is not found out again.
-        before: what stands of the same maps, as far as it is still true. A link keeps its decision until
-            links between the same two maps come or go; None: all are decided.
+        before: standing decisions on the same maps. A link keeps its decision until links between the same
+            two maps come or go; None: all are decided.
 
     Returns:
-        The merged map, and what stands now.
+        The merged map, and the standing decisions.
     """
     s = settings
     fragments = memory.fragments(maps, s.consistency, s.strain)
@@ -183,14 +183,14 @@ def _weighed(
     memory: DecisionCache,
     s: MergeSettings,
 ) -> dict[Pair, Link]:
-    """Links with their doubles, which are looked for among those between maps of which links are new."""
+    """Links with their aliased landmarks, searched among links between maps with new links."""
     out = {pair: standing.weighed[pair] for pair in given if pair in known}
     some = [link for link in given.values() if link.maps in fresh]
     involved = {one: maps[one] for pair in fresh for one in pair if one in maps}
     for link, found in zip(
         some, memory.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
     ):
-        # What is known to be elsewhere too stays so, whoever is looked at.
+        # Known aliased landmarks stay aliased.
         if link.key not in out or out[link.key].doubles < found.doubles:
             out[link.key] = found
     return out

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.replay import add_recording, options_of
+
 
 def add_to(commands: Any) -> None:
     """Declare the command and what it can evaluate."""
@@ -61,6 +63,62 @@ def add_to(commands: Any) -> None:
         "--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline and the merge"
     )
     merge.set_defaults(run=run_merge)
+    replay: argparse.ArgumentParser = kinds.add_parser(
+        "replay",
+        help="map a recording; error of every frame beside the wheels alone",
+        description="Map a recording as `mapweave replay` does. Print the absolute and relative error of its "
+        "frames beside the wheels alone, nodes, bytes, the share of frames used, and why others were not. "
+        "The trajectories go to files that evo reads. Without truth nothing is scored.",
+    )
+    add_recording(replay)
+    replay.add_argument(
+        "--truth",
+        type=Path,
+        metavar="FILE",
+        help="truth.csv, or poses as TUM has them (default: truth.csv beside it)",
+    )
+    replay.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
+    replay.add_argument("--out", type=Path, metavar="DIR", help="default: out/eval-replay/RECORDING")
+    replay.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    replay.add_argument("--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline")
+    replay.set_defaults(run=run_replay)
+
+
+def run_replay(arguments: argparse.Namespace) -> int:
+    """Map, score and print."""
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from mapweave.agent.drivers.replay import Replay
+    from mapweave.commands.network import settings_of
+    from mapweave.evaluation.replaying import evaluate_replay, rows
+    from mapweave.output_folder import check_output
+
+    path: Path = arguments.recording
+    out = arguments.out or Path("out/eval-replay") / path.resolve().stem
+    check_output(out)
+    truth = arguments.truth or (path if path.is_dir() else path.parent) / "truth.csv"
+    replay = Replay(path, arguments.robot, options=options_of(arguments))
+    console = Console(stderr=True)
+    for note in replay.recording.notes:
+        console.print(note, highlight=False)
+    with Progress(console=console) as progress:
+        task = progress.add_task("frames", total=len(replay))
+        evaluated = evaluate_replay(
+            replay, settings_of(arguments).pipeline, truth, lambda frame: progress.advance(task)
+        )
+    for written in evaluated.write(out):
+        console.print(f"{written}", highlight=False)
+    report = evaluated.report()
+    if arguments.json:
+        print(json.dumps(report, allow_nan=False))
+        return 0
+    table = Table("", "", title=str(path))
+    for name, words in rows(report):
+        table.add_row(name, words)
+    Console(file=sys.stdout).print(table)
+    return 0
 
 
 def run(arguments: argparse.Namespace) -> int:

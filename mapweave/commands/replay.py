@@ -83,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         mission=Carried(),
         server=network.server,
         total=len(robot),
+        trajectories=True,
         patience=0.0 if arguments.offline else arguments.patience,
     )
     stop = stop_on_signals()

@@ -17,6 +17,7 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import Idle, Mission
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, PipelineSettings, Step
+from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.merged_poses import MergedPoses
@@ -54,6 +55,7 @@ class AgentOptions:
         synchronization: what the loop waits for between ticks.
         server: whose acknowledgement lets changes be forgotten.
         total: observations that will come, if that is known.
+        trajectories: whether the pose at each observation goes to a file beside the map's.
         patience: how long to wait at the end until the server has everything, s.
     """
 
@@ -67,6 +69,7 @@ class AgentOptions:
     synchronization: Synchronization = field(default_factory=FreeRunning)
     server: str = "s0"
     total: int | None = None
+    trajectories: bool = False
     patience: float = 5.0
 
 
@@ -85,7 +88,7 @@ class Agent:
         keys: Keys,
         settings: PipelineSettings,
         options: AgentOptions,
-        on_step: Callable[[Step], None] = lambda step: None,
+        on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
         print_line: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Open the journal and join the fleet.
@@ -172,7 +175,14 @@ class Agent:
             self._bus, self._keys, map_id, options.synchronization.answer_timeout, options.server,
             self.replicator.unacknowledged, self._placed,
         )  # fmt: skip
-        self.runner = Runner(pipeline, self._fleet, self.replicator, options.synchronization, self._on_step)
+        path = trajectory_path(options.data, map_id)
+        self._trajectory = TrajectoryFile(path) if options.trajectories else None
+        self.runner = Runner(pipeline, self._fleet, self.replicator, options.synchronization, self._stepped)
+
+    def _stepped(self, observation: Observation, step: Step) -> None:
+        if self._trajectory is not None and step.status.located:
+            self._trajectory.add(observation.stamp_ns, step.status.map_from_robot)
+        self._on_step(observation, step)
 
     @property
     def map_id(self) -> MapId:
@@ -235,6 +245,8 @@ class Agent:
         return self.merged_poses.count(self.map_id)
 
     def _leave(self) -> None:
+        if self._trajectory is not None:
+            self._trajectory.close()
         self._fleet.close()
         self.merged_poses.close()
         self.replicator.flush(10.0)
@@ -249,6 +261,11 @@ class Agent:
 def map_path(folder: Path, map_id: MapId) -> Path:
     """Where an agent writes a map: one file a map, for example `r0.3.mapweave`."""
     return folder / f"{map_id}.mapweave"
+
+
+def trajectory_path(folder: Path, map_id: MapId) -> Path:
+    """Where an agent writes where it was at each observation, for example `r0.3.tum`."""
+    return folder / f"{map_id}.tum"
 
 
 def epochs_of_files(folder: Path, agent: str) -> list[int]:
@@ -336,7 +353,7 @@ class _progress:
         if self._bar is not None:
             self._bar.stop()
 
-    def __call__(self, step: Step) -> None:
+    def __call__(self, observation: Observation, step: Step) -> None:
         status = step.status
         if self._bar is not None:
             self._bar.update(self._task, advance=1, detail=f"{status.nodes} nodes, {status.detail}")

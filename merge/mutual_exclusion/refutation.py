@@ -1,4 +1,4 @@
-"""Refutation: which groups of links cannot be true, because robots are bodies."""
+"""Refutation: which groups of links cannot be true, because robots exclude each other."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIGHT = 8.0
 
 
 class Refutation:
-    """Knows where every robot was when, as far as its clock is known."""
+    """Keeps the trajectories of all robots with known clocks."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Refutation:
         exclusion: ExclusionSettings,
         memory: DecisionCache | None = None,
     ) -> None:
-        """Read the trails.
+        """Read the trajectories.
 
         Args:
             maps: with the nodes of all fragments.
@@ -51,7 +51,7 @@ class Refutation:
         self._trails: dict[NodeId, tuple[BodyTrajectory, ...]] = {name: some for name, some in trails if some}
 
     def verdict(self, story: Sequence[Link]) -> str:
-        """Why links that agree with each other cannot be true; empty if they can, as far as anybody knows."""
+        """Why links that agree with each other cannot be true; empty if they may be."""
         ends = {self._by_node[node].name: self._by_node[node] for link in story for node in link.pair}
         if len(ends.keys() & self._trails.keys()) < 2:
             return ""
@@ -78,7 +78,7 @@ class Refutation:
         Args:
             solved: the components.
             kept: the links that made them.
-            changed: fragments whose robots may clash with others since it was looked at last; None: all.
+            changed: fragments whose robots may collide with others since the last test; None: all.
         """
         clashes = dict(self._clashes(solved, changed))
         if not clashes:
@@ -97,7 +97,7 @@ class Refutation:
     def _clashes(
         self, solved: Sequence[PoseGraph], changed: Collection[NodeId] | None = None
     ) -> Iterator[tuple[Key, Collision]]:
-        """Pairs of fragments in one component that clash, by whichever clock says so most clearly."""
+        """Pairs of fragments in one component that collide, by the clock with most evidence."""
         for graph in solved:
             trails = [
                 (name, trail) for name, some in self._trails.items() if name in graph.rows for trail in some
@@ -115,9 +115,9 @@ class Refutation:
 
 
 def _near(graph: PoseGraph, trails: Sequence[BodyTrajectory]) -> Iterator[tuple[int, int]]:
-    """Pairs of trails of different robots that overlap in time, by one clock, and come near each other.
+    """Pairs of trajectories of different robots that overlap in time, by one clock, and come near each other.
 
-    Of a thousand robots in a large building few ever meet, and to look closely takes long.
+    Of a thousand robots in a large building few ever meet, and a full test is slow.
     """
     if not trails:
         return

@@ -1,4 +1,4 @@
-"""Trails: when a robot was where, as far as its nodes and their wakes tell."""
+"""Trajectories: when a robot was where, by its nodes and their trajectory segments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mapweave.merge.mutual_exclusion.range_scans import RangeScans
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 LONGEST_GAP = 5.2
-"""Between moments that are further apart nobody knows where the robot was, s."""
+"""Between moments further apart the robot's pose is unknown, s."""
 LONGEST_WAY = 1.0
 """Nor if they are further apart, m."""
 ALONG = 0.15
@@ -28,12 +28,12 @@ CLOCK_ERROR = 0.05
 
 NANOSECONDS = 1e9
 DRIFT = 0.02
-"""How far a robot on its way is off beside its node, as a share of the way between them, one sigma."""
+"""Error of a robot's pose relative to its node, as a share of the way between them, one sigma."""
 
 
 @dataclass(frozen=True)
 class BodyTrajectorySettings:
-    """How well it is known where a robot is between two moments of its trail.
+    """Uncertainty of a robot's pose between two moments of its trajectory.
 
     In the simulator it is within 1 cm of the straight line, but up to a third of its length ahead or behind.
     """
@@ -41,15 +41,15 @@ class BodyTrajectorySettings:
 
 @dataclass(frozen=True, eq=False)
 class BodyTrajectory:
-    """N moments of a robot, by one clock: the images of its nodes, and their wakes.
+    """N moments of a robot, by one clock: the images of its nodes, and their trajectory segments.
 
     Attributes:
         clock: not empty.
-        nodes: N, in the order of time: the node that tells of each moment.
-        node_from_robot: (N, 3) m, m and rad: where the robot was beside it; zeros for the node's own image.
+        nodes: N, in the order of time: the node of each moment.
+        node_from_robot: (N, 3) m, m and rad: the robot's pose in it; zeros for the node's own image.
         times: (N,) s, ascending.
-        radius: of the robot, m; 0 if not all nodes tell.
-        looks: what its proximity sensors saw at each moment.
+        radius: of the robot, m; 0 if unknown.
+        looks: its proximity readings at each moment.
         views: what its camera saw: the nodes themselves, in the order of time.
     """
 
@@ -73,7 +73,7 @@ class BodyTrajectory:
 
     @property
     def drifts(self) -> Array:
-        """(N,) m, how far the robot may have been elsewhere beside its node, standard deviation."""
+        """(N,) m, standard deviation of the robot's position relative to its node."""
         out: Array = DRIFT * np.hypot(self.node_from_robot[:, 0], self.node_from_robot[:, 1])
         return out
 
@@ -89,7 +89,7 @@ class BodyTrajectory:
 
 
 def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
-    """The trails of one robot's nodes, one a clock; nodes whose clock nobody knows are left out."""
+    """The trajectories of one robot's nodes, one a clock; nodes of unknown clocks are left out."""
     by_clock: dict[str, list[Node]] = {}
     for node in nodes:
         if node.clock:
@@ -98,7 +98,7 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
     for clock, known in sorted(by_clock.items()):
         known.sort(key=lambda node: (node.stamp_ns, node.id))
         radius = min(node.radius for node in known)
-        # Wakes of neighbours may overlap by a rounded moment: the order of time is made here.
+        # Segments of neighbours may overlap by a rounded moment: they are ordered by time here.
         teller = np.concatenate([np.arange(len(known)), np.repeat(range(len(known)), _lengths(known))])
         wakes = [node.wake for node in known if len(node.wake)]
         ages = np.concatenate([np.zeros(len(known)), *(wake.ages for wake in wakes)])
@@ -124,10 +124,10 @@ class Stay:
     """Where a robot was at T moments.
 
     Attributes:
-        known: (T,) whether anybody knows.
-        places: (T, 2) m, in the frame of the trail's places.
-        spreads: (T, 2, 2) m^2, covariances: the robot wanders between the moments of its trail.
-        nearest: (T,) index of the moment of the trail that is nearest in time.
+        known: (T,) whether the pose is known.
+        places: (T, 2) m, in the frame of the trajectory's places.
+        spreads: (T, 2, 2) m^2, covariances: the robot moves freely between the moments of its trajectory.
+        nearest: (T,) index of the trajectory's moment that is nearest in time.
     """
 
     known: NDArray[np.bool_]

@@ -72,13 +72,13 @@ class DecisionCache:
         verdict: Verdict,
         exact: bool = True,
     ) -> dict[Key, LinkGroup]:
-        """See `LinkGroup.of`; links between two fragments are sorted anew only if any of them is new.
+        """See `LinkGroup.of`; links between two fragments are sorted again only if any of them is new.
 
         Args:
             links: each once.
             by_node: the fragment of each node.
-            s: when links are believed.
-            verdict: on sets that are supported alike; it depends on the two fragments alone.
+            s: when links are accepted.
+            verdict: on sets with equal support; it depends on the two fragments alone.
             exact: also if either fragment has changed elsewhere.
 
         Returns:
@@ -103,14 +103,14 @@ class DecisionCache:
         return known[1]
 
     def forget(self, maps: set[MapId]) -> None:
-        """Drop what is known of maps that are gone."""
+        """Drop entries of removed maps."""
         self._maps = {k: v for k, v in self._maps.items() if k not in maps}
         self._groups = _among(self._groups, maps)
         self._weighed = _among(self._weighed, maps)
 
 
 def _among(known: dict[Key, T], gone: set[MapId]) -> dict[Key, T]:
-    """What is known between two nodes of maps that are not gone."""
+    """Entries between two nodes of present maps."""
     return {k: v for k, v in known.items() if k[0].map not in gone and k[1].map not in gone}
 
 

@@ -1,10 +1,10 @@
-"""Readmission: the few links that most of the map speaks against, tried once more by solving with them.
+"""Readmission: the few refused links of a map, tried once more by solving with them.
 
-How far a link is off is judged along the tangent of the solution without it. Where headings are little known
-that is not good enough: the map bends by more than its tangent tells. If nearly all links of a map are
-believed, those that are not are likely to be right too, and if they are not far off worth a solution each.
-How much the chi-square of everything rises takes the place of the misfit in Bayes' factor, and the odds begin
-with how many links are believed for one that is not (see mapweave.merge.outlier_rejection.link_probability).
+A link's residual is computed along the tangent of the solution without it. Where headings are uncertain that
+is not good enough: the map bends by more than its tangent. If nearly all links of a map are accepted, the
+refused ones are likely to be right too, and worth a solution each if their residuals are not large. The rise
+of the total chi-square replaces the misfit in Bayes' factor, and the prior odds are accepted over refused
+links (see mapweave.merge.outlier_rejection.link_probability).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mapweave.merge.pose_graph.links import Link
 FEW = 0.05
 """Share of a component's links up to which those that are refused are tried."""
 NEAR = 10.0
-"""How many times the gate one may be off along the tangent: it saves the solutions that are in vain."""
+"""Largest residual along the tangent, in gates: it saves useless solutions."""
 
 
 def readmitted(
@@ -32,9 +32,9 @@ def readmitted(
 
     Args:
         solver: of the fragments.
-        kept: links that are believed.
+        kept: accepted links.
         refused: links that are not.
-        s: when links are believed.
+        s: when links are accepted.
     """
     out: list[Link] = []
     if not refused:

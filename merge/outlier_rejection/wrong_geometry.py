@@ -1,19 +1,19 @@
-"""Maps with wrong geometry: wherever their links put them, other robots look through their walls.
+"""Maps with wrong geometry: in every placement by their links, other robots see through their walls.
 
 A robot whose wheels slip, or that is carried off unnoticed, makes a map with true views and a wrong way
-between them. Each of its links to a sound map is true, and no rigid placement satisfies them all: they fall
+between them. Each of its links to a correct map is true, and no rigid placement satisfies them all: they fall
 into sets that agree only within themselves (pairwise consistency, Mangelson et al., ICRA 2018). A room that
-looks like another room gives such sets too. Consistency cannot tell the two cases apart. Lines of sight can:
+looks like another room gives such sets too. Consistency cannot distinguish the two cases. Lines of sight can:
 
-* If the map is sound, one placement is true. Under it the landmarks of the map are where others have seen
-  them, or where nobody has looked. The links of all other sets are false.
-* If the map bends or jumps, each placement puts a part of it where it never was. Others then look through its
-  walls, and it looks through theirs: they know landmarks behind them in the same direction.
+* If the map is correct, one placement is true. Under it the landmarks of the map are where others have seen
+  them, or where no robot has observed. The links of all other sets are false.
+* If the map bends or jumps, each placement puts a part of it in a wrong place. Others then see through its
+  walls, and it sees through theirs: they have landmarks behind them in the same direction.
 
 So a map is wrong if lines of sight refute every placement among several maps that agree with each other.
-Clutter and wrong depths are looked through at true places too. How much is measured on the same nodes, each
-put where its own links put it. Where others have not looked nothing is refuted, and the map may be right: it
-may know a room that only looks like theirs.
+Clutter and wrong depths are seen through at true places too. Their share is measured on the same nodes, each
+placed by its own links. Unobserved placements are not refuted, and the map may be right: it may have a room
+that only looks like theirs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from mapweave.merge.pose_graph.merged_map import WrongGeometry
 from mapweave.registration.pose_arrays import PoseGaussians
 
 MOST_LINKS = 60
-"""Links between two pieces of map that are looked at, evenly chosen: pairs of links grow by the square."""
+"""Links between two pieces of map that are tested, evenly chosen: pairs of links grow by the square."""
 MOST_PARTNERS = 5
 """Maps against which one is held: those with which it has most links."""
 AGREEING = 0.9
@@ -48,7 +48,7 @@ more, those of a robot with wrong geometry up to 0.75."""
 LEAST_SHARE = 0.25
 """A set of links is a placement if it has this share of the links of the largest set."""
 RARE = 0.05
-"""Share of nodes, where their own links put them, that are looked through more than is usual."""
+"""Share of nodes, placed by their own links, that are seen through more than usual."""
 REFUTED = 0.001
 """Chance, at most, that so many nodes are under a true placement (binomial)."""
 LEAST_NODES = 4
@@ -79,7 +79,7 @@ class _Tie:
     Attributes:
         links: all between the largest pieces of the two.
         best: the largest set of them that agrees.
-        share: of the links that were looked at that are in it.
+        share: of the tested links that are in it.
     """
 
     links: tuple[Link, ...]
@@ -120,7 +120,7 @@ class WrongGeometrySearch:
             maps: by id; never changed, only replaced.
             links: gives those between two of them.
             stale: pairs of maps whose links have changed, or of which one was replaced, since the last call.
-            left_out: maps that are not heard.
+            left_out: maps that are not used.
 
         Returns:
             The maps that are wrong, by id.
@@ -242,7 +242,7 @@ def all_refuted(
     nodes: Mapping[NodeId, Node],
     s: ConsistencySettings,
 ) -> bool:
-    """Whether the lines of sight refute every placement that links give.
+    """Whether lines of sight refute every placement by links.
 
     Args:
         links: from `placed` to `fixed`.
@@ -258,7 +258,7 @@ def all_refuted(
     own: dict[NodeId, list[Link]] = {}
     for link in links:
         own.setdefault(link.a, []).append(link)
-    # By its own links each node is where it truly is, whatever the map says of the way there.
+    # By its own links each node is at its true place, regardless of the map's geometry.
     usual = np.concatenate([_looked_through(some, [one], placed, fixed, nodes) for one, some in own.items()])
     return all(
         _more(_looked_through(one, sorted(own.keys() - {k.a for k in one}), placed, fixed, nodes), usual)
@@ -269,8 +269,8 @@ def all_refuted(
 def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
     """Whether the links of each single node agree where it is.
 
-    They do, whatever the geometry of its map. Otherwise many links are false since places look alike, and a
-    map whose links are all false would be refuted everywhere too.
+    They do, with any geometry of its map. Otherwise many links are false by perceptual aliasing, and a map
+    with only false links would be refuted everywhere too.
     """
     places: dict[NodeId, list[Pose2]] = {}
     for link in sorted(links, key=lambda link: -link.weight):
@@ -284,7 +284,7 @@ def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
 
 
 def _more(shares: Array, usual: Array) -> bool:
-    """Whether more nodes than chance makes are looked through more than is usual."""
+    """Whether more nodes than by chance are seen through more than usual."""
     if min(len(shares), len(usual)) < LEAST_NODES:
         return False
     many = int((shares > np.quantile(usual, 1.0 - RARE)).sum())
@@ -298,7 +298,7 @@ def _looked_through(
     fixed: Fragment,
     nodes: Mapping[NodeId, Node],
 ) -> Array:
-    """Of each node that can be placed: the share of its comparable landmarks that are looked through.
+    """Of each node that can be placed: the share of its comparable landmarks that are seen through.
 
     Args:
         story: links from `placed` to `fixed` that place it.
@@ -340,14 +340,14 @@ def looked_through(
 ) -> tuple[int, int]:
     """How many of a node's landmarks a view can confirm or refute, and how many it refutes.
 
-    A view confirms a landmark if it knows one as far away in the same direction. It looks through it, and so
-    refutes it, if it knows one only behind it. Landmarks that lie behind everything that the view knows
-    there are hidden, and say nothing: a map placed outside the walls would have too many of them.
+    A view confirms a landmark if it has one at the same distance in the same direction. It sees through it, and
+    so refutes it, if it has one only behind it. Landmarks behind everything that the view has there are
+    occluded, and are no evidence: a map placed outside the walls would have too many of them.
 
     Args:
         node: whose landmarks.
         view: another node.
-        view_from_node: how the two stand,
+        view_from_node: relative pose,
         sigma_xy: standard deviation of that, m,
         sigma_heading: and rad.
     """

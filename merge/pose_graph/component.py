@@ -35,8 +35,8 @@ MOST_AT_ONCE = 400
 class Component(PoseGraph):
     """A solved pose graph with the measurements that made it; its nodes are in the order of their ids.
 
-    In a large one, how two nodes stand to each other is known by the measurements around them. What lies
-    further away would make it a little more certain and is left out, so covariances are a little too large,
+    In a large one, the relative pose of two nodes is determined by the measurements around them. Measurements
+    further away would make it a little more certain and are left out, so covariances are a little too large,
     never too small.
 
     Attributes:
@@ -182,7 +182,7 @@ def solve_graph(
     Args:
         anchor: the node that is held.
         anchor_pose: where.
-        measurements: what is known; those that do not connect to the anchor are left out.
+        measurements: those that do not connect to the anchor are left out.
         huber: normalised residual from which a robust measurement pulls no harder; inf: plain least squares.
 
     Returns:

@@ -44,7 +44,7 @@ class ComponentSolver:
 
         Args:
             fragments: pieces of map.
-            huber: normalised residual from which a link pulls no harder, as long as it is not believed.
+            huber: normalised residual from which a link's pull is constant, unless all links are accepted.
         """
         self.fragments = fragments
         self.by_node = fragment_by_node(fragments)
@@ -78,7 +78,7 @@ class ComponentSolver:
         links: Sequence[Link],
         gone: Iterable[Link],
     ) -> None:
-        """Go on from an earlier solution, in which all links were believed.
+        """Continue from an earlier solution, in which all links were accepted.
 
         Args:
             graphs: its components.
@@ -110,7 +110,7 @@ class ComponentSolver:
         seats: dict[NodeId, tuple[int, int]],
         number: int,
     ) -> None:
-        """Put a piece where it was, and nodes that are new beside the nearest that was there."""
+        """Put a piece where it was, and new nodes next to their nearest earlier node."""
         at = self._rows(fragment.nodes)
         known = [seats.get(node, (-1, -1)) for node in fragment.nodes]
         labels = np.array([label for label, _ in known])
@@ -134,7 +134,7 @@ class ComponentSolver:
 
         Args:
             links: at most one between two nodes.
-            believed: whether all of them are, and none is held back: plain least squares.
+            believed: whether all links are accepted without a robust kernel: plain least squares.
             whole: whether large components are optimised as a whole if anything of them is not settled.
         """
         self._move_on(np.sort(self._index(links)), believed or self._resumed, whole)
@@ -160,7 +160,7 @@ class ComponentSolver:
         seats = [self._seats.get(link.key, -1) for link in links]
         if -1 in seats:
             new = [link.canonical() for link, seat in zip(links, seats, strict=True) if seat < 0]
-            # Whatever the order in which links come, the numbers are the same.
+            # The numbers do not depend on the order of links.
             new.sort(key=lambda link: link.key)
             self._seats |= {link.key: len(self._links) + k for k, link in enumerate(new)}
             self._links += new

@@ -176,7 +176,9 @@ def test_blocked_edges_are_used_in_route_explanations(path: Path) -> None:
         blocked = encode_route_request(RouteRequest(one, two, ((one, two),)))
         assert not asker.ask(KEYS.route("s0"), blocked).error
         told = way()
-        assert told.found and any("recently could not get through" in hop.words for hop in (*told.hops, *told.gaps))
+        assert told.found and any(
+            "recently could not get through" in hop.words for hop in (*told.hops, *told.gaps)
+        )
         assert [hop.b for hop in told.gaps] == [two] and sum(h.cost for h in told.hops) > free.hops[0].cost
 
 

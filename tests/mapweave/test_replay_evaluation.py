@@ -1,0 +1,98 @@
+"""`mapweave eval replay` against evo, and what it says of frames that were not used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from evo.core import metrics, sync
+from evo.core.trajectory import PoseTrajectory3D
+from evo.tools import file_interface
+
+from mapweave.cli import main
+from mapweave.evaluation.replaying import errors
+from mapweave.hybridmap.pose import Pose2
+from tests.agent.conftest import PhotoWalls
+
+
+def trajectory(poses: np.ndarray) -> PoseTrajectory3D:
+    half = poses[:, 2] / 2
+    zero = np.zeros(len(poses))
+    return PoseTrajectory3D(
+        np.column_stack([poses[:, :2], zero]),
+        np.column_stack([np.cos(half), zero, zero, np.sin(half)]),
+        np.arange(len(poses), dtype=float),
+    )
+
+
+def test_errors_are_those_of_evo() -> None:
+    """Steps of 0.25 m make a metre four frames, which evo can be asked for."""
+    rng = np.random.default_rng(3)
+    pose, rows = Pose2(2.0, 1.0, 0.4), []
+    for _ in range(80):
+        rows.append(pose.vector)
+        pose = pose @ Pose2(0.25, 0.0, rng.normal(0.0, 0.1))
+    true = np.array(rows)
+    mine = np.array([(Pose2(5.0, -3.0, 2.0) @ Pose2.from_vector(row)).vector for row in true])
+    mine += rng.normal(0.0, [0.03, 0.03, 0.01], mine.shape)
+    ate, rpe, turn = errors(mine, true, np.zeros(len(true)))
+
+    reference, estimate = trajectory(true), trajectory(mine)
+    aligned = trajectory(mine)
+    aligned.align(reference)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((reference, aligned))
+    assert ate == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), rel=0.01)
+    for relation, measured in (
+        (metrics.PoseRelation.translation_part, rpe), (metrics.PoseRelation.rotation_angle_deg, turn)
+    ):  # fmt: skip
+        relative = metrics.RPE(relation, 4, metrics.Unit.frames, all_pairs=True)
+        relative.process_data((reference, estimate))
+        assert measured == pytest.approx(relative.get_statistic(metrics.StatisticsType.rmse), rel=0.02)
+
+
+def test_parts_are_aligned_one_by_one() -> None:
+    """Two maps of a drive, each exact in a frame of its own, have no error."""
+    true = np.array([[0.1 * k, 0.02 * k * k, 0.1 * k] for k in range(40)])
+    moved = [Pose2(9.0, 9.0, 1.0) @ Pose2.from_vector(row) if k < 20 else Pose2.from_vector(row)
+             for k, row in enumerate(true)]  # fmt: skip
+    mine = np.array([pose.vector for pose in moved])
+    ate, rpe, turn = errors(mine, true, np.repeat([0, 1], 20))
+    assert ate == pytest.approx(0.0, abs=1e-9) and rpe == pytest.approx(0.0, abs=1e-9)
+    assert turn == pytest.approx(0.0, abs=1e-6)
+    assert errors(mine[:0], true[:0], np.zeros(0)) == (None, None, None)
+
+
+def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A drive towards two walls, whose odometry is 3 % long."""
+    walls, folder, out = PhotoWalls(), tmp_path / "walk", tmp_path / "out"
+    (folder / "images").mkdir(parents=True)
+    (folder / "camera.toml").write_text(
+        "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+    )
+    odometry, truth = ["forward_m,turn_rad"], ["stamp_s,x_m,y_m,heading_rad"]
+    for k in range(30):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(0.025 * k)))
+        odometry.append(f"{0.02575 if k else 0.0},0")
+        truth.append(f"{0.1 * k},{0.025 * k},0,0")
+    (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
+    (folder / "truth.csv").write_text("\n".join(truth) + "\n")
+    assert main(["eval", "replay", str(folder), "--out", str(out), "--json"]) == 0
+    report = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert report["frames"] == 30 and report["maps"] == 1 and report["nodes"] >= 1
+    used = round(report["frames_used"] * report["frames"])
+    assert used >= 25 and used + sum(report["not_used"].values()) == 30
+    # Alignment leaves of an error in proportion to the way its spread: 3 % of the way's standard deviation.
+    spread = 0.03 * 0.025 * np.arange(30)[30 - used :].std()
+    assert report["wheels_ate_m"] == pytest.approx(spread, rel=0.01, abs=1e-4)
+    assert 0.0 <= report["ate_m"] < 1.5 * spread
+    estimate = file_interface.read_tum_trajectory_file(out / "map0.tum")
+    wheels = file_interface.read_tum_trajectory_file(out / "wheels.tum")
+    assert (estimate.num_poses, wheels.num_poses) == (used, 30)
+    matched, _ = sync.associate_trajectories(wheels, estimate)
+    assert matched.num_poses == used
