@@ -340,8 +340,8 @@ def looked_through(
 ) -> tuple[int, int]:
     """How many of a node's landmarks a view can confirm or refute, and how many it refutes.
 
-    A view confirms a landmark if it has one at this distance in the same direction. It sees through it, and so
-    refutes it, if it has one only behind it. Landmarks behind everything that the view has there are
+    A view confirms a landmark if it has one at this distance in the same direction. It sees through it, and
+    so refutes it, if it has one only behind it. Landmarks behind everything that the view has there are
     occluded, and are no evidence: a map placed outside the walls would have too many of them.
 
     Args:
