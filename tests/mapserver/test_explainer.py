@@ -128,14 +128,14 @@ def links(content: MapFile) -> set[tuple[NodeId, NodeId]]:
     return {link.pair for link in merged_of(content).links}
 
 
-def same(one: MergedMap, two: MergedMap) -> None:
-    assert [link.pair for link in one.links] == [link.pair for link in two.links]
-    assert [(r.pair, r.reason, r.edge) for r in one.refused] == [
-        (r.pair, r.reason, r.edge) for r in two.refused
+def same(first: MergedMap, second: MergedMap) -> None:
+    assert [link.pair for link in first.links] == [link.pair for link in second.links]
+    assert [(r.pair, r.reason, r.edge) for r in first.refused] == [
+        (r.pair, r.reason, r.edge) for r in second.refused
     ]
-    assert one.components == two.components and one.rulings.made == two.rulings.made
-    for node, place in one.poses.items():
-        other = two.poses[node]
+    assert first.components == second.components and first.rulings.made == second.rulings.made
+    for node, place in first.poses.items():
+        other = second.poses[node]
         assert place.component == other.component
         assert np.allclose(
             place.merged_from_robot.mean.vector, other.merged_from_robot.mean.vector, atol=1e-5

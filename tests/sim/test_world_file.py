@@ -41,15 +41,15 @@ def load(folder: Path, text: str) -> World:
     return load_world(path)
 
 
-def same(one: World, other: World) -> bool:
+def same(first: World, second: World) -> bool:
     """Whether two worlds are equal in all that can be run into or seen."""
     names = ("plan", "blocks", "pieces", "name", "background", "start_rooms", "look_along")
-    if any(getattr(one, name) != getattr(other, name) for name in names):
+    if any(getattr(first, name) != getattr(second, name) for name in names):
         return False
-    return len(one.panels) == len(other.panels) and all(
+    return len(first.panels) == len(second.panels) and all(
         all((getattr(a, name) == getattr(b, name)).all() for name in ("corner", "along", "down"))
         and (a.texture.seed, a.texture.painter) == (b.texture.seed, b.texture.painter)
-        for a, b in zip(one.panels, other.panels, strict=True)
+        for a, b in zip(first.panels, second.panels, strict=True)
     )
 
 

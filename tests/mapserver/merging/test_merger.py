@@ -58,14 +58,14 @@ def merger(scene: Scene) -> Merger:
     return scene.merger(scene.logs[A] + scene.logs[B])
 
 
-def same(one: MergedMap, two: MergedMap) -> bool:
+def same(first: MergedMap, second: MergedMap) -> bool:
     return (
-        [link.pair for link in one.links] == [link.pair for link in two.links]
-        and [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
-        and one.components == two.components
+        [link.pair for link in first.links] == [link.pair for link in second.links]
+        and [(r.pair, r.reason) for r in first.refused] == [(r.pair, r.reason) for r in second.refused]
+        and first.components == second.components
         and all(
-            np.array_equal(p.merged_from_robot.mean.vector, two.poses[n].merged_from_robot.mean.vector)
-            for n, p in one.poses.items()
+            np.array_equal(p.merged_from_robot.mean.vector, second.poses[n].merged_from_robot.mean.vector)
+            for n, p in first.poses.items()
         )
     )
 

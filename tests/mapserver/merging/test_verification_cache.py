@@ -56,18 +56,18 @@ def saved(merger: Merger, path: Path) -> Path:
     return path.with_name(path.name + SUFFIX)
 
 
-def same(one: MergedMap, two: MergedMap) -> bool:
+def same(first: MergedMap, second: MergedMap) -> bool:
     """To the last bit."""
     return (
-        [link.pair for link in one.links] == [link.pair for link in two.links]
-        and [(r.pair, r.reason) for r in one.refused] == [(r.pair, r.reason) for r in two.refused]
-        and list(one.poses) == list(two.poses)
+        [link.pair for link in first.links] == [link.pair for link in second.links]
+        and [(r.pair, r.reason) for r in first.refused] == [(r.pair, r.reason) for r in second.refused]
+        and list(first.poses) == list(second.poses)
         and all(
-            place.merged_from_robot.mean == two.poses[node].merged_from_robot.mean
+            place.merged_from_robot.mean == second.poses[node].merged_from_robot.mean
             and np.array_equal(
-                place.merged_from_robot.covariance, two.poses[node].merged_from_robot.covariance
+                place.merged_from_robot.covariance, second.poses[node].merged_from_robot.covariance
             )
-            for node, place in one.poses.items()
+            for node, place in first.poses.items()
         )
     )
 

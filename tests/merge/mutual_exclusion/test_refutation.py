@@ -110,8 +110,8 @@ class Twins:
         return links(self.truth_a, self.truth_b, pairs, self.rng, inliers=inliers)
 
 
-def pairs(found: Sequence[Link]) -> set[tuple[NodeId, NodeId]]:
-    return {link.pair for link in found}
+def pairs(result: Sequence[Link]) -> set[tuple[NodeId, NodeId]]:
+    return {link.pair for link in result}
 
 
 @pytest.mark.parametrize("seed", [1, 2])
