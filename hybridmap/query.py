@@ -42,6 +42,10 @@ class Certainty(StrEnum):
     UNKNOWN = "unknown"
 
 
+NO_COMPONENT = -1
+"""Component of a node that is not in the merged map yet."""
+
+
 @dataclass(frozen=True, eq=False)
 class Whereabouts:
     """One place where the robot may be.
@@ -50,7 +54,7 @@ class Whereabouts:
         node: the node that was recognised.
         node_from_robot: the robot's pose in that node's robot frame.
         merged_from_robot: the same in the merged frame of the node's component, if it has one.
-        component: number of the node's component in the merged map.
+        component: number of the node's component in the merged map; `NO_COMPONENT` if it is in none.
         inliers: landmarks that agree.
         probability: that this place is the right one, 0 to 1.
         distance_known: if not, the node's scale was not measured, and the covariance includes that.

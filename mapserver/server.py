@@ -25,20 +25,14 @@ from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
-from mapweave.mapserver.retrieval.index_keeper import EVERY, PlaceIndexKeeper
+from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
-from mapweave.merge.merging import MergeSettings
+from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
 from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
-
-STATUS_EVERY = 0.5
-"""Seconds between two status messages."""
-MERGE_SHARE = 0.4
-"""At most this share of the time is spent making the merged map anew."""
-
 
 log = logging.getLogger(__name__)
 
@@ -48,12 +42,18 @@ class ServerSettings:
     """How the server shares its time.
 
     Attributes:
-        desk: how questions that take long are shared out.
+        admission_control: how questions that take long are shared out.
         merge: how maps are merged.
     """
 
-    desk: AdmissionSettings = field(default_factory=AdmissionSettings)
+    admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
+
+
+STATUS_EVERY = 0.5
+"""Time between two status messages, s."""
+MERGE_SHARE = 0.4
+"""At most this share of the time is spent making the merged map anew."""
 
 
 class MapServer:
@@ -89,13 +89,15 @@ class MapServer:
         self._schedule = clock = schedule or LiveSchedule()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = Store(path)
-        self._keeper = PlaceIndexKeeper(self._store, path)
+        self._places = PlaceDatabase(self._store, path)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._chronicle = MapHistory(self._store, clock=clock.time_ns)
-        self._upkeep = MergeWorker(clock, MERGE_SHARE, self._keeper.index, s.merge, findings, self._chronicle)
+        self._upkeep = MergeWorker(clock, MERGE_SHARE, self._places, s.merge, findings, self._chronicle)
         self._rulings = RulingBook(self._store)
         self._upkeep.rule(self._rulings.rulings)
-        self._desk = AdmissionControl(s.desk, clock.monotonic, clock.executor(s.desk.workers))
+        self._desk = AdmissionControl(
+            s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)
+        )
         self._blockages = Blockages()
 
     def __enter__(self) -> MapServer:
@@ -114,7 +116,7 @@ class MapServer:
         )  # fmt: skip
         self._herald = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         clock.every(STATUS_EVERY, self._tell)
-        clock.every(EVERY, self._keeper.look)
+        clock.every(EVERY, self._places.save_if_worthwhile)
         return self
 
     def __exit__(
@@ -127,7 +129,7 @@ class MapServer:
         self._ingest.close()
         self._herald.close()
         self._upkeep.close()
-        self._keeper.close()
+        self._places.close()
         self._store.close()
 
     def summary(self) -> str:

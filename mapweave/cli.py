@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from mapweave.commands import agent, demo, evaluate, info, map_file, relocalize, replay, server, sim
+from mapweave.commands import agent, demo, evaluate, info, map_file, relocalize, replay, server, settings, sim
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
 
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (demo, server, sim, agent, map_file, replay, info, relocalize, evaluate):
+    for command in (demo, server, sim, agent, map_file, replay, info, relocalize, evaluate, settings):
         command.add_to(commands)
     return top
 

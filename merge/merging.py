@@ -19,14 +19,13 @@ from dataclasses import dataclass, field
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.refutation import Refutation
-from mapweave.merge.mutual_exclusion.settings import ExclusionSettings
+from mapweave.merge.mutual_exclusion.trajectories import TrajectoryCache
 from mapweave.merge.outlier_rejection.agglomerative_joining import agglomerate
 from mapweave.merge.outlier_rejection.closing_links import optimise
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
-from mapweave.merge.outlier_rejection.pairwise_consistency import ConsistencySettings
 from mapweave.merge.outlier_rejection.readmission import readmitted
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
@@ -34,22 +33,21 @@ from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
 
 
-@dataclass(frozen=True)
-class MergeSettings:
-    """How maps are merged.
+@dataclass(frozen=True, eq=False)
+class MergeCache:
+    """What a merge found out that the next one with the same settings need not find out again.
 
     Attributes:
-        consistency: when links are accepted.
-        exclusion: when two robots would have been in one place.
-        strain: chi-square with 3 degrees of freedom above which an optimised link is refused.
+        decisions: fragments of maps, and links between them, sorted.
+        trajectories: of the robots.
     """
 
-    consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
-    exclusion: ExclusionSettings = field(default_factory=ExclusionSettings)
-    strain: float = 25.0
+    decisions: DecisionCache = field(default_factory=DecisionCache)
+    trajectories: TrajectoryCache = field(default_factory=TrajectoryCache)
 
 
 def merge_maps(
@@ -69,7 +67,7 @@ def merge_maps(
     Returns:
         The merged map. It does not depend on the order of maps, links or nodes.
     """
-    return decide(maps, links, refused, settings or MergeSettings(), DecisionCache())[0]
+    return decide(maps, links, refused, settings or MergeSettings(), MergeCache())[0]
 
 
 def decide(
@@ -77,7 +75,7 @@ def decide(
     links: Iterable[Link],
     refused: Iterable[RefusedLink],
     settings: MergeSettings,
-    memory: DecisionCache,
+    cache: MergeCache,
     before: StandingDecisions | None = None,
 ) -> tuple[MergedMap, StandingDecisions]:
     """Merge, and return the decisions, so that the next merge can begin from them.
@@ -87,15 +85,15 @@ def decide(
         links: verified, see `merge_maps`.
         refused: pairs that were refused before, to be kept with their reasons.
         settings: how.
-        memory: of merges with the same settings; what they have found out is not found out again.
-        before: standing decisions on the same maps. A link keeps its decision until links between the same
-            two maps come or go; None: all are decided.
+        cache: of merges with the same settings.
+        before: what stands of the same maps, as far as it is still true. A link keeps its decision until
+            links between the same two maps come or go; None: all are decided.
 
     Returns:
         The merged map, and the standing decisions.
     """
     s = settings
-    fragments = memory.fragments(maps, s.consistency, s.strain)
+    fragments = cache.decisions.fragments(maps, s.consistency, s.strain)
     solver = ComponentSolver(fragments)
     by_node = solver.by_node
     given = {link.pair: link for link in links if link.a in by_node and link.b in by_node}
@@ -103,7 +101,7 @@ def decide(
     known = {pair for pair, link in given.items() if standing.given.get(pair) is link}
     news = (given.keys() - known) | (standing.given.keys() - known)
     fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
-    weighed = _weighed(given, standing, known, fresh, by_node, maps, memory, s)
+    weighed = _weighed(given, standing, known, fresh, by_node, maps, cache.decisions, s)
     held = [link for pair, link in weighed.items() if pair in standing.believed and pair in known]
     refuted = standing.refuted & known
     closed = {
@@ -114,9 +112,9 @@ def decide(
     if before is not None:
         gone = [standing.weighed[pair] for pair in standing.believed - known]
         solver.resume(standing.graphs, standing.fragments, held, gone)
-    refutation = Refutation(maps, fragments, s.exclusion, memory)
+    refutation = Refutation(maps, fragments, s.exclusion, cache.trajectories)
     open_ = [link for pair, link in weighed.items() if pair not in refuted]
-    groups = memory.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
+    groups = cache.decisions.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
     # Each round refutes a link at least, so there is a last one.
     while True:
         solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
@@ -180,7 +178,7 @@ def _weighed(
     fresh: Set[tuple[MapId, MapId]],
     by_node: Mapping[NodeId, Fragment],
     maps: Mapping[MapId, HybridMap],
-    memory: DecisionCache,
+    cache: DecisionCache,
     s: MergeSettings,
 ) -> dict[Pair, Link]:
     """Links with their aliased landmarks, searched among links between maps with new links."""
@@ -188,7 +186,7 @@ def _weighed(
     some = [link for link in given.values() if link.maps in fresh]
     involved = {one: maps[one] for pair in fresh for one in pair if one in maps}
     for link, found in zip(
-        some, memory.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
+        some, cache.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
     ):
         # Known aliased landmarks stay aliased.
         if link.key not in out or out[link.key].doubles < found.doubles:

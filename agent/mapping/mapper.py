@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.update_report import Health
 from mapweave.agent.mapping.anchored_keyframe import HERE
-from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder, KeyframeBuilderSettings
+from mapweave.agent.mapping.episode import EpisodeRequest
+from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.mapping.tracking import Tracking
-from mapweave.agent.mapping.tracking_settings import TrackingSettings
-from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder, TrajectoryRecorderSettings
+from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import View
 from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.track_quality import TrackQuality
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -23,28 +23,11 @@ from mapweave.hybridmap.node import MapId, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.recognition import Recognition
 from mapweave.vision.lens import Lens
-from mapweave.vision.sift import Features, Sift, SiftSettings
+from mapweave.vision.sift import Features, Sift
 
 DEPTHS_PER_HEIGHT = 8.0
 """Assumed depth of an unknown feature before there is any node, as a multiple of the camera's height (the
 paper's "assumed common height")."""
-
-
-@dataclass(frozen=True)
-class MapperSettings:
-    """How a map is made.
-
-    Attributes:
-        sift: features of a view.
-        tracking: of landmarks between views.
-        cartographer: nodes and edges.
-        wayside: what is kept of the way between nodes.
-    """
-
-    sift: SiftSettings = field(default_factory=SiftSettings)
-    tracking: TrackingSettings = field(default_factory=TrackingSettings)
-    cartographer: KeyframeBuilderSettings = field(default_factory=KeyframeBuilderSettings)
-    wayside: TrajectoryRecorderSettings = field(default_factory=TrajectoryRecorderSettings)
 
 
 class Mapper:
@@ -61,26 +44,24 @@ class Mapper:
         self,
         map_id: MapId,
         description: RobotDescription,
-        settings: MapperSettings | None = None,
+        settings: AgentSettings | None = None,
         contents: Sequence[ChangeBody] = (),
         next_number: int = 1,
     ) -> None:
         """Start an empty map where the robot stands, or take up one that was begun; see Cartographer."""
-        settings = settings or MapperSettings()
+        settings = settings or AgentSettings()
         self.typical_depth = DEPTHS_PER_HEIGHT * max(description.camera.mount_height, 0.05)
         self._description = description
         self._settings = settings
         self._lens = Lens(description.camera, description.distortion)
         self._sift = Sift(self._lens, settings.sift)
-        self._tracking = Tracking(description, self._lens, settings.tracking)
-        self._cartographer = KeyframeBuilder(
-            map_id, description, settings.cartographer, contents, next_number
-        )
-        self._wayside = TrajectoryRecorder(description, settings.wayside)
+        self._tracking = Tracking(description, self._lens, settings)
+        self._cartographer = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
+        self._wayside = TrajectoryRecorder(description)
         self._anchor: View | None = None
         self._leaves: list[View] = []
 
-    # What an explorer or a passenger needs to know
+    # What behaviours read, see `Episode`
 
     @property
     def map(self) -> HybridMap:
@@ -100,14 +81,15 @@ class Mapper:
     @property
     def doubtful(self) -> bool:
         """Whether the last image shows nothing of what it should, or none comes: no time to map."""
-        return self._tracking.doubtful
+        return self._tracking.acceptance.doubtful
 
     @property
     def doubt(self) -> str:
         """Why, in words."""
-        if self._tracking.strange:
+        images = self._tracking.acceptance
+        if images.strange:
             return "the image shows something else than a moment ago"
-        if self._tracking.blank:
+        if images.blank:
             return "the image shows nothing: is it dark, or the lens covered?"
         return "the camera gives no new image" if self.doubtful else ""
 
@@ -173,11 +155,21 @@ class Mapper:
     def step(self, observation: Observation) -> None:
         """Take in what the robot senses. Call once a tick, before anything below."""
         self._tracking.step(observation)
-        if self._tracking.carried_off or self._tracking.disputed:
+        if self._tracking.acceptance.carried_off or self._tracking.disputed:
             self.lose()
             self._tracking.step(observation)
         elif self._anchor is not None and not self.doubtful:
             self._wayside.step(observation, self._tracking.pose.mean)
+
+    def meet(self, request: EpisodeRequest, observation: Observation) -> None:
+        """Do what a behaviour asks for, with the observation of the last step."""
+        match request:
+            case EpisodeRequest.BEGIN:
+                self.begin(observation)
+            case EpisodeRequest.ADD_VIEW:
+                self.leaf(observation)
+            case EpisodeRequest.FINISH:
+                self.finish(observation)
 
     def begin(self, observation: Observation) -> None:
         """Take the first view: the anchor of the first episode."""
@@ -191,7 +183,7 @@ class Mapper:
         With nodes it is astray and must `resume`; without any it may `begin` anew.
         """
         self._cartographer.lose(self._tracking.pose)
-        self._tracking = Tracking(self._description, self._lens, self._settings.tracking)
+        self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._leaves = None, []
 
     def resume(

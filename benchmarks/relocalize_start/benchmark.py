@@ -34,7 +34,7 @@ from benchmarks.relocalize.queries import Query, known
 from benchmarks.relocalize.score import judged, share
 from benchmarks.relocalize_start.store import fill
 from mapweave.hybridmap.query import RelocalizeAnswer
-from mapweave.mapserver.retrieval.index_keeper import SUFFIX
+from mapweave.mapserver.retrieval.place_database import SUFFIX
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
@@ -12,20 +12,15 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.node import CODE_BYTES, Node, NodeId
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import voting
+from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS, bounded
 from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
-from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP, CandidateSettings
-
-REACH = 0.6
-"""Distance of two decoded descriptors at which a vote counts nothing."""
-
+from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
 
 SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
 FEW_GONE = 20
 """Of more nodes that go at once, the index is read through once for where they lie."""
-MOST_LANDMARKS = 400
-"""Of a node with more the first ones are compared, see `bounded`: a robot's nodes have up to 150."""
 AT_ONCE = 1024
 """Nodes that are taken in at once."""
 
@@ -35,26 +30,18 @@ class PlaceIndexSettings:
     """How places are found.
 
     Attributes:
-        candidates: what counts as alike and how much overlap is worth noting.
         landmarks: how landmarks are found.
         votes: descriptors of the fleet that each feature of a view votes for.
         compared: nodes of a large fleet that are compared with one whose overlaps are wanted.
     """
 
-    candidates: CandidateSettings = field(default_factory=CandidateSettings)
     landmarks: LandmarkIndexSettings = field(default_factory=LandmarkIndexSettings)
     votes: int = 16
     compared: int = 64
 
 
-def bounded(node: Node) -> Node:
-    """A node with at most `MOST_LANDMARKS`, the very same one if it has no more.
-
-    Two nodes take as much time to compare as the product of their landmarks.
-    """
-    if len(node.landmarks) <= MOST_LANDMARKS:
-        return node
-    return replace(node, landmarks=node.landmarks.take(np.arange(MOST_LANDMARKS)))
+REACH = 0.6
+"""Distance of two decoded descriptors at which a vote counts nothing."""
 
 
 class PlaceIndex:
@@ -203,7 +190,7 @@ class PlaceIndex:
         Returns:
             Overlaps of at least `least_overlap`.
         """
-        _s, node = self._settings.candidates, bounded(node)
+        node = bounded(node)
         if len(node.landmarks) == 0 or len(self._landmarks) == 0:
             return {}
         with self._lock:

@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
             synchronization=synchronization,
             server=network.server,
         )
-        run_agent(robot, bus, keys, settings.pipeline, options, stop)
+        run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
         if body is not bus:
             body.close()

@@ -148,7 +148,7 @@ def run_one(arguments: argparse.Namespace) -> int:
             seed=seed,
             out=out,
             processes=not arguments.one_process,
-            settings=settings.pipeline,
+            settings=settings.agent,
             settings_file=arguments.settings,
             film_every=0.0 if arguments.no_film else 1.0,
             view=arguments.view,
@@ -181,7 +181,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
         seeds=arguments.seeds,
         out=check_output(arguments.out or Path("out/sim") / scenario.name),
         processes=not arguments.one_process,
-        settings=settings.pipeline,
+        settings=settings.agent,
         settings_file=arguments.settings,
         film=arguments.film,
         json=arguments.json,
@@ -210,7 +210,7 @@ def run_serve(arguments: argparse.Namespace) -> int:
         bus = ZenohBus(BusSettings(mode="client", endpoints=network.endpoints))
         warn_without_router(bus, "the simulator")
     try:
-        run_sim(bus, network.fleet, scenario, seed, stop, arguments.held)
+        run_sim(bus, network.fleet, scenario.world(seed), scenario.robots, seed, stop, arguments.held)
     finally:
         bus.close()
     return 0

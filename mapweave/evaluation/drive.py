@@ -14,7 +14,8 @@ import numpy as np
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import RobotDescription
-from mapweave.agent.pipeline import Pipeline, PipelineSettings
+from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.verdict import LEVELS, Verdict
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
@@ -88,7 +89,7 @@ class DriveMap:
         covered: truth of all its images.
     """
 
-    def __init__(self, robot: Replay, truth: Truth, settings: PipelineSettings, ticks: Iterable[int]) -> None:
+    def __init__(self, robot: Replay, truth: Truth, settings: AgentSettings, ticks: Iterable[int]) -> None:
         """Map.
 
         Args:
@@ -114,7 +115,7 @@ class DriveMap:
         self.nodes = len(merged.poses)
         self._truth = truth
         self._merger = merger
-        self._relocalizer = Relocalizer(merger.index, merger.node, merged)
+        self._relocalizer = Relocalizer(merger.places, merger.node, merged)
         self._sift = Sift(Lens(self.description.camera, self.description.distortion))
 
     def questions(self, robot: Replay) -> Iterator[Verdict]:

@@ -8,35 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Node, NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.range_scans import RangeScans
+from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
-
-LONGEST_GAP = 5.2
-"""Between moments further apart the robot's pose is unknown, s."""
-LONGEST_WAY = 1.0
-"""Nor if they are further apart, m."""
-ALONG = 0.15
-"""How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
-standard deviation: it stops and goes."""
-ASIDE = 0.05
-"""The same to the side of the line."""
-CLOCK_ERROR = 0.05
-"""Of two robots with the same clock, s."""
-
 
 NANOSECONDS = 1e9
 DRIFT = 0.02
 """Error of a robot's pose relative to its node, as a share of the way between them, one sigma."""
-
-
-@dataclass(frozen=True)
-class BodyTrajectorySettings:
-    """Uncertainty of a robot's pose between two moments of its trajectory.
-
-    In the simulator it is within 1 cm of the straight line, but up to a third of its length ahead or behind.
-    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +92,22 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
     return tuple(trails)
 
 
+class TrajectoryCache:
+    """The trajectories of fragments, read once. Fragments are never changed, only replaced."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._known: dict[NodeId, tuple[Fragment, tuple[BodyTrajectory, ...]]] = {}
+
+    def trajectories(self, fragment: Fragment, one: HybridMap) -> tuple[BodyTrajectory, ...]:
+        """See `trajectories_of`; `one` holds the fragment's nodes."""
+        known = self._known.get(fragment.name)
+        if known is None or known[0] is not fragment:
+            found = trajectories_of([one.nodes[node] for node in fragment.nodes])
+            known = self._known[fragment.name] = fragment, found
+        return known[1]
+
+
 def _seconds(nodes: Sequence[Node]) -> Array:
     return np.array([node.stamp_ns for node in nodes]) / NANOSECONDS
 
@@ -136,18 +133,28 @@ class Stay:
     nearest: NDArray[np.int64]
 
 
-def stay(
-    trail: BodyTrajectory, places: Array, times: Array, settings: BodyTrajectorySettings | None = None
-) -> Stay:
+LONGEST_GAP = 5.2
+"""Between moments that are further apart in time nobody knows where the robot was, s."""
+LONGEST_WAY = 1.0
+"""Between moments that are further apart in space nobody knows where the robot was, m."""
+ALONG = 0.15
+"""How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
+standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a
+third of its length ahead or behind."""
+ASIDE = 0.05
+"""Standard deviation to the side of the line midway, as a share of the line."""
+CLOCK_ERROR = 0.05
+"""Standard deviation between two robots with the same clock, s."""
+
+
+def stay(trail: BodyTrajectory, places: Array, times: Array) -> Stay:
     """Where a robot was, on the straight lines between its moments, which it drives at a pace of its own.
 
     Args:
         trail: of N moments.
         places: (N, 2) m, where it was then.
         times: (T,) s.
-        settings: how well that is known.
     """
-    settings or BodyTrajectorySettings()
     before = np.clip(np.searchsorted(trail.times, times, side="right") - 1, 0, max(len(places) - 2, 0))
     after = np.minimum(before + 1, len(places) - 1)
     gaps = np.maximum(trail.times[after] - trail.times[before], 1e-9)

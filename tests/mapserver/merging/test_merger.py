@@ -15,8 +15,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.calibration import HypothesisSupport, probabilities
 from mapweave.mapserver.relocalization.place_hypotheses import fuse
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
-from mapweave.mapserver.relocalization.verdict import HypothesisSelectionSettings
-from mapweave.mapserver.routes import Router, RouterSettings
+from mapweave.mapserver.routes import NEAR, Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.recognition import examine_matches
 from synthetic.world import Sensing, World, room, take_map, take_view
@@ -165,7 +164,7 @@ def test_robots_that_would_walk_through_each_other_are_not_joined(clock: str, jo
 
 
 def relocalizer(merger: Merger) -> Relocalizer:
-    return Relocalizer(merger.index, merger.node, merger.merged())
+    return Relocalizer(merger.places, merger.node, merger.merged())
 
 
 def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -> None:
@@ -201,13 +200,13 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
         examined.append(node.id)
         return examine_matches(node, *others)
 
-    monkeypatch.setattr("mapweave.mapserver.relocalization.relocalizer.examine_matches", counted)
+    monkeypatch.setattr("mapweave.mapserver.relocalization.view_registration.examine_matches", counted)
     # No single candidate is enough: then every similar node is examined.
     thorough = Relocalizer(
-        merger.index,
+        merger.places,
         merger.node,
         merger.merged(),
-        RelocalizationSettings(judgement=HypothesisSelectionSettings(alone=1000), faint=0.0),
+        RelocalizationSettings(faint=0.0),
     )
     quick, rng, counts = relocalizer(merger), np.random.default_rng(11), np.zeros(2, int)
     for stop in list(scene.truth.values())[::4]:
@@ -266,7 +265,7 @@ def test_maps_that_nothing_joins_are_not_silently_confused(scene: Scene) -> None
     for map_id in (A, B):
         nodes, _ = take_map(scene.world, map_id, [stop], rng)
         merger.apply(map_id, NodePut(nodes[0]))
-    service = Relocalizer(merger.index, merger.node, MergedMap.empty())
+    service = Relocalizer(merger.places, merger.node, MergedMap.empty())
     view, _ = take_view(scene.world, stop, rng)
     answer = service.answer(view)
     assert answer.certainty is Certainty.AMBIGUOUS and "nothing joins" in answer.reason
@@ -310,7 +309,7 @@ def test_routes_lead_from_map_to_map_by_measured_edges(scene: Scene, merger: Mer
         edge = edges.get(frozenset((before.node.id, leg.node.id)))
         if edge is None:  # two nodes in one place that look in different directions
             assert leg.kind is EdgeKind.LOOP
-            assert leg.previous_from_node.mean.distance(Pose2()) < RouterSettings().near
+            assert leg.previous_from_node.mean.distance(Pose2()) < NEAR
         else:
             assert leg.kind is edge.kind
         true = scene.truth[before.node.id].inverse() @ scene.truth[leg.node.id]
@@ -338,7 +337,7 @@ def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
 def test_long_undriven_links_are_avoided(scene: Scene, merger: Merger) -> None:
     merged = merger.merged()
     start, goal = min(scene.truth), max(scene.truth)
-    bold = RouterSettings(route=RouteSettings(per_undriven=0.0))
+    bold = RouteSettings(per_undriven=0.0)
     undriven = {EdgeKind.LOOP, EdgeKind.MERGED}
 
     def longest(router: Router) -> float:
