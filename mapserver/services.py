@@ -13,7 +13,7 @@ from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.packed_map import PackedMap
-from mapweave.mapserver.wire_limits import Pairs, drivable, said
+from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
@@ -90,7 +90,7 @@ class Services:
 
     def _relocalize(self, payload: bytes) -> bytes:
         view = decode_view(payload)
-        return encode_relocalize_answer(said(self._answers().relocalizer.answer(view)))
+        return encode_relocalize_answer(within_range(self._answers().relocalizer.answer(view)))
 
     def _route(self, payload: bytes) -> bytes:
         request = decode_route_request(payload)

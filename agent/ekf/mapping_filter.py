@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.ekf.adaptive_odometry_noise import AdaptiveOdometryNoise
 from mapweave.agent.ekf.filter_health import FilterHealth
-from mapweave.agent.ekf.gating import MEDIAN, Judgement, pixel_gate, select_inliers
+from mapweave.agent.ekf.gating import MEDIAN, Judgement, pixel_gate, remove_outliers, select_inliers
 from mapweave.agent.ekf.innovations import Examined, innovation_covariance, whiten
 from mapweave.agent.ekf.landmark_estimates import Ids, LandmarkEstimates
 from mapweave.agent.ekf.mapping_state import LEAST_AGREEING, PRIOR_DEPTH, PRIOR_SPREAD, MappingState, Step

@@ -46,7 +46,7 @@ class TrackHistory:
             for column in (self._poses, self._ids, self._pixels):
                 del column[1::2]
 
-    def sightings(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
+    def observations(self, ids: NDArray[np.int64]) -> tuple[Array, Array]:
         """All observations of some tracks.
 
         Args:

@@ -120,7 +120,7 @@ def test_recently_blocked_edges_are_reported(router: Router) -> None:
     free, wary = explain_route(router, one, two), explain_route(router, one, two, wary=[(one, two)])
     if [hop.b for hop in wary.hops] == [two]:
         assert wary.hops[0].cost == pytest.approx(free.hops[0].cost + WARY_COST)
-        assert "did not get through of late" in wary.hops[0].words
+        assert "recently could not get through" in wary.hops[0].words
     else:
         assert "recently could not get through" in wary.gaps[0].words
     assert wary.gaps, "the way that would be cheaper is told"

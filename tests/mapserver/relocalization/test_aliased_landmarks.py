@@ -86,7 +86,7 @@ def test_a_place_whose_twin_was_not_recognised_is_ambiguous() -> None:
     alone = service.conclude(Registration(Candidates(view, [(first.id, 2.0)]), matches))
     assert alone.certainty is Certainty.FOUND
     both = service.conclude(Registration(Candidates(view, Ranked().query(view)), matches))
-    assert both.certainty is Certainty.AMBIGUOUS and "look alike on the map" in both.reason
+    assert both.certainty is Certainty.AMBIGUOUS and "look the same on the map" in both.reason
     assert {one.node for one in both.candidates} == {first.id, twin.id}
     assert max(one.probability for one in both.candidates) < 0.9
 

@@ -221,7 +221,7 @@ def test_a_server_that_starts_again_has_its_places_at_once(
         return [one.body.node for one in store.replay(MAP) if isinstance(one.body, NodePut)]
 
     places = PlaceDatabase(store, path)
-    assert f"made anew: {path}{SUFFIX}: there is none yet" in caplog.text and len(places) == 0
+    assert f"built again: {path}{SUFFIX}: there is none yet" in caplog.text and len(places) == 0
     places.put(replayed())
     places.close()
     put(store, [NodeRetired(NodeId("a", 1, 4)), *(NodePut(node) for node in many(3, 200))], 91)

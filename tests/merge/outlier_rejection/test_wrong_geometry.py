@@ -15,7 +15,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection import wrong_geometry
-from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, looked_through
+from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch, seen_through
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.settings import ConsistencySettings
 
@@ -48,7 +48,7 @@ def test_a_view_through_a_wall_is_detected(ahead: float, first: str, second: str
     one, other = (facing_a_wall(MapId("a", 1), k, 3.0, Pose2(), 500) for k in (1, 2))
     there = Pose2(ahead, 0.0, 0.0)
     for node, view, moved, expected in ((one, other, there.inverse(), first), (other, one, there, second)):
-        compared, through = looked_through(node, view, moved, 0.01, 0.001)
+        compared, through = seen_through(node, view, moved, 0.01, 0.001)
         assert compared >= 50 if expected != "hidden" else compared == 0
         assert through == (compared if expected == "refuted" else 0)
 
