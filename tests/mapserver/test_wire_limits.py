@@ -13,7 +13,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.wire_limits import Pairs, drivable, said
+from mapweave.mapserver.wire_limits import Pairs, drivable, within_range
 from mapweave.wire.messages import (
     decode_relocalize_answer,
     encode_known_answer,
@@ -49,7 +49,7 @@ def test_values_out_of_range_are_left_out(
     left: tuple[Certainty, list[int]],
 ) -> None:
     candidates = tuple(place(k, *poses) for k, poses in enumerate(places, start=1))
-    answer = said(RelocalizeAnswer(certainty, candidates, "words"))
+    answer = within_range(RelocalizeAnswer(certainty, candidates, "words"))
     back = decode_relocalize_answer(encode_relocalize_answer(answer))
     assert (back.certainty, [one.node.number for one in back.candidates]) == left
     assert all((one.merged_from_robot is None) == (one.component < 0) for one in back.candidates)
@@ -68,7 +68,7 @@ def test_a_node_where_no_robot_can_be_is_no_second_place() -> None:
         two.merger.on_change(Change(C, number, 0, body))
     answer = two.answers().relocalizer.answer(two.view(HERE))
     assert answer.certainty is Certainty.FOUND and answer.candidates[0].node.map == HERE
-    encode_relocalize_answer(said(answer))
+    encode_relocalize_answer(within_range(answer))
 
 
 def test_a_view_without_a_heading_is_not_published() -> None:
