@@ -25,7 +25,7 @@ def clearance(
         description: footprint and rangers.
         proximity: (K,) m from the robot's edge.
         direction: rad, 0 ahead, positive to the left.
-        unknown: returned if no ranger points that way.
+        unknown: returned if no ranger looks that way, or if nothing is within the reach of short rangers.
     """
     bearings, radius = np.array(description.ranger_bearings), description.radius
     if not len(bearings) or len(proximity) != len(bearings):
@@ -36,4 +36,6 @@ def clearance(
     in_way = (np.cos(off) > 0.3) & (lateral < radius + ASIDE)
     if not in_way.any():
         return unknown
-    return float(max((reach * np.cos(off))[in_way].min() - radius - BEFORE, 0.0))
+    free = np.maximum((reach * np.cos(off))[in_way] - radius - BEFORE, 0.0)
+    nothing = proximity[in_way] >= description.ranger_reach - 1e-6
+    return float(np.where(nothing, np.maximum(free, unknown), free).min())

@@ -15,7 +15,7 @@ from types import TracebackType
 
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.query import RelocalizeAnswer, View
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.explainer import Explainer, RulingBook
@@ -30,7 +30,6 @@ from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
 from mapweave.merge.settings import MergeSettings
 from mapweave.wire.bus import Bus
-from mapweave.wire.explanation_messages import ExplainRequest
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, encode_record
 

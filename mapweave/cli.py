@@ -7,7 +7,20 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from mapweave.commands import agent, demo, evaluate, info, map_file, relocalize, replay, server, settings, sim
+from mapweave.commands import (
+    agent,
+    demo,
+    evaluate,
+    info,
+    map_file,
+    relocalize,
+    replay,
+    robots,
+    router,
+    server,
+    settings,
+    sim,
+)
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError
 
@@ -45,7 +58,9 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", nargs=0, action=PrintVersion, help="print the version and exit")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (demo, server, sim, agent, map_file, replay, info, relocalize, evaluate, settings):
+    for command in (
+        demo, server, router, sim, agent, robots, map_file, replay, info, relocalize, evaluate, settings
+    ):  # fmt: skip
         command.add_to(commands)
     return top
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
@@ -33,12 +34,14 @@ class Settings:
 
     Attributes:
         network: how to reach the fleet.
+        robot: driver, camera and geometry of an agent's robot.
         agent: of a robot's program.
         admission_control: how a map server shares out the questions that take long.
         merge: how maps are merged.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)
+    robot: RobotSettings = field(default_factory=RobotSettings)
     agent: AgentSettings = field(default_factory=AgentSettings)
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)

@@ -2,13 +2,12 @@
 
 1. Maps are cut into pieces that their own edges connect; loop closures must agree with the robot's drive.
 2. The links between each two pieces, and the loops within one, are sorted by consistency.
-3. Pieces are joined, best supported first, and the links between the larger pieces are sorted again. Links
-   within one piece must agree with it.
-4. Each component is optimised; a link with too large a residual is refused, worst first. If few are refused,
-   each is tried once more by solving with it.
-5. Where two robots would have been at the same place at the same time, the links that cause this are
-   refuted, and the merge continues at 2 with the rest.
-6. Drives of a robot among others' nodes are checked against the result.
+3. Pieces are joined, best supported first, and the links between what is larger now are sorted anew. Links
+   that would join what is joined already must agree with it.
+4. Each component is optimised. Where few links are refused, each is tried once more by solving with it.
+5. Where two robots would have been at the same place at the same time, the links that make them so are
+   refuted, and it goes on at 2 with the rest.
+6. Drives of a robot among others' nodes are checked against the outcome.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.mutual_exclusion.trajectories import TrajectoryCache
 from mapweave.merge.outlier_rejection.agglomerative_joining import agglomerate
-from mapweave.merge.outlier_rejection.closing_links import optimise
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
@@ -93,7 +91,7 @@ def decide(
         The merged map, and the standing decisions.
     """
     s = settings
-    fragments = cache.decisions.fragments(maps, s.consistency, s.strain)
+    fragments = cache.decisions.fragments(maps, s.consistency)
     solver = ComponentSolver(fragments)
     by_node = solver.by_node
     given = {link.pair: link for link in links if link.a in by_node and link.b in by_node}
@@ -163,12 +161,11 @@ def _joined(
 ) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
     """Join and optimise: the components, the links that are kept, and those that are not."""
     kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
-    _, kept, strained = optimise(solver, kept, s.strain, whole)
-    refused = [*unjoined, *strained]
-    tried = [r.link for r in refused if r.link is not None]
+    solver.solve(kept, whole=whole)
+    tried = [r.link for r in unjoined if r.link is not None]
     kept += readmitted(solver, kept, tried, s.consistency)
     told = {link.key for link in kept}
-    return solver.solve(kept, believed=True), kept, [r for r in refused if r.pair not in told]
+    return solver.solve(kept), kept, [r for r in unjoined if r.pair not in told]
 
 
 def _weighed(

@@ -207,6 +207,10 @@ class Keys:
         """Under which one that drives a robot's body is alive."""
         return f"{self.root}/robot/{check_name(robot)}/driver/{check_epoch(number)}"
 
+    def robot_drivers_of(self, robot: str) -> str:
+        """Pattern: all agents that drive one base."""
+        return f"{self.root}/robot/{check_name(robot)}/driver/*"
+
     def robot_drivers(self) -> str:
         """Pattern: everybody who drives a body."""
         return f"{self.root}/robot/*/driver/*"

@@ -51,7 +51,7 @@ def clip(command: Command, description: RobotDescription) -> Command:
 
 
 class RemoteRobot:
-    """The Robot protocol over questions to a base.
+    """A robot base behind Zenoh keys: simulated, or in any language (docs/wire.md).
 
     Each `sense` carries the last command there and the observation back: one question a tick.
     """

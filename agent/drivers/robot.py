@@ -1,4 +1,7 @@
-"""The Robot protocol: a few methods that the Koala, a recording, the simulator and a test all have."""
+"""The Robot protocol, which drivers, recordings, the simulator and tests implement.
+
+SI units and radians throughout. `docs/drivers.md` explains how to write a driver.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,10 @@ class Robot(Protocol):
         ...
 
     def sense(self) -> Observation | None:
-        """Wait for the next observation. None when there will be no more (end of a recording).
+        """Wait for the next observation, at most two ticks. None at the end of the observations.
+
+        A driver whose line fails later reconnects. Meanwhile the robot stands, and its observations have zero
+        odometry and no proximity readings.
 
         Raises:
             DeviceError: the robot cannot be read.
@@ -23,7 +29,10 @@ class Robot(Protocol):
         ...
 
     def act(self, command: Command) -> Command:
-        """Send a command; returns the command that is really applied (clipped to the limits)."""
+        """Send a command; returns the applied command. Does not block.
+
+        The wheels stop within 0.5 s when no further command follows, also when this process dies.
+        """
         ...
 
     def close(self) -> None:

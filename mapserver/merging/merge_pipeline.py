@@ -8,6 +8,7 @@ import numpy as np
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
@@ -17,7 +18,6 @@ from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdicts
 from mapweave.merge.settings import MergeSettings
-from mapweave.wire.pose_codec import MAX_POSITION
 
 
 class MergePipeline:

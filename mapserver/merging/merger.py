@@ -58,7 +58,7 @@ class Merger:
         self._pipeline = self._new_pipeline()
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
-        self._contradictions = WrongGeometrySearch(self.settings.consistency, self.settings.strain)
+        self._contradictions = WrongGeometrySearch(self.settings.consistency)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.network import (
+    SOON,
     add_network,
     connect,
     network_of,
@@ -19,6 +20,7 @@ from mapweave.commands.network import (
 
 if TYPE_CHECKING:
     from mapweave.agent.drivers.robot import Robot
+    from mapweave.agent.drivers.settings import RobotSettings
     from mapweave.agent.synchronization import Synchronization
     from mapweave.wire.bus import Bus
 
@@ -33,8 +35,10 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument("name", help="the robot's name in the fleet, for example r0")
     parser.add_argument(
-        "--driver", choices=["remote"], default="remote", help="remote: a body behind Zenoh keys (simulator)"
-    )
+        "--robot", metavar="DRIVER",
+        help="a driver as `mapweave robots` lists them, or your own class, FILE.py:CLASS (default: [robot] "
+        "driver of the settings, else remote, a base behind Zenoh keys such as the simulator's)",
+    )  # fmt: skip
     parser.add_argument(
         "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
     )
@@ -60,6 +64,8 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
+    from mapweave.agent.drivers.checked import CheckedRobot
+    from mapweave.agent.drivers.claim import Claim
     from mapweave.agent.mission import Carried, Explore, Idle, Mission
     from mapweave.commands.map_ends import map_of
     from mapweave.hybridmap.errors import InvalidValue
@@ -77,12 +83,14 @@ def run(arguments: argparse.Namespace) -> int:
     network = network_of(arguments, settings)
     stop = stop_on_signals()
     bus, keys = connect(network)
-    body = bus
+    body, claim, robot = bus, None, None
     try:
         warn_without_router(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
-        robot, synchronization = _body(arguments, body, network.fleet, name)
+        if body.wait_connected(SOON):
+            claim = Claim(body, keys, name)
+        robot, synchronization = _robot(arguments, settings.robot, body, network.fleet, name)
         # Who is told to stop while it waits for its body stops waiting.
         threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
         missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
@@ -97,25 +105,39 @@ def run(arguments: argparse.Namespace) -> int:
             synchronization=synchronization,
             server=network.server,
         )
-        run_agent(robot, bus, keys, settings.agent, options, stop)
+        run_agent(CheckedRobot(robot), bus, keys, settings.agent, options, stop)
     finally:
+        if robot is not None:
+            robot.close()
+        if claim is not None:
+            claim.close()
         if body is not bus:
             body.close()
         bus.close()
     return 0
 
 
-def _body(arguments: argparse.Namespace, bus: Bus, fleet: str, name: str) -> tuple[Robot, Synchronization]:
-    """The body behind Zenoh keys, and what the loop waits for: a simulation may be driven in lock-step."""
+def _robot(
+    arguments: argparse.Namespace, settings: RobotSettings, bus: Bus, fleet: str, name: str
+) -> tuple[Robot, Synchronization]:
+    """The robot, and how the loop is synchronised: a simulation may run in lock-step."""
+    from mapweave.agent.drivers.registry import find_driver
     from mapweave.agent.drivers.remote import RemoteRobot
+    from mapweave.agent.drivers.settings import REMOTE
     from mapweave.agent.synchronization import FreeRunning, Lockstep
+    from mapweave.hybridmap.errors import SettingsError
 
-    if not arguments.lockstep:
+    driver = arguments.robot or settings.driver
+    if driver == REMOTE and not arguments.lockstep:
         return RemoteRobot(bus, fleet, name), FreeRunning()
-    from mapweave.sim.lockstep_robot import LockstepRobot
+    if driver == REMOTE:
+        from mapweave.sim.lockstep_robot import LockstepRobot
 
-    robot = LockstepRobot(bus, fleet, name)
-    return robot, Lockstep(robot.rendezvous)
+        robot = LockstepRobot(bus, fleet, name)
+        return robot, Lockstep(robot.rendezvous)
+    if arguments.lockstep or arguments.body:
+        raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
+    return find_driver(driver)(settings), FreeRunning()
 
 
 def _close_on(stop: threading.Event, robot: Robot) -> None:

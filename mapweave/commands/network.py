@@ -68,7 +68,7 @@ def warn_without_router(bus: ZenohBus, name: str) -> None:
     def look() -> None:
         # A process that ends earlier has not waited long enough to know.
         if not bus.wait_connected(SOON) and time.monotonic() - began >= SOON:
-            advice = "start `mapweave server` or give --connect"
+            advice = "start `mapweave server` or `mapweave router`, or give --connect"
             print(f"{name} finds no router: {advice}; it goes on looking", file=sys.stderr, flush=True)
 
     threading.Thread(target=look, name="router", daemon=True).start()

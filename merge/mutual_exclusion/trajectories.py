@@ -29,9 +29,8 @@ class BodyTrajectory:
         nodes: N, in the order of time: the node of each moment.
         node_from_robot: (N, 3) m, m and rad: the robot's pose in it; zeros for the node's own image.
         times: (N,) s, ascending.
-        radius: of the robot, m; 0 if unknown.
-        looks: its proximity readings at each moment.
-        views: what its camera saw: the nodes themselves, in the order of time.
+        radius: of the robot, m; 0 if not all nodes tell.
+        looks: what its proximity sensors saw at each moment.
     """
 
     clock: str
@@ -40,17 +39,11 @@ class BodyTrajectory:
     times: Array
     radius: float
     looks: RangeScans
-    views: tuple[Node, ...]
 
     @property
     def agent(self) -> str:
         """Whose it is."""
         return self.nodes[0].agent
-
-    @property
-    def view_times(self) -> Array:
-        """(V,) s, ascending."""
-        return _seconds(self.views)
 
     @property
     def drifts(self) -> Array:
@@ -88,7 +81,7 @@ def trajectories_of(nodes: Collection[Node]) -> tuple[BodyTrajectory, ...]:
         order = np.argsort(times, kind="stable")
         looks = RangeScans.of([node.ranges for node in known], [node.wake for node in known]).take(order)
         ids = tuple(known[k].id for k in teller[order])
-        trails.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, looks, tuple(known)))
+        trails.append(BodyTrajectory(clock, ids, offsets[order], times[order], radius, looks))
     return tuple(trails)
 
 

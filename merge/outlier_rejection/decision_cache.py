@@ -30,9 +30,7 @@ class DecisionCache:
         self._groups: dict[Key, LinkGroup] = {}
         self._weighed: dict[Key, tuple[Link, Link]] = {}
 
-    def fragments(
-        self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings, strain: float
-    ) -> list[Fragment]:
+    def fragments(self, maps: Mapping[MapId, HybridMap], s: ConsistencySettings) -> list[Fragment]:
         """See `mapweave.merge.outlier_rejection.segmentation.fragments_of`; only maps that have changed are
         cut.
         """
@@ -40,7 +38,7 @@ class DecisionCache:
         for map_id, one in maps.items():
             known = self._maps.get(map_id)
             if known is None or known[0] is not one:
-                known = self._maps[map_id] = one, fragments_of({map_id: one}, s, strain)
+                known = self._maps[map_id] = one, fragments_of({map_id: one}, s)
             found += known[1]
         return sorted(found, key=lambda fragment: fragment.name)
 

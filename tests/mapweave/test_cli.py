@@ -26,7 +26,7 @@ def test_every_command_has_help(command, capfd):
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["fly"], ["agent"], ["agent", "r0", "--driver", "legs"], ["demo", "--robots", "many"], ["map"],
+    [[], ["fly"], ["agent"], ["agent", "r0", "--mission", "fly"], ["demo", "--robots", "many"], ["map"],
      ["replay"], ["relocalize"], ["server", "--port", "1"]],
 )  # fmt: skip
 def test_a_wrong_use_shows_how_to_use_it(arguments, capfd):

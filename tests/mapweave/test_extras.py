@@ -44,6 +44,8 @@ CASES: list[tuple[str, str, str]] = [
     ("sim serve", "office --connect {nobody}", SIM),
     ("server", "--listen {nobody} --data {tmp}", SERVER),
     ("agent", "R0 --connect {nobody}", "R0"),  # a name that cannot be: else it waits for its robot
+    ("robots", "", "koala"),
+    ("router", "--listen nowhere", "endpoints look like"),
     ("replay", "{recording} --offline --data {tmp} --name walk", "0 nodes"),
     ("relocalize", "{recording}/images/0.png --connect {nobody} --timeout 0.1", WITHOUT_SERVER),
     ("eval relocalize", "{recording}", SERVER),

@@ -1,0 +1,172 @@
+"""Images from a video device, a file or a stream with OpenCV: the newest frame, stamped at capture.
+
+On a Raspberry Pi with libcamera (Bookworm and later) the camera is no video device for OpenCV. Either run
+`rpicam-vid -t 0 --codec mjpeg --inline --listen -o tcp://0.0.0.0:8888` and give `source =
+"tcp://127.0.0.1:8888"`, or write a `FrameSource` over picamera2: `capture_request()` gives the image and, in
+`SensorTimestamp` of its metadata, the monotonic time of the exposure, which `clock.of_monotonic_ns` makes a
+stamp.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+import time
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.agent.drivers.clock import now_ns, of_monotonic_ns
+from mapweave.agent.drivers.settings import CameraSettings
+from mapweave.hybridmap.errors import DeviceError
+
+log = logging.getLogger(__name__)
+
+RETRY = 1.0
+"""s between two attempts to open a camera."""
+SETTLING = 1.0
+"""s of automatic exposure before it is locked."""
+FARTHEST_STAMP_NS = 1_000_000_000
+"""Largest age of a frame; a greater difference means that the device uses another clock."""
+
+
+class Frame(NamedTuple):
+    """An image with its stamp.
+
+    Attributes:
+        stamp_ns: of the exposure.
+        image: (H, W) uint8 grey.
+    """
+
+    stamp_ns: int
+    image: NDArray[np.uint8]
+
+
+class FrameSource(Protocol):
+    """A camera."""
+
+    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+        """Wait up to `patience` (s) for a frame newer than a stamp; returns the newest. Never raises."""
+        ...
+
+    def close(self) -> None:
+        """Release the camera. Never raises."""
+        ...
+
+
+class Capture:
+    """OpenCV capture. A thread grabs every frame, so that buffers stay empty, and keeps the newest."""
+
+    def __init__(self, settings: CameraSettings) -> None:
+        """Open the source and start to capture.
+
+        Raises:
+            DeviceError: the source cannot be opened.
+        """
+        self._settings = settings
+        self._changed = threading.Condition()
+        self._newest: Frame | None = None
+        self._closing = False
+        self._capture = self._open()
+        self._thread = threading.Thread(target=self._serve, name="camera", daemon=True)
+        self._thread.start()
+
+    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+        """Wait for a frame newer than a stamp; see FrameSource."""
+
+        def there() -> bool:
+            return self._closing or (self._newest is not None and self._newest.stamp_ns > stamp_ns)
+
+        with self._changed:
+            self._changed.wait_for(there, patience)
+            return self._newest if self._newest is not None and self._newest.stamp_ns > stamp_ns else None
+
+    def close(self) -> None:
+        """Release the source. May be called twice."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(2.0)
+
+    def _open(self) -> cv2.VideoCapture:
+        settings, source = self._settings, self._settings.source
+        number = re.fullmatch(r"(?:/dev/video)?(\d+)", source)
+        self._is_device = number is not None
+        self._is_file = number is None and "://" not in source
+        if self._is_file and not Path(source).is_file():
+            raise DeviceError(f"camera {source}: no such file; a source is a number, a file or a URL")
+        if number is not None:
+            capture = cv2.VideoCapture(int(number[1]), cv2.CAP_V4L2)
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, settings.width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        else:
+            # FFmpeg with n threads decodes n frames at once, which delays each by n frames.
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+        if not capture.isOpened():
+            capture.release()
+            raise DeviceError(
+                f"camera {source}: cannot be opened; is it connected, and not in use by another program?"
+            )
+        return capture
+
+    # In the camera's thread.
+
+    def _serve(self) -> None:
+        while not self._closing:
+            self._take_all()
+            self._capture.release()
+            if self._is_file or self._closing:
+                return
+            log.warning("camera %s delivers no images; opening it again", self._settings.source)
+            while not self._closing:
+                time.sleep(RETRY)
+                try:
+                    self._capture = self._open()
+                    break
+                except DeviceError:
+                    continue
+
+    def _take_all(self) -> None:
+        """Capture until the source ends."""
+        capture, settings = self._capture, self._settings
+        begin, locked = time.monotonic(), not (settings.lock_exposure and self._is_device)
+        while not self._closing and capture.grab():
+            if self._is_file:
+                # A file plays at its frame rate.
+                ahead = begin + capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 - time.monotonic()
+                time.sleep(max(ahead, 0.0))
+            stamp_ns = self._stamp_ns() - round(settings.delay * 1e9)
+            good, image = capture.retrieve()
+            if not good or image is None:
+                return
+            grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            with self._changed:
+                self._newest = Frame(stamp_ns, np.asarray(grey, dtype=np.uint8))
+                self._changed.notify_all()
+            if not locked and time.monotonic() - begin >= SETTLING:
+                locked = True
+                self._lock_exposure()
+
+    def _stamp_ns(self) -> int:
+        """Stamp of the frame that was just grabbed."""
+        if self._is_device:
+            # Video4Linux stamps frames with the monotonic clock; some device drivers do not.
+            taken = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            if 0 <= time.monotonic_ns() - taken < FARTHEST_STAMP_NS:
+                return of_monotonic_ns(taken)
+        return now_ns()
+
+    def _lock_exposure(self) -> None:
+        """Fix exposure and white balance at their present values."""
+        capture = self._capture
+        exposure = capture.get(cv2.CAP_PROP_EXPOSURE)
+        # 1 is manual exposure in Video4Linux.
+        done = capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1) and capture.set(cv2.CAP_PROP_EXPOSURE, exposure)
+        capture.set(cv2.CAP_PROP_AUTO_WB, 0)
+        if not done:
+            log.warning("camera %s: this device cannot lock its exposure", self._settings.source)

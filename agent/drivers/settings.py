@@ -1,0 +1,133 @@
+"""The `[robot]` table of a settings file: which driver, its options, the camera, and the robot's geometry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from mapweave.agent.observation import RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import SettingsError
+
+REMOTE = "remote"
+"""The driver of a robot base behind Zenoh keys, for example a simulated one."""
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Source of the images and calibration of the camera. Names as in the `camera.toml` of recordings.
+
+    Attributes:
+        width: px.
+        height: px.
+        fx: focal length, px.
+        fy: focal length, px.
+        cx: principal point, px.
+        cy: principal point, px.
+        height_m: of the optical centre above the floor.
+        forward_m: how far the optical centre stands ahead of the axle.
+        distortion: (k1, k2, p1, p2, k3) of the lens, OpenCV's order.
+        source: number or path of a video device, a video file, or the URL of an RTSP or HTTP stream.
+        delay: time from the middle of the exposure until the frame is here, s; subtracted from the stamps.
+        lock_exposure: fix exposure and white balance after the first second.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    height_m: float
+    forward_m: float = 0.0
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    source: str = "0"
+    delay: float = 0.0
+    lock_exposure: bool = False
+
+    @property
+    def intrinsics(self) -> Camera:
+        """The ideal camera on the robot."""
+        return Camera(
+            self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.height_m, self.forward_m
+        )
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Dimensions and limits of a robot. The settings file overrides the driver's values; None is not given.
+
+    Attributes:
+        radius: of the footprint, m.
+        axle: distance between the wheels, m.
+        wheel_noise: standard deviation of a wheel's way, as a share of the way.
+        max_forward: speed limit, m/s.
+        max_turn: rate limit, rad/s.
+        ranger_bearings_deg: directions of the proximity sensors, 0 ahead, positive to the left.
+        ranger_reach: the proximity sensors' maximum, m.
+    """
+
+    radius: float | None = None
+    axle: float | None = None
+    wheel_noise: float | None = None
+    max_forward: float | None = None
+    max_turn: float | None = None
+    ranger_bearings_deg: tuple[float, ...] | None = None
+    ranger_reach: float | None = None
+
+    def over(self, defaults: Geometry) -> Geometry:
+        """These values where given, the defaults elsewhere."""
+        given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+        return replace(defaults, **given)
+
+
+@dataclass(frozen=True)
+class RobotSettings:
+    """One robot.
+
+    Attributes:
+        driver: name of a driver, as `mapweave robots` lists them, or `FILE.py:CLASS`.
+        options: the driver's own table.
+        camera: source and calibration; None for a driver with images of its own.
+        geometry: overrides the driver's values.
+    """
+
+    driver: str = REMOTE
+    options: Mapping[str, Any] = field(default_factory=dict)
+    camera: CameraSettings | None = None
+    geometry: Geometry = field(default_factory=Geometry)
+
+    def describe(self, known: Geometry) -> RobotDescription:
+        """Description of the robot for the agent.
+
+        Args:
+            known: values of the driver.
+
+        Raises:
+            SettingsError: there is no camera, or a length is missing or not positive.
+        """
+        if self.camera is None:
+            raise SettingsError(
+                "the settings have no [robot.camera]: give source, width, height, fx, fy, cx, cy and height_m"
+            )
+        geometry = self.geometry.over(known)
+        for name in ("radius", "axle", "max_forward", "max_turn"):
+            value = getattr(geometry, name)
+            if value is None:
+                raise SettingsError(f"[robot.geometry] {name} is missing: the driver cannot know it")
+            if not value > 0.0:
+                raise SettingsError(f"[robot.geometry] {name} = {value:g} must be positive")
+        assert geometry.radius and geometry.axle and geometry.max_forward and geometry.max_turn
+        given = RobotDescription(
+            self.camera.intrinsics,
+            self.camera.distortion,
+            radius=geometry.radius,
+            axle=geometry.axle,
+            max_forward=geometry.max_forward,
+            max_turn=geometry.max_turn,
+            ranger_bearings=tuple(math.radians(b) for b in geometry.ranger_bearings_deg or ()),
+            ranger_reach=geometry.ranger_reach or 0.0,
+        )
+        return given if geometry.wheel_noise is None else replace(given, wheel_noise=geometry.wheel_noise)

@@ -1,0 +1,37 @@
+"""`mapweave robots`: list the drivers."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "robots",
+        help="list the drivers of robots",
+        description="List the drivers with their robots and missing libraries. The settings file of a robot "
+        'names its driver: [robot] driver = "koala". Your own driver is FILE.py:CLASS.',
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print one line per driver."""
+    from mapweave.agent.drivers.registry import listing
+    from mapweave.extras import extra_of
+
+    robots = listing()
+    width = max(len(robot.name) for robot in robots)
+    for robot in robots:
+        line = robot.line
+        if robot.missing:
+            extra = extra_of(robot.missing)
+            line = f"needs the library {robot.missing}"
+            if extra is not None:
+                line = f"needs the extra {extra!r}: pip install 'mapweave[{extra}]'"
+        elif robot.error:
+            line = f"cannot be loaded: {robot.error}"
+        print(f"{robot.name:<{width}}  {line}")
+    return 0

@@ -1,0 +1,37 @@
+"""`mapweave router`: the Zenoh router alone, for robots without a map server."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "router",
+        help="run the router alone, without a map server",
+        description="Run the Zenoh router for robots and tools, without a map server. It needs only the "
+        "base installation. Maps are not merged; robots keep them on their own disks and send them when a "
+        "map server can be reached.",
+    )
+    add_network(parser, listens=True)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Route until told to stop."""
+    from mapweave.wire.bus_settings import BusSettings
+    from mapweave.wire.zenoh_bus import ZenohBus
+
+    network = network_of(arguments, settings_of(arguments))
+    stop = stop_on_signals()
+    bus = ZenohBus(BusSettings(mode="router", listen=network.endpoints))
+    try:
+        print(f"router listens at {', '.join(network.endpoints)}", flush=True)
+        stop.wait()
+    finally:
+        bus.close()
+    return 0

@@ -1,0 +1,15 @@
+"""What tests of drivers share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.agent.drivers.contract import write_video
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A minute of images for the camera."""
+    return write_video(tmp_path_factory.mktemp("video") / "noise.avi", 60.0)

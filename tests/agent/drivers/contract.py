@@ -1,0 +1,229 @@
+"""What every driver promises, as a class to derive tests from: give the robot and its emulator.
+
+The limits in time are the contract's; a busy machine gets what `SLACK` says on top.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers.checked import CheckedRobot
+from mapweave.agent.drivers.robot import Robot
+from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
+from mapweave.agent.observation import Command, Observation
+from mapweave.hybridmap.errors import InvalidValue
+
+ROOT = Path(__file__).parents[3]
+WIDTH, HEIGHT = 64, 48
+STOPS_WITHIN = 0.5
+"""s after the last command, or after the death of the process."""
+ANSWERS_WITHIN = 0.02
+"""s that `act` may take, and `sense` beyond two ticks."""
+SLACK = 0.03
+"""s; processes and threads of a busy machine wait for their turn."""
+
+CHILD = """
+import sys, time
+from pathlib import Path
+from mapweave.agent.drivers.registry import find_driver
+from mapweave.agent.observation import Command
+from mapweave.settings import load_settings
+settings = load_settings(Path(sys.argv[1])).robot
+robot = find_driver(settings.driver)(settings)
+while True:
+    robot.sense()
+    robot.act(Command(0.2, 0.0))
+    print("driving", flush=True)
+"""
+
+
+def write_video(path: Path, seconds: float) -> Path:
+    """A video of noise at 20 frames a second."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (WIDTH, HEIGHT))
+    noise = np.random.default_rng(0)
+    frames = [noise.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(4)]
+    for k in range(round(20 * seconds)):
+        writer.write(frames[k % 4])
+    writer.release()
+    return path
+
+
+def until(happened: Callable[[], bool], seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end, f"did not happen within {seconds:g} s"
+        time.sleep(0.002)
+
+
+def drive(robot: Robot, command: Command, seconds: float) -> list[Observation]:
+    """Let the robot drive; returns what it saw after each command."""
+    seen = []
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        robot.act(command)
+        observation = robot.sense()
+        assert observation is not None
+        seen.append(observation)
+    return seen
+
+
+class RobotContract:
+    """Derive from it, and give `emulator`, `DRIVER` and the other values."""
+
+    DRIVER: str
+    SPEED_STEP: float
+    """Of a wheel, m/s: what the robot's command can say."""
+    COUNT: float
+    """Way of a wheel for a step of what it reads, m."""
+    OPTIONS: ClassVar[dict[str, Any]] = {}
+    GEOMETRY: ClassVar[dict[str, Any]] = {}
+
+    @pytest.fixture
+    def emulator(self, tmp_path: Path) -> Iterator[Any]:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def settings(self, emulator: Any, tmp_path: Path, video: Path) -> Path:
+        def table(values: dict[str, Any]) -> str:
+            return "\n".join(f"{name} = {value!r}" for name, value in values.items())
+
+        camera = {
+            "source": str(video), "width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 60.0, "cx": 32.0,
+            "cy": 24.0, "height_m": 0.3,
+        }  # fmt: skip
+        options = {"port": str(emulator.path), **self.OPTIONS}
+        path = tmp_path / "robot.toml"
+        path.write_text(
+            f"[robot]\ndriver = {self.DRIVER!r}\n[robot.camera]\n{table(camera)}\n"
+            f"[robot.options]\n{table(options)}\n[robot.geometry]\n{table(self.GEOMETRY)}\n"
+        )
+        return path
+
+    @pytest.fixture
+    def robot(self, settings: Path) -> Iterator[Robot]:
+        from mapweave.agent.drivers.registry import find_driver
+        from mapweave.settings import load_settings
+
+        given: RobotSettings = load_settings(settings).robot
+        assert isinstance(given.camera, CameraSettings)
+        robot = CheckedRobot(find_driver(given.driver)(given))
+        robot.describe()
+        yield robot
+        robot.close()
+
+    def test_odometry_is_in_metres_and_radians(self, robot: Robot, emulator: Any) -> None:
+        robot.sense()
+        start = emulator.wheels.way()
+        axle = robot.describe().axle
+        seen = [*drive(robot, Command(0.2, 0.0), 0.8), *drive(robot, Command(0.1, 0.5), 0.8)]
+        seen += drive(robot, Command(), 0.4)
+        left, right = (b - a for a, b in zip(start, emulator.wheels.way(), strict=True))
+        assert left + right > 0.3
+        forward, turn = (sum(getattr(o.odometry, name) for o in seen) for name in ("forward", "turn"))
+        error = 2 * self.COUNT
+        assert forward == pytest.approx((left + right) / 2, abs=error)
+        assert turn == pytest.approx((right - left) / axle, abs=2 * error / axle)
+        assert turn > 0.2
+
+    def test_stamps_are_nanoseconds_that_rise_with_the_images(self, robot: Robot) -> None:
+        seen = drive(robot, Command(), 1.5)
+        now, tick = time.time_ns(), robot.describe().tick
+        stamps = [observation.stamp_ns for observation in seen]
+        assert 0 <= now - stamps[-1] < 1e9
+        steps = np.diff(stamps) / 1e9
+        assert (steps > 0).all()
+        assert np.median(steps) == pytest.approx(tick, abs=0.03)
+        images = [observation.image for observation in seen]
+        assert sum(image is not None for image in images) >= len(images) - 2
+        assert all(i.shape == (HEIGHT, WIDTH) and i.dtype == np.uint8 for i in images if i is not None)
+
+    def test_act_returns_what_the_wheels_do(self, robot: Robot, emulator: Any) -> None:
+        description = robot.describe()
+        axle = description.axle
+        for wanted in (Command(0.1234, 0.321), Command(-0.05, 0.1), Command(99.0, -99.0)):
+            applied = robot.act(wanted)
+            left, right = applied.forward - applied.turn * axle / 2, applied.forward + applied.turn * axle / 2
+            until(lambda speeds=(left, right): emulator.wheels.speeds == pytest.approx(speeds, abs=1e-9), 0.5)
+            limited = min(abs(wanted.forward), description.max_forward)
+            assert abs(applied.forward) == pytest.approx(limited, abs=self.SPEED_STEP)
+            assert abs(applied.turn) <= description.max_turn + 2 * self.SPEED_STEP / axle
+        with pytest.raises(InvalidValue, match="finite"):
+            robot.act(Command(float("nan"), 0.0))
+
+    def test_wheels_stop_when_commands_cease(self, robot: Robot, emulator: Any) -> None:
+        drive(robot, Command(0.2, 0.0), 0.5)
+        assert emulator.wheels.speeds[0] > 0.1
+        last = time.monotonic()
+        until(lambda: emulator.wheels.speeds == (0.0, 0.0), 1.5)
+        assert emulator.wheels.stopped_at - last < STOPS_WITHIN + SLACK
+        # It drives on with the next command.
+        drive(robot, Command(0.2, 0.0), 0.3)
+        assert emulator.wheels.speeds[0] > 0.1
+
+    def test_wheels_stop_when_it_is_closed(self, robot: Robot, emulator: Any) -> None:
+        drive(robot, Command(0.2, 0.0), 0.3)
+        robot.close()
+        until(lambda: emulator.wheels.speeds == (0.0, 0.0), STOPS_WITHIN)
+        assert robot.sense() is None
+
+    @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+    def test_wheels_stop_when_the_process_dies_or_hangs(
+        self, settings: Path, emulator: Any, end: signal.Signals
+    ) -> None:
+        child = subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(settings)], stdout=subprocess.PIPE, cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+        try:
+            assert child.stdout is not None
+            for _ in range(3):
+                assert child.stdout.readline() == b"driving\n"
+            until(lambda: emulator.wheels.speeds[0] > 0.1, 1.0)
+            child.send_signal(end)
+            died = time.monotonic()
+            until(lambda: emulator.wheels.speeds == (0.0, 0.0), 1.5)
+            assert emulator.wheels.stopped_at - died < STOPS_WITHIN + SLACK
+        finally:
+            child.kill()
+            child.communicate()
+
+    def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any) -> None:
+        drive(robot, Command(0.2, 0.0), 0.3)
+        emulator.unplug()
+        gone = drive(robot, Command(0.2, 0.0), 0.8)
+        assert sum(o.odometry.forward for o in gone[4:]) == pytest.approx(0.0, abs=1e-9)
+        assert not len(gone[-1].proximity)
+        emulator.plug_in()
+        until(lambda: bool(drive(robot, Command(0.2, 0.0), 0.1)) and emulator.wheels.speeds[0] > 0.1, 4.0)
+        back = drive(robot, Command(0.2, 0.0), 0.5)
+        assert sum(o.odometry.forward for o in back) > 0.05
+        assert len(back[-1].proximity) == len(robot.describe().ranger_bearings)
+
+    def test_a_stalled_line_holds_up_nothing(self, robot: Robot, emulator: Any) -> None:
+        drive(robot, Command(0.1, 0.0), 0.3)
+        emulator.stalled = True
+        tick, acts, senses = robot.describe().tick, [], []
+        for _ in range(12):
+            begin = time.monotonic()
+            robot.act(Command(0.1, 0.0))
+            acts.append(time.monotonic() - begin)
+            begin = time.monotonic()
+            robot.sense()
+            senses.append(time.monotonic() - begin)
+        emulator.stalled = False
+        # The median: a machine that does other things as well may hold up a single call.
+        assert np.median(acts) < ANSWERS_WITHIN
+        assert np.median(senses) < 2 * tick + ANSWERS_WITHIN
+        assert max(acts) < 0.25
+        until(lambda: len(drive(robot, Command(0.1, 0.0), 0.1)) > 0 and emulator.wheels.speeds[0] > 0.05, 4.0)

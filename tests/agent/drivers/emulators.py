@@ -1,0 +1,425 @@
+"""Robots on real lines: a pseudo-terminal or a socket with wheels behind it, which may stall or vanish.
+
+The bytes are written by hand from the manuals; nothing here knows a driver.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.server
+import json
+import os
+import pty
+import select
+import struct
+import termios
+import threading
+import time
+import tty
+import urllib.parse
+from pathlib import Path
+from typing import ClassVar
+
+
+class TwoWheels:
+    """Wheels that turn at once as they are told; what they really do is the tests' truth."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._since = time.monotonic()
+        self.speeds = (0.0, 0.0)
+        self._way = (0.0, 0.0)
+        self.stopped_at = self._since
+
+    def set(self, left: float, right: float) -> None:
+        """Speeds, m/s."""
+        with self._lock:
+            self._advance()
+            if (left, right) == (0.0, 0.0) != self.speeds:
+                self.stopped_at = self._since
+            self.speeds = (left, right)
+
+    def way(self) -> tuple[float, float]:
+        """m, of each wheel so far."""
+        with self._lock:
+            self._advance()
+            return self._way
+
+    def _advance(self) -> None:
+        now = time.monotonic()
+        dt, self._since = now - self._since, now
+        self._way = (self._way[0] + self.speeds[0] * dt, self._way[1] + self.speeds[1] * dt)
+
+
+class Emulator:
+    """A robot at the far end of a pseudo-terminal, which stands under `path` as long as it is plugged in.
+
+    Attributes:
+        path: of the port.
+        wheels: what drives.
+        stalled: whether it neither reads nor answers.
+        heard: all bytes that came.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "port"
+        self.wheels = TwoWheels()
+        self.stalled = False
+        self.heard = b""
+        self._closing = False
+        self._master = self._slave = -1
+        self._lock = threading.RLock()
+        self.plug_in()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def plug_in(self) -> None:
+        with self._lock:
+            self._master, self._slave = pty.openpty()
+            tty.setraw(self._slave)
+            self.path.symlink_to(os.ttyname(self._slave))
+            self.switched_on()
+
+    def unplug(self) -> None:
+        """The port vanishes, as a USB adapter does; the wheels go on as they were told."""
+        with self._lock:
+            self.path.unlink()
+            os.close(self._master)
+            os.close(self._slave)
+            self._master = self._slave = -1
+
+    def line_settings(self) -> tuple[int, int]:
+        """Baud constant and stop bits that the driver has set."""
+        attributes = termios.tcgetattr(self._master)
+        return attributes[5], 2 if attributes[2] & termios.CSTOPB else 1
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join()
+        if self._master >= 0:
+            self.unplug()
+
+    # For those who write a robot.
+
+    def switched_on(self) -> None:
+        """Begin as after power on."""
+
+    def take(self, data: bytes) -> None:
+        """Bytes from the driver."""
+        raise NotImplementedError
+
+    def idle(self) -> None:
+        """Called every few milliseconds."""
+
+    def say(self, data: bytes) -> None:
+        with self._lock, contextlib.suppress(OSError):
+            if self._master >= 0:
+                os.write(self._master, data)
+
+    def _serve(self) -> None:
+        while not self._closing:
+            master = self._master
+            if master < 0 or self.stalled:
+                time.sleep(0.005)
+                self.idle()
+                continue
+            try:
+                ready, _, _ = select.select([master], [], [], 0.005)
+                data = os.read(master, 4096) if ready else b""
+            except (OSError, ValueError):
+                time.sleep(0.005)
+                continue
+            if data:
+                self.heard += data
+                self.take(data)
+            self.idle()
+
+
+class LineEmulator(Emulator):
+    """One that takes lines."""
+
+    def switched_on(self) -> None:
+        self._rest = b""
+
+    def take(self, data: bytes) -> None:
+        *lines, self._rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
+        for line in lines:
+            if line:
+                self.line(line.decode("ascii", "replace"))
+
+    def line(self, line: str) -> None:
+        raise NotImplementedError
+
+
+class KoalaSilver(LineEmulator):
+    """Koala silver edition: user manual, appendix "Communication protocol to control the robot"."""
+
+    BAUD, STOP_BITS = termios.B38400, 2
+
+    def switched_on(self) -> None:
+        super().switched_on()
+        self.wheels.set(0.0, 0.0)
+        self.infrared = [0] * 16
+
+    def line(self, line: str) -> None:
+        if self.line_settings() != (self.BAUD, self.STOP_BITS):
+            return  # noise to a line that is set otherwise
+        name, *arguments = line.split(",")
+        match name, [int(a) for a in arguments]:
+            case "B", []:
+                self.say(b"b,5.02,5.02\r\n")
+            case "D", [left, right] if abs(left) <= 127 and abs(right) <= 127:
+                # "Set speed: the unit is the pulse / 10 ms, that corresponds to 4.5 mm/s".
+                self.wheels.set(left * 0.0045, right * 0.0045)
+                self.say(b"d\r\n")
+            case "H", []:
+                # "Read position: the unit is the pulse, 0.045 mm".
+                left, right = (round(way / 0.045e-3) for way in self.wheels.way())
+                self.say(f"h,{left},{right}\r\n".encode())
+            case "N", []:
+                self.say(("n," + ",".join(map(str, self.infrared)) + "\r\n").encode())
+            case _:
+                self.say(b"z,Protocol error\r\n")
+
+
+class Koala25(LineEmulator):
+    """Koala 2.5: user manual 1.1, section 6 "Serial communication protocol", and 4.1 on the sensors."""
+
+    BAUD, STOP_BITS = termios.B115200, 1
+    PULSE = 3.141592653589793 * 82.5e-3 / 23400
+
+    def switched_on(self) -> None:
+        super().switched_on()
+        self.wheels.set(0.0, 0.0)
+        self.ultrasonic = [1000] * 9
+
+    def line(self, line: str) -> None:
+        if self.line_settings() != (self.BAUD, self.STOP_BITS):
+            return
+        name, *arguments = line.split(",")
+        match name, [int(a) for a in arguments]:
+            case "B", []:
+                self.say(b"b,A-02\r\n")
+            case "D", [left, right]:
+                # "Set speed: pulses per 10 ms".
+                self.wheels.set(left * self.PULSE * 100, right * self.PULSE * 100)
+                self.say(b"d\r\n")
+            case "P", []:
+                left, right = (round(way / self.PULSE) for way in self.wheels.way())
+                self.say(f"p,{left},{right}\r\n".encode())
+            case "G", []:
+                self.say(("g," + ",".join(map(str, self.ultrasonic)) + "\r\n").encode())
+            case _:
+                self.say(b"#\r\n")
+
+
+class Create2(Emulator):
+    """Create 2: Open Interface specification, "Open Interface commands" and "Sensor packets"."""
+
+    LENGTHS: ClassVar = {7: 0, 128: 0, 131: 0, 132: 0, 145: 4, 149: None, 173: 0}
+
+    def switched_on(self) -> None:
+        self._data = b""
+        self.mode = 0
+        self.bumps = 0
+        self.wheels.set(0.0, 0.0)
+
+    def lift(self) -> None:
+        """A wheel drops: the wheels stop, and the mode is Passive (specification, "Safe Mode")."""
+        self.mode = 1
+        self.wheels.set(0.0, 0.0)
+
+    def take(self, data: bytes) -> None:
+        if self.line_settings() != (termios.B115200, 1):
+            return
+        self._data += data
+        while self._data:
+            opcode = self._data[0]
+            if opcode not in self.LENGTHS:
+                self._data = self._data[1:]
+                continue
+            length = self.LENGTHS[opcode]
+            if length is None:
+                length = 1 + self._data[1] if len(self._data) > 1 else 1
+            if len(self._data) < 1 + length:
+                return
+            arguments, self._data = self._data[1 : 1 + length], self._data[1 + length :]
+            self._obey(opcode, arguments)
+
+    def _obey(self, opcode: int, arguments: bytes) -> None:
+        if opcode == 128 and self.mode == 0:
+            self.mode = 1
+        elif opcode in (131, 132) and self.mode:
+            self.mode = opcode - 129
+        elif opcode == 145 and self.mode in (2, 3):
+            # "Right velocity high byte, low byte, left velocity high byte, low byte", mm/s.
+            right, left = struct.unpack(">hh", arguments)
+            if max(abs(right), abs(left)) <= 500:
+                self.wheels.set(left / 1000, right / 1000)
+        elif opcode == 149 and self.mode:
+            self.say(b"".join(self._packet(number) for number in arguments[1:]))
+
+    def _packet(self, number: int) -> bytes:
+        # "Left/right encoder counts": 508.8 a turn of a 72 mm wheel, unsigned, 16 bit, high byte first.
+        left, right = (round(way / (3.141592653589793 * 72e-3) * 508.8) for way in self.wheels.way())
+        return {
+            7: bytes([self.bumps]),
+            35: bytes([self.mode]),
+            43: struct.pack(">H", left % 65536),
+            44: struct.pack(">H", right % 65536),
+        }[number]
+
+
+class Ugv:
+    """What the firmware of a Waveshare UGV does with a command: wiki "UGV Rover", JSON commands."""
+
+    def __init__(self, wheels: TwoWheels, odometers: bool) -> None:
+        self.wheels = wheels
+        self.odometers = odometers
+        self.watchdog = 3.0
+        self.last = time.monotonic()
+        self.stream = False
+        self.interval = 0.1
+
+    def obey(self, command: dict[str, float]) -> None:
+        match command:
+            case {"T": 1, "L": left, "R": right} if max(abs(left), abs(right)) <= 0.5:
+                self.last = time.monotonic()
+                self.wheels.set(left, right)
+            case {"T": 136, "cmd": milliseconds}:
+                self.watchdog = milliseconds / 1000
+            case {"T": 131, "cmd": on}:
+                self.stream = bool(on)
+            case {"T": 142, "cmd": milliseconds}:
+                self.interval = milliseconds / 1000
+
+    def watch(self) -> None:
+        """Without a new command within the heartbeat time the robot stops."""
+        if time.monotonic() - self.last > self.watchdog and self.wheels.speeds != (0.0, 0.0):
+            self.wheels.set(0.0, 0.0)
+
+    def info(self) -> str:
+        left, right = self.wheels.speeds
+        answer = {"T": 1001, "L": left, "R": right, "r": 0.1, "p": -0.2, "v": 11.9}
+        if self.odometers:
+            ways = [round(100 * way) for way in self.wheels.way()]
+            answer |= {"odl": ways[0], "odr": ways[1]}
+        return json.dumps(answer)
+
+
+class UgvSerial(LineEmulator):
+    """A UGV on its UART."""
+
+    def __init__(self, folder: Path, odometers: bool = False) -> None:
+        self._odometers = odometers
+        super().__init__(folder)
+
+    def switched_on(self) -> None:
+        super().switched_on()
+        self.ugv = Ugv(self.wheels, self._odometers)
+        self._told = 0.0
+
+    def line(self, line: str) -> None:
+        with contextlib.suppress(ValueError):
+            self.ugv.obey(json.loads(line))
+
+    def idle(self) -> None:
+        self.ugv.watch()
+        if self.ugv.stream and not self.stalled and time.monotonic() - self._told >= self.ugv.interval:
+            self._told = time.monotonic()
+            self.say(self.ugv.info().encode() + b"\r\n")
+
+
+class UgvHttp:
+    """A UGV as a web server on 127.0.0.1; `path` is its address."""
+
+    def __init__(self, folder: Path) -> None:
+        self.wheels = TwoWheels()
+        self.stalled = False
+        self._port = 0
+        self._closing = False
+        self.plug_in()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    @property
+    def path(self) -> str:
+        return f"http://127.0.0.1:{self._port}"
+
+    def plug_in(self) -> None:
+        emulator = self
+        self.ugv = Ugv(self.wheels, False)
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_GET(self) -> None:
+                while emulator.stalled and not emulator._closing:
+                    time.sleep(0.01)
+                path, _, query = self.path.partition("?")
+                if path != "/js":
+                    self.send_error(404)
+                    return
+                emulator.ugv.obey(json.loads(urllib.parse.parse_qs(query)["json"][0]))
+                answer = emulator.ugv.info().encode()
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(answer)))
+                self.end_headers()
+                self.wfile.write(answer)
+                # Unplugged means that open connections end, too.
+                self.close_connection = emulator._server is not self.server
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        http.server.ThreadingHTTPServer.allow_reuse_address = True
+        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", self._port), Handler)
+        self._server.daemon_threads = True
+        self._port = self._server.server_address[1]
+        self._unplugged = False
+        threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
+
+    def unplug(self) -> None:
+        server, self._server = self._server, None  # type: ignore[assignment]
+        server.shutdown()
+        server.server_close()
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join()
+        if self._server is not None:
+            self.unplug()
+
+    def _watch(self) -> None:
+        while not self._closing:
+            time.sleep(0.005)
+            self.ugv.watch()
+
+
+class ArduinoSketch(LineEmulator):
+    """The protocol of docs/arduino.md, written from its text."""
+
+    COUNTS_PER_TURN, WHEEL_RADIUS = 1440, 0.033
+
+    def switched_on(self) -> None:
+        super().switched_on()
+        self.wheels.set(0.0, 0.0)
+        self.bumped, self.centimetres = 0, [200, -1, 15]
+        self._last = self._told = time.monotonic()
+
+    def line(self, line: str) -> None:
+        word, left, right = line.split()
+        assert word == "D"
+        self._last = time.monotonic()
+        self.wheels.set(int(left) / 1000, int(right) / 1000)
+
+    def idle(self) -> None:
+        now = time.monotonic()
+        if now - self._last > 0.3 and self.wheels.speeds != (0.0, 0.0):
+            self.wheels.set(0.0, 0.0)
+        if now - self._told >= 0.05 and not self.stalled:
+            self._told = now
+            turn = 2 * 3.141592653589793 * self.WHEEL_RADIUS
+            left, right = (round(way / turn * self.COUNTS_PER_TURN) for way in self.wheels.way())
+            numbers = [left, right, self.bumped, *self.centimetres]
+            self.say(("S " + " ".join(map(str, numbers)) + "\n").encode())

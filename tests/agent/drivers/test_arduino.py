@@ -1,0 +1,43 @@
+"""The driver for any Arduino against the protocol of docs/arduino.md at the end of a pseudo-terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers.robot import Robot
+from mapweave.agent.observation import Command
+from tests.agent.drivers.contract import RobotContract, drive
+from tests.agent.drivers.emulators import ArduinoSketch
+
+
+class TestArduino(RobotContract):
+    DRIVER = "arduino"
+    SPEED_STEP = 0.001
+    COUNT = 0.2e-3 + 0.005
+    OPTIONS = {"wheel_radius": 0.033, "counts_per_turn": 1440}  # noqa: RUF012
+    GEOMETRY = {  # noqa: RUF012
+        "radius": 0.12, "axle": 0.15, "ranger_bearings_deg": [45.0, 0.0, -45.0], "ranger_reach": 1.5,
+    }  # fmt: skip
+
+    @pytest.fixture
+    def emulator(self, tmp_path: Path) -> Iterator[Any]:
+        sketch = ArduinoSketch(tmp_path)
+        yield sketch
+        sketch.close()
+
+    def test_distances_and_bumper(self, robot: Robot, emulator: Any) -> None:
+        emulator.bumped = 1
+        seen = drive(robot, Command(), 0.3)[-1]
+        # 200 cm are beyond the reach, -1 is nothing.
+        np.testing.assert_allclose(seen.proximity, [1.5, 1.5, 0.15])
+        assert seen.bumped
+
+    def test_lines_that_are_no_lines_are_passed_over(self, robot: Robot, emulator: Any) -> None:
+        emulator.say(b"S 12 x\nrubbish\n\n")
+        drive(robot, Command(0.1, 0.0), 0.4)
+        assert emulator.wheels.speeds[0] > 0.05

@@ -1,0 +1,219 @@
+"""OpenCV capture: the newest frame, stamped when it was taken."""
+
+from __future__ import annotations
+
+import http.server
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers.camera import Capture
+from mapweave.agent.drivers.settings import CameraSettings
+from mapweave.hybridmap.errors import DeviceError
+
+WIDTH, HEIGHT = 64, 48
+RATE = 20.0
+
+
+def settings(source: str, **rest: float) -> CameraSettings:
+    return CameraSettings(WIDTH, HEIGHT, 60.0, 60.0, 32.0, 24.0, 0.3, source=source, **rest)  # type: ignore[arg-type]
+
+
+def shade(number: int) -> int:
+    """Frames count in grey."""
+    return 5 * (number % 50)
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> str:
+    """Frames that say their number."""
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, (WIDTH, HEIGHT))
+    for k in range(40):
+        writer.write(np.full((HEIGHT, WIDTH, 3), shade(k), np.uint8))
+    writer.release()
+    return str(path)
+
+
+def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str) -> None:
+    camera = Capture(settings(clip))
+    first = camera.newer(0, 2.0)
+    assert first is not None
+    assert first.image.shape == (HEIGHT, WIDTH)
+    time.sleep(0.5)
+    later = camera.newer(first.stamp_ns, 0.2)
+    assert later is not None
+    # The ten frames between are not waited for.
+    passed = (later.stamp_ns - first.stamp_ns) / 1e9
+    assert passed == pytest.approx(0.5, abs=0.12)
+    assert (int(later.image[0, 0]) - int(first.image[0, 0])) / 5 == pytest.approx(passed * RATE, abs=2)
+    assert abs(time.time_ns() - later.stamp_ns) < 0.3e9
+    camera.close()
+
+
+def test_after_the_end_of_a_file_nothing_comes(clip: str) -> None:
+    camera = Capture(settings(clip))
+    time.sleep(2.5)
+    last = camera.newer(0, 0.1)
+    assert last is not None
+    begin = time.monotonic()
+    assert camera.newer(last.stamp_ns, 0.1) is None
+    assert time.monotonic() - begin < 0.3
+    camera.close()
+    camera.close()
+
+
+def test_a_known_delay_is_subtracted(clip: str) -> None:
+    camera = Capture(settings(clip, delay=5.0))
+    frame = camera.newer(0, 2.0)
+    assert frame is not None
+    assert (time.time_ns() - frame.stamp_ns) / 1e9 == pytest.approx(5.0, abs=0.4)
+    camera.close()
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [("/nowhere/film.avi", "no such file"), ("63", "camera 63: cannot be opened")],
+)
+def test_a_source_that_is_not_there(source: str, words: str) -> None:
+    with pytest.raises(DeviceError, match=words):
+        Capture(settings(source))
+
+
+class Stream:
+    """An MJPEG stream over HTTP, as network cameras and phones give it; frames say when they were made."""
+
+    def __init__(self) -> None:
+        stream = self
+        self.number = 0
+        self.stop = threading.Event()
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                while not stop_of(stream).wait(1 / RATE):
+                    stream.number += 1
+                    image = np.full((HEIGHT, WIDTH, 3), shade(stream.number), np.uint8)
+                    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                    try:
+                        self.wfile.write(head.encode() + jpeg + b"\r\n")
+                    except OSError:
+                        return
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.server.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self.server.server_address[1]}/stream.mjpg"
+        threading.Thread(target=self.server.serve_forever, args=(0.02,), daemon=True).start()
+
+    def close(self) -> None:
+        self.stop.set()
+        self.server.shutdown()
+        self.server.server_close()
+
+
+def stop_of(stream: Stream) -> threading.Event:
+    return stream.stop
+
+
+@pytest.fixture
+def stream() -> Iterator[Stream]:
+    made = Stream()
+    yield made
+    made.close()
+
+
+def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream) -> None:
+    camera = Capture(settings(stream.url))
+    behind = []
+    frame = camera.newer(0, 5.0)
+    for _ in range(10):
+        assert frame is not None
+        time.sleep(0.12)
+        frame = camera.newer(frame.stamp_ns, 1.0)
+        assert frame is not None
+        behind.append((stream.number - round(int(frame.image[0, 0]) / 5)) % 50)
+    assert np.median(behind) <= 2
+    camera.close()
+
+
+def test_a_stream_that_ends_is_opened_again(stream: Stream) -> None:
+    camera = Capture(settings(stream.url))
+    frame = camera.newer(0, 5.0)
+    assert frame is not None
+    stop, stream.stop = stream.stop, threading.Event()
+    stop.set()
+    time.sleep(0.2)
+    last = camera.newer(0, 0.1)
+    assert last is not None
+    assert camera.newer(last.stamp_ns, 6.0) is not None
+    camera.close()
+
+
+class Device:
+    """What OpenCV makes of a Video4Linux device, for machines without one."""
+
+    def __init__(self, locks: bool) -> None:
+        self.locks = locks
+        self.properties = {cv2.CAP_PROP_EXPOSURE: 157.0, cv2.CAP_PROP_AUTO_EXPOSURE: 3.0}
+        self.exposed_ns = 0
+        self.released = False
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, name: int, value: float) -> bool:
+        if name == cv2.CAP_PROP_AUTO_EXPOSURE and not self.locks:
+            return False
+        self.properties[name] = value
+        return True
+
+    def get(self, name: int) -> float:
+        if name == cv2.CAP_PROP_POS_MSEC:
+            return self.exposed_ns / 1e6
+        return self.properties.get(name, 0.0)
+
+    def grab(self) -> bool:
+        # Taken 60 ms before it is here.
+        self.exposed_ns = time.monotonic_ns() - 60_000_000
+        time.sleep(0.03)
+        return not self.released
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+    def release(self) -> None:
+        self.released = True
+
+
+@pytest.mark.parametrize("locks", [True, False])
+def test_a_device_is_stamped_by_its_driver_and_its_exposure_locked(
+    locks: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    device, opened = Device(locks), []
+    monkeypatch.setattr("cv2.VideoCapture", lambda *arguments: opened.append(arguments) or device)
+    monkeypatch.setattr("mapweave.agent.drivers.camera.SETTLING", 0.2)
+    camera = Capture(settings("/dev/video2", lock_exposure=True))
+    assert opened == [(2, cv2.CAP_V4L2)]
+    frame = camera.newer(0, 2.0)
+    assert frame is not None
+    age = (time.time_ns() - frame.stamp_ns) / 1e9
+    assert 0.08 < age < 0.4
+    assert device.properties[cv2.CAP_PROP_FRAME_WIDTH] == WIDTH
+    assert device.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == 3.0
+    time.sleep(0.6)
+    assert device.properties[cv2.CAP_PROP_AUTO_EXPOSURE] == (1.0 if locks else 3.0)
+    assert device.properties[cv2.CAP_PROP_EXPOSURE] == 157.0
+    assert ("cannot lock its exposure" in caplog.text) is not locks
+    camera.close()
+    assert device.released

@@ -1,0 +1,145 @@
+"""Each mistake of a driver's author is one line at the first observation that shows it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers.checked import CheckedRobot
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.errors import DeviceError
+
+DESCRIPTION = RobotDescription(
+    Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3),
+    ranger_bearings=(-0.5, 0.0, 0.5, 1.0, 1.5),
+    ranger_reach=2.0,
+)
+NOW_S = 1_795_000_000.0
+NOW_NS = round(NOW_S * 1e9)
+GOOD = Observation(NOW_NS, Odometry(0.01, 0.0), np.zeros((48, 64), np.uint8), np.full(5, 1.0))
+
+
+class Scripted:
+    """A driver that does as the test says."""
+
+    def __init__(self, *seen: Any, description: Any = DESCRIPTION, applied: Any = None) -> None:
+        self.seen = list(seen)
+        self.description = description
+        self.applied = applied
+
+    def describe(self) -> Any:
+        return self.description
+
+    def sense(self) -> Any:
+        return self.seen.pop(0)
+
+    def act(self, command: Command) -> Any:
+        return self.applied
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def checked(*seen: Any, **rest: Any) -> CheckedRobot:
+    return CheckedRobot(Scripted(*seen, **rest), clock=lambda: NOW_S)
+
+
+def good(**changes: Any) -> Observation:
+    return replace(GOOD, **changes)
+
+
+@pytest.mark.parametrize(
+    ("seen", "words"),
+    [
+        (good(image=np.zeros((48, 64, 3), np.uint8)), "image has 3 channels; it must be grey"),
+        (good(image=np.zeros((48, 64), np.float32)), r"image must be \(H, W\) uint8, not .* float32"),
+        (good(image=np.zeros((480, 640), np.uint8)), "image is 640x480 px, but .* described as 64x48"),
+        (good(image="frame.png"), "image must be an array, not str"),
+        (good(stamp_ns=time.time()), "stamp_ns .* is float; it must be whole nanoseconds"),
+        (good(stamp_ns=round(NOW_S)), "stamp_ns 1795000000 are seconds since 1970; it must be nanoseconds"),
+        (good(stamp_ns=round(NOW_S * 1e3)), "stamp_ns .* are milliseconds since 1970"),
+        (good(stamp_ns=round(NOW_S * 1e6)), "stamp_ns .* are microseconds since 1970"),
+        (good(odometry=Odometry(math.nan, 0.0)), "odometry is not finite: nan m, 0 rad"),
+        (good(odometry=Odometry(0.0, math.inf)), "odometry is not finite"),
+        (good(proximity=np.ones(4)), r"proximity has 4 readings, but describe\(\) gives 5 ranger_bearings"),
+        (good(proximity=np.ones((5, 2))), "proximity must be an array of one distance for each bearing"),
+        ((GOOD,), r"sense\(\) must return an Observation or None, not tuple"),
+    ],
+)
+def test_a_wrong_observation(seen: Any, words: str) -> None:
+    with pytest.raises(DeviceError, match=f"^driver: {words}") as error:
+        checked(seen).sense()
+    assert "\n" not in str(error.value)
+
+
+def test_five_readings_and_no_bearings() -> None:
+    robot = checked(GOOD, description=replace(DESCRIPTION, ranger_bearings=()))
+    with pytest.raises(DeviceError, match=r"5 readings, but describe\(\) gives 0 ranger_bearings"):
+        robot.sense()
+
+
+def test_bearings_in_degrees() -> None:
+    robot = checked(GOOD, description=replace(DESCRIPTION, ranger_bearings=(0.0, 45.0, 90.0)))
+    with pytest.raises(DeviceError, match="ranger_bearings are radians, not degrees: 45"):
+        robot.sense()
+
+
+def test_a_description_that_is_none() -> None:
+    with pytest.raises(DeviceError, match=r"describe\(\) must return a RobotDescription, not dict"):
+        checked(description={}).describe()
+
+
+@pytest.mark.parametrize(
+    ("second", "words"),
+    [
+        (NOW_NS, "stamp_ns stands still"),
+        (NOW_NS - 1, "stamp_ns goes backwards, from 1795000000000000000 to 1794999999999999999"),
+        (NOW_NS + 100, "stamp_ns rises by 100 in a tick of 0.1 s; it must be nanoseconds"),
+    ],
+)
+def test_stamps_that_do_not_rise_as_they_should(second: int, words: str) -> None:
+    robot = checked(GOOD, good(stamp_ns=second))
+    robot.sense()
+    with pytest.raises(DeviceError, match=words):
+        robot.sense()
+
+
+def test_seconds_since_the_start_are_no_nanoseconds() -> None:
+    robot = checked(good(stamp_ns=0), good(stamp_ns=1))
+    robot.sense()
+    with pytest.raises(DeviceError, match="must be nanoseconds"):
+        robot.sense()
+
+
+@pytest.mark.parametrize(
+    ("applied", "words"),
+    [
+        (None, "must return the Command that is applied, not None"),
+        ((0.1, 0.0), "not tuple"),
+        (Command(math.nan, 0.0), "is not finite"),
+    ],
+)
+def test_act_without_an_answer(applied: Any, words: str) -> None:
+    with pytest.raises(DeviceError, match=rf"^driver: act\(\) .*{words}"):
+        checked(applied=applied).act(Command())
+
+
+def test_a_good_robot_passes_through() -> None:
+    blind = good(stamp_ns=NOW_NS + 100_000_000, image=None, proximity=np.zeros(0))
+    later = good(stamp_ns=np.int64(NOW_NS + 200_000_000), proximity=np.full(5, np.nan))
+    robot = checked(GOOD, blind, later, None, applied=Command(0.1, 0.0))
+    assert robot.describe() is DESCRIPTION
+    assert [robot.sense() for _ in range(4)] == [GOOD, blind, later, None]
+    assert robot.act(Command(0.5, 0.0)) == Command(0.1, 0.0)
+
+
+def test_a_simulation_that_begins_at_zero_is_no_mistake() -> None:
+    robot = CheckedRobot(Scripted(*(good(stamp_ns=k * 100_000_000) for k in range(50))))
+    for _ in range(50):
+        assert robot.sense() is not None

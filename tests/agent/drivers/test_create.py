@@ -1,0 +1,50 @@
+"""The Create 2's driver against its Open Interface at the end of a pseudo-terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mapweave.agent.drivers.robot import Robot
+from mapweave.agent.observation import Command
+from tests.agent.drivers.contract import RobotContract, drive, until
+from tests.agent.drivers.emulators import Create2
+
+
+class TestCreate(RobotContract):
+    DRIVER = "create"
+    SPEED_STEP = 0.001
+    COUNT = 0.45e-3 + 0.002
+
+    @pytest.fixture
+    def emulator(self, tmp_path: Path) -> Iterator[Any]:
+        create = Create2(tmp_path)
+        yield create
+        create.close()
+
+    def test_it_drives_on_after_it_was_lifted(self, robot: Robot, emulator: Any) -> None:
+        drive(robot, Command(0.1, 0.0), 0.3)
+        emulator.lift()
+        until(lambda: emulator.wheels.speeds == (0.0, 0.0), 0.5)
+        drive(robot, Command(0.1, 0.0), 0.5)
+        assert emulator.mode == 2
+        assert emulator.wheels.speeds[0] > 0.05
+
+    def test_the_bumper_is_the_two_lowest_bits(self, robot: Robot, emulator: Any) -> None:
+        for bumps, bumped in ((0b0000, False), (0b0001, True), (0b0010, True), (0b1100, False)):
+            emulator.bumps = bumps
+            seen = drive(robot, Command(), 0.3)
+            assert seen[-1].bumped is bumped
+
+    def test_counters_wrap_around(self, robot: Robot, emulator: Any) -> None:
+        # 65536 counts are 29 m; a second before that.
+        with emulator.wheels._lock:
+            way = 65530 * 3.141592653589793 * 72e-3 / 508.8
+        # What the counter says at the start is the past's.
+        emulator.wheels._way = (way, way)
+        drive(robot, Command(), 0.3)
+        seen = drive(robot, Command(0.2, 0.0), 0.5)
+        assert 0.05 < sum(o.odometry.forward for o in seen) < 0.15

@@ -1,0 +1,117 @@
+"""Drivers are found: shipped ones, another package's, a class in a file; what is wrong is one line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mapweave.agent.drivers.registry import SHIPPED, drivers, find_driver, listing
+from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
+from mapweave.hybridmap.errors import DeviceError, SettingsError
+
+ROOT = Path(__file__).parents[3]
+CLASS = """
+class Rover:
+    '''A rover.'''
+    def __init__(self, settings): self.settings = settings
+    def describe(self): return None
+    def sense(self): return None
+    def act(self, command): return command
+    def close(self): pass
+"""
+
+
+def test_shipped_drivers_are_listed_with_what_they_drive() -> None:
+    listed = {robot.name: robot for robot in listing()}
+    assert {"koala", "create", "waveshare", "arduino", "remote"} <= listed.keys()
+    assert "Koala" in listed["koala"].line
+    assert not any(robot.missing or robot.error for robot in listed.values())
+
+
+def test_a_driver_of_another_package_is_found_and_what_it_lacks_is_said(tmp_path: Path) -> None:
+    (tmp_path / "rover.py").write_text(CLASS)
+    (tmp_path / "legs.py").write_text("import a_library_that_is_not_there\n" + CLASS)
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    info = tmp_path / "rovers-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: rovers\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[mapweave.robots]\n"
+        "rover = rover:Rover\nlegs = legs:Rover\nbroken = broken:Rover\nkoala = rover:Rover\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-m", "mapweave", "robots"], capture_output=True, text=True, cwd=ROOT, check=True,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"},
+    )  # fmt: skip
+    lines = dict(line.split(maxsplit=1) for line in ran.stdout.splitlines())
+    assert lines["rover"] == "A rover"
+    assert lines["legs"] == "needs the library a_library_that_is_not_there"
+    assert lines["broken"] == "cannot be loaded: ZeroDivisionError: division by zero"
+    # A package does not take the place of a shipped driver.
+    assert "K-Team" in lines["koala"]
+    assert len(lines) == len(SHIPPED) + 3
+
+
+def test_a_class_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "rover.py"
+    path.write_text(CLASS)
+    settings = RobotSettings(options={"port": "x"})
+    robot = find_driver(f"{path}:Rover")(settings)
+    assert robot.settings is settings  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "words"),
+    [
+        (None, "Rover", "no such file"),
+        (CLASS, "Rower", "no class 'Rower'; there are Rover"),
+        ("def f(:\n", "Rover", "line 1: SyntaxError"),
+        ("\n\nraise ValueError('no')\n", "Rover", "line 3: ValueError: no"),
+        (CLASS.replace("act", "move"), "Rover", "lacks act"),
+        ("Rover = 7\n", "Rover", "needs a class"),
+    ],
+)
+def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "rover.py"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(DeviceError, match=words) as error:
+        find_driver(f"{path}:{name}")
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_name() -> None:
+    with pytest.raises(SettingsError, match="did you mean 'koala'"):
+        find_driver("koalla")
+    with pytest.raises(SettingsError, match="there are arduino, create"):
+        find_driver("zzz")
+    assert "remote" in drivers()
+
+
+CAMERA = CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3, forward_m=0.1)
+KNOWN = Geometry(radius=0.2, axle=0.25, max_forward=0.3, max_turn=0.8)
+
+
+def test_settings_go_over_what_the_driver_knows() -> None:
+    given = Geometry(axle=0.31, ranger_bearings_deg=(90.0,), ranger_reach=1.0)
+    description = RobotSettings(camera=CAMERA, geometry=given).describe(KNOWN)
+    assert (description.axle, description.radius) == (0.31, 0.2)
+    assert description.ranger_bearings == pytest.approx((1.5708,), abs=1e-4)
+    assert description.camera.mount_forward == 0.1
+
+
+@pytest.mark.parametrize(
+    ("settings", "known", "words"),
+    [
+        (RobotSettings(), KNOWN, r"no \[robot.camera\]: give source, width"),
+        (RobotSettings(camera=CAMERA), Geometry(), "radius is missing"),
+        (RobotSettings(camera=CAMERA, geometry=Geometry(axle=-1.0)), KNOWN, "axle = -1 must be positive"),
+    ],
+)
+def test_settings_that_lack_something(settings: RobotSettings, known: Geometry, words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        settings.describe(known)

@@ -1,0 +1,68 @@
+"""The Waveshare UGV's driver over a pseudo-terminal and over HTTP."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mapweave.agent.drivers.robot import Robot
+from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
+from mapweave.agent.drivers.waveshare import Waveshare
+from mapweave.agent.observation import Command
+from tests.agent.drivers.contract import RobotContract, drive
+from tests.agent.drivers.emulators import UgvHttp, UgvSerial
+
+
+class TestUgvSerial(RobotContract):
+    DRIVER = "waveshare"
+    SPEED_STEP = 0.001
+    # Speeds are summed: a change of speed between two answers is half seen.
+    COUNT = 0.02
+
+    @pytest.fixture
+    def emulator(self, tmp_path: Path) -> Iterator[Any]:
+        ugv = UgvSerial(tmp_path)
+        yield ugv
+        ugv.close()
+
+    def test_it_shortens_the_watchdog_before_it_drives(self, robot: Robot, emulator: Any) -> None:
+        drive(robot, Command(0.1, 0.0), 0.2)
+        sent = [json.loads(line) for line in emulator.heard.splitlines()]
+        moves = [k for k, command in enumerate(sent) if command["T"] == 1 and command["L"]]
+        assert {"T": 136, "cmd": 300} in sent[: moves[0]]
+
+    def test_a_line_that_is_cut_off_is_passed_over(self, robot: Robot, emulator: Any) -> None:
+        emulator.say(b'{"T":1001,"L":0.1\r\n\xff\xfe{}\r\n')
+        assert len(drive(robot, Command(0.1, 0.0), 0.4)) >= 3
+        assert emulator.wheels.speeds[0] > 0.05
+
+
+def test_odometers_go_before_speeds(tmp_path: Path, video: Path) -> None:
+    """Firmware ugv_base_ros: `odl`, `odr` in centimetres."""
+    ugv = UgvSerial(tmp_path, odometers=True)
+    camera = CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3, source=str(video))
+    robot = Waveshare(RobotSettings(options={"port": str(ugv.path)}, camera=camera))
+    robot.sense()
+    seen = drive(robot, Command(0.2, 0.5), 1.0)
+    seen += drive(robot, Command(), 0.3)
+    left, right = ugv.wheels.way()
+    assert sum(o.odometry.forward for o in seen) == pytest.approx((left + right) / 2, abs=0.01)
+    assert sum(o.odometry.turn for o in seen) == pytest.approx((right - left) / 0.172, abs=0.06)
+    robot.close()
+    ugv.close()
+
+
+class TestUgvHttp(RobotContract):
+    DRIVER = "waveshare"
+    SPEED_STEP = 0.001
+    COUNT = 0.02
+
+    @pytest.fixture
+    def emulator(self, tmp_path: Path) -> Iterator[Any]:
+        ugv = UgvHttp(tmp_path)
+        yield ugv
+        ugv.close()

@@ -1,0 +1,167 @@
+"""A base and a camera as one robot: odometry at the time of the image, whatever fails."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
+from mapweave.agent.drivers.camera import Frame
+from mapweave.agent.drivers.checked import CheckedRobot
+from mapweave.agent.drivers.clock import now_ns
+from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
+from mapweave.agent.drivers.wheeled import WheeledRobot
+from mapweave.agent.observation import Command
+from mapweave.hybridmap.errors import DeviceError
+
+SETTINGS = RobotSettings(camera=CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3))
+IMAGE = np.zeros((48, 64), np.uint8)
+SPEED = Wheels(0.2, 0.3)
+
+
+class EvenBase:
+    """Wheels that have always driven evenly: their way is the time."""
+
+    geometry = Geometry(radius=0.1, axle=0.25, max_forward=0.3, max_turn=0.8)
+
+    def __init__(self) -> None:
+        self.failing = self.broken = False
+
+    def way(self, stamp_ns: int) -> Wheels:
+        seconds = (stamp_ns % 10**13) / 1e9
+        return Wheels(SPEED.left * seconds, SPEED.right * seconds)
+
+    def open(self) -> None:
+        if self.failing:
+            raise DeviceError("gone")
+
+    def close(self) -> None:
+        pass
+
+    def nearest(self, speeds: Wheels) -> Wheels:
+        return speeds
+
+    def drive(self, speeds: Wheels) -> None:
+        if self.broken:
+            raise ValueError("a mistake in the driver")
+
+    def read(self) -> BaseReading:
+        if self.failing:
+            raise DeviceError("gone")
+        return BaseReading(self.way(now_ns()))
+
+
+class LateCamera:
+    """Frames that come a while after they were taken."""
+
+    def __init__(self, delay: float) -> None:
+        self.delay = delay
+        self.silent = False
+
+    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+        end = time.monotonic() + patience
+        while time.monotonic() < end:
+            taken = now_ns() - round(self.delay * 1e9)
+            if taken > stamp_ns and not self.silent:
+                return Frame(taken, IMAGE)
+            time.sleep(0.005)
+        return None
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def base() -> EvenBase:
+    return EvenBase()
+
+
+@pytest.fixture
+def camera() -> LateCamera:
+    return LateCamera(0.13)
+
+
+@pytest.fixture
+def robot(base: EvenBase, camera: LateCamera) -> Iterator[CheckedRobot]:
+    robot = CheckedRobot(WheeledRobot(base, SETTINGS, camera))
+    for _ in range(3):
+        # Images from before the base has answered first: nothing is known of its way then.
+        robot.sense()
+    yield robot
+    robot.close()
+
+
+def test_odometry_is_that_of_the_time_between_the_images(robot: CheckedRobot) -> None:
+    first = robot.sense()
+    for _ in range(10):
+        assert first is not None
+        second = robot.sense()
+        assert second is not None
+        seconds = (second.stamp_ns - first.stamp_ns) / 1e9
+        assert second.odometry.forward == pytest.approx(0.25 * seconds, abs=5e-4)
+        assert second.odometry.turn == pytest.approx(0.1 / 0.25 * seconds, abs=4e-3)
+        first = second
+
+
+def test_ticks_without_image_and_images_after_them(robot: CheckedRobot, camera: LateCamera) -> None:
+    seen = [robot.sense() for _ in range(3)]
+    camera.silent = True
+    seen += [robot.sense() for _ in range(5)]
+    camera.silent = False
+    seen += [robot.sense() for _ in range(4)]
+    observations = [o for o in seen if o is not None]
+    assert len(observations) == 12
+    assert all(o.image is None for o in observations[3:8])
+    assert all(o.image is not None for o in observations[9:])
+    stamps = [o.stamp_ns for o in observations]
+    assert min(np.diff(stamps)) > 1e6
+    whole = 0.25 * (stamps[-1] - stamps[0]) / 1e9
+    assert sum(o.odometry.forward for o in observations[1:]) == pytest.approx(whole, abs=1e-3)
+
+
+def test_neither_image_nor_wheels(robot: CheckedRobot, base: EvenBase, camera: LateCamera) -> None:
+    robot.sense()
+    camera.silent = base.failing = True
+    begin = time.monotonic()
+    for _ in range(6):
+        seen = robot.sense()
+        assert seen is not None
+    assert time.monotonic() - begin < 1.6
+    assert seen is not None
+    assert seen.odometry.forward == 0.0
+    camera.silent = base.failing = False
+    time.sleep(0.5)
+    for _ in range(3):
+        seen = robot.sense()
+    assert seen is not None
+    assert seen.image is not None
+
+
+def test_a_driver_that_fails_is_not_driven_on(robot: CheckedRobot, base: EvenBase) -> None:
+    robot.sense()
+    base.broken = True
+    with pytest.raises(DeviceError, match="the driver of the base has failed: ValueError: a mistake"):
+        for _ in range(5):
+            robot.act(Command(0.1, 0.0))
+            robot.sense()
+
+
+def test_a_base_that_is_not_there_is_one_line(base: EvenBase, camera: LateCamera, monkeypatch) -> None:
+    monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 0.5)
+    base.failing = True
+    robot = WheeledRobot(base, SETTINGS, camera)
+    with pytest.raises(DeviceError, match=r"^gone$"):
+        robot.sense()
+    robot.close()
+
+
+def test_a_counter_that_wraps_or_is_set_back() -> None:
+    counter = WheelCounter(0.001, bits=16, fastest=1.0)
+    ways = [counter.update(count, 0.1 * k) for k, count in enumerate([65500, 65530, 24, 54, 10, 40, 65530])]
+    assert ways == pytest.approx([0.0, 0.030, 0.060, 0.090, 0.046, 0.076, 0.030])
+    restarted = WheelCounter(0.001, bits=32, fastest=1.0)
+    ways = [restarted.update(count, 0.1 * k) for k, count in enumerate([100_000, 100_050, 0, 50])]
+    assert ways == pytest.approx([0.0, 0.05, 0.05, 0.10])

@@ -1,0 +1,119 @@
+"""`mapweave agent` with a driver from a file; a router without server; a second agent is refused."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.waiting import eventually, free_port
+
+DRIVER = """
+import time
+import numpy as np
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave.hybridmap.camera import Camera
+
+class Still:
+    '''A robot that looks at noise and writes down what it is told to do.'''
+    def __init__(self, settings):
+        self.log = open(settings.options["log"], "a", buffering=1)
+        self.image = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+    def describe(self):
+        return RobotDescription(Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3))
+    def sense(self):
+        time.sleep(0.1)
+        return Observation({stamp}, Odometry(0.0, 0.0), self.image)
+    def act(self, command):
+        print(command, file=self.log)
+        return command
+    def close(self):
+        print("closed", file=self.log)
+"""
+
+
+class Started:
+    """A `mapweave` process; its output is in a file."""
+
+    def __init__(self, folder: Path, name: str, *arguments: object) -> None:
+        self.said = folder / f"{name}.txt"
+        with self.said.open("w") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "mapweave", *map(str, arguments)], stdout=output, stderr=output
+            )
+
+    def says(self, words: str) -> bool:
+        return words in self.said.read_text()
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(30)
+
+
+def settings(folder: Path, name: str) -> Path:
+    path = folder / f"{name}.toml"
+    path.write_text(f'[robot.options]\nlog = "{folder / name}.log"\n')
+    return path
+
+
+def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    driver = tmp_path / "still.py"
+    driver.write_text(DRIVER.replace("{stamp}", "time.time_ns()"))
+    router = Started(tmp_path, "router", "router", "--listen", endpoint)
+    started = [router]
+    try:
+        eventually(lambda: router.says(f"router listens at {endpoint}"))
+
+        def agent(name: str) -> Started:
+            started.append(
+                Started(
+                    tmp_path, name, "agent", "r0", "--robot", f"{driver}:Still", "--connect", endpoint,
+                    "--settings", settings(tmp_path, name), "--data", tmp_path / name,
+                )
+            )  # fmt: skip
+            return started[-1]
+
+        first = agent("first")
+        eventually(lambda: (tmp_path / "first.log").exists() and (tmp_path / "first.log").stat().st_size)
+        second = agent("second")
+        assert second.process.wait(40) == 1
+        assert second.said.read_text().splitlines()[-1] == (
+            "mapweave: another agent drives r0; stop it, or give this robot another name"
+        )
+        assert not (tmp_path / "second.log").exists()
+        assert not (tmp_path / "second").exists()
+        assert first.process.poll() is None
+        # The same name on the robot that takes over: an agent that was killed is not waited for long.
+        first.process.kill()
+        first.process.wait()
+        third = agent("third")
+        eventually(lambda: (tmp_path / "third.log").exists() and (tmp_path / "third.log").stat().st_size)
+        assert third.end() == 0
+        assert (tmp_path / "third.log").read_text().endswith("closed\n")
+        assert router.end() == 0
+    finally:
+        for one in started:
+            one.process.kill()
+            one.process.wait()
+
+
+@pytest.mark.parametrize(
+    ("stamp", "words"),
+    [("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7")],
+)
+def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: Path, nobody: str) -> None:
+    driver = tmp_path / "still.py"
+    driver.write_text(DRIVER.replace("{stamp}", stamp))
+    agent = Started(
+        tmp_path, "agent", "agent", "r0", "--robot", f"{driver}:Still", "--connect", nobody,
+        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data",
+    )  # fmt: skip
+    assert agent.process.wait(60) == 1
+    *_, last = agent.said.read_text().splitlines()
+    assert re.match(f"mapweave: driver: {words}", last), last
+    assert (tmp_path / "agent.log").read_text().endswith("closed\n")
