@@ -181,7 +181,7 @@ def _why_apart(
         return f"{head}: {reason_of(constraint)}"
     if refused:
         reasons = Counter(r.reason for r in refused)
-        told = [
+        reasons_in_words = [
             reason if count == len(refused) else f"{reason} ({count} of them)"
             for reason, count in reasons.most_common(2)
         ]
@@ -190,7 +190,7 @@ def _why_apart(
             if len(refused) == 1
             else (f"{len(refused)} links were found and all refused")
         )
-        return f"{head}: {many}: {'; '.join(told)}"
+        return f"{head}: {many}: {'; '.join(reasons_in_words)}"
     if unverified:
         best = f"; nearest are {nearest[0].a} and {nearest[0].b}: {nearest[0].lacks}" if nearest else ""
         many = "1 pair of nodes looks" if len(unverified) == 1 else f"{len(unverified)} pairs of nodes look"
@@ -202,16 +202,16 @@ def _strongest(refused: Sequence[RefusedLink]) -> tuple[NearMiss, ...]:
     """Refused links with the most landmarks behind them that are found nowhere else."""
     links = [(refusal.link, refusal.reason) for refusal in refused if refusal.link is not None]
     links.sort(key=lambda item: (-item[0].weight, item[0].pair))
-    return tuple(_near(link, reason) for link, reason in links[:MOST_NEAR])
+    return tuple(_near_miss(link, reason) for link, reason in links[:MOST_NEAR])
 
 
 def _weakest(merged: MergedMap, links: Sequence[Link]) -> tuple[NearMiss, ...]:
     """Accepted links with the fewest landmarks: the weakest of a merge."""
     few = sorted(links, key=lambda link: (link.weight, link.pair))[:MOST_NEAR]
-    return tuple(_near(link, reach_words(merged, link.edge())) for link in few)
+    return tuple(_near_miss(link, reach_words(merged, link.edge())) for link in few)
 
 
-def _near(link: Link, words: str) -> NearMiss:
+def _near_miss(link: Link, words: str) -> NearMiss:
     inliers = int(link.evidence.get("inliers", link.weight))
     if link.doubles:
         words = f"{link.doubles} of these are found at other places too; {words}"

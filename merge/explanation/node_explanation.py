@@ -13,7 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.explanation.own_edges import claims, consequences, own_edge, said
+from mapweave.merge.explanation.own_edges import claims, consequences, edge_in_words, own_edge
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import prior_odds, probability, standpoints
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
@@ -58,7 +58,7 @@ def explain_nodes(
     elif own is not None:
         geometry = link_of(own)
     explanation = replace(
-        _looked_at(first, second, geometry, verification),
+        _evidence(first, second, geometry, verification),
         claims=(*claims(merged, first.id, second.id, own), *consequences(merged, link, first.id, second.id)),
         rulings=merged.rulings.about(first.id, second.id),
     )
@@ -70,7 +70,7 @@ def explain_nodes(
     if geometry is None and explanation.a_from_b is not None:
         geometry = Link(first.id, second.id, explanation.a_from_b, explanation.shared, explanation.evidence)
     if geometry is not None and (own is None or own.kind in CLAIMS):
-        witnesses = _witnesses(merged, geometry, consistency)
+        witnesses = _other_links(merged, geometry, consistency)
     standing, reason = _verdict(merged, (first, second), link, own, refusal, witnesses, verification)
     explanation = replace(explanation, standing=standing, reason=reason, witnesses=witnesses)
     if geometry is None:
@@ -92,13 +92,13 @@ def _verdict(
     first, second = ends
     if link is not None:
         count = sum(w.agrees and w.kept for w in witnesses)
-        return Standing.LINKED, f"{_landmarks(link)}, {_others(count)}"
+        return Standing.LINKED, f"{_landmarks(link)}, {_other_links_in_words(count)}"
     constraint = merged.rulings.against(first.id, second.id)
     if constraint is not None and refusal is not None and refusal.link is not None:
         return Standing.UNDONE, reason_of(constraint)
     if own is not None:
         more = f"; the merge has compared them too: {refusal.reason}" if refusal else ""
-        return Standing.OWN, f"{said(own)}{more}"
+        return Standing.OWN, f"{edge_in_words(own)}{more}"
     if refusal is not None:
         return Standing.REFUSED, refusal.reason
     fresh = verify(first, second, verification)
@@ -135,7 +135,7 @@ def residuals_px(a: Node, b: Node, a_from_b: Pose2, shared: NDArray[np.int64]) -
     return out
 
 
-def _looked_at(
+def _evidence(
     a: Node, b: Node, link: Link | None, verification: RecognitionSettings | None
 ) -> PairExplanation:
     """The evidence of the landmarks. A link has its pose; else the nodes are compared again.
@@ -174,7 +174,7 @@ def _landmarks(link: Link) -> str:
     return f"{inliers} landmarks agree on one pose, {link.doubles} of them found at other places too"
 
 
-def _others(count: int) -> str:
+def _other_links_in_words(count: int) -> str:
     more = "1 more link" if count == 1 else f"{count} more links"
     return f"and {more} between the same pieces of map agree{'s' if count == 1 else ''}"
 
@@ -189,7 +189,9 @@ def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, f
     return misfit, probability(standpoint.log_factor, prior_odds(merged))
 
 
-def _witnesses(merged: MergedMap, link: Link, consistency: ConsistencySettings | None) -> tuple[Witness, ...]:
+def _other_links(
+    merged: MergedMap, link: Link, consistency: ConsistencySettings | None
+) -> tuple[Witness, ...]:
     """All other links that were found between the two pieces of map, as the merge compares them."""
     s = consistency or ConsistencySettings()
     maps = {map_id: merged.maps[map_id] for map_id in {link.a.map, link.b.map}}

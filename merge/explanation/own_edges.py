@@ -13,7 +13,7 @@ from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
-SAID = {
+WORDS = {
     EdgeKind.MAPPED: "drove from one to the other while it mapped",
     EdgeKind.TURNED: "turned on the spot from one to the other",
     EdgeKind.DRIVEN: "has driven from one to the other",
@@ -22,9 +22,9 @@ SAID = {
 }
 
 
-def said(edge: Edge) -> str:
+def edge_in_words(edge: Edge) -> str:
     """For example `r0 turned on the spot from one to the other (edge r0.1.5)`."""
-    return f"{edge.id.agent} {SAID[edge.kind]} (edge {edge.id})"
+    return f"{edge.id.agent} {WORDS[edge.kind]} (edge {edge.id})"
 
 
 def own_edge(merged: MergedMap, a: NodeId, b: NodeId) -> Edge | None:
@@ -63,7 +63,7 @@ def claims(merged: MergedMap, a: NodeId, b: NodeId, named: Edge | None = None) -
         for edge in hybrid_map.edges.values():
             if {edge.a, edge.b} != {a, b}:
                 continue
-            words = [] if named is not None and edge.id == named.id else [said(edge)]
+            words = [] if named is not None and edge.id == named.id else [edge_in_words(edge)]
             if edge.id in refused:
                 words.append(f"refused: {refused[edge.id]}")
             elif edge.kind in CLAIMS:

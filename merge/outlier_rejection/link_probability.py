@@ -86,8 +86,8 @@ def link_probabilities(merged: MergedMap) -> dict[tuple[NodeId, NodeId], float]:
         inside = [link for link in merged.links if link.a in graph.rows]
         for k in range(0, len(inside), AT_ONCE):
             some = inside[k : k + AT_ONCE]
-            for link, found in zip(some, standpoints(some, graph, kept=True), strict=True):
-                out[link.pair] = probability(found.log_factor, odds)
+            for link, standpoint in zip(some, standpoints(some, graph, kept=True), strict=True):
+                out[link.pair] = probability(standpoint.log_factor, odds)
     return out
 
 
@@ -130,8 +130,8 @@ def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> St
     spread = own + rest + FLOOR
     # In the plane anywhere on the floor that is mapped, in heading anyhow.
     anywhere = -math.log(area * 2.0 * math.pi)
-    there = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
-    if there <= anywhere:
+    log_density = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
+    if log_density <= anywhere:
         return Standpoint(merged, off, strain2, True, 0.0)
-    factor = there - 0.5 * float(moved @ np.linalg.solve(spread, moved)) - anywhere
+    factor = log_density - 0.5 * float(moved @ np.linalg.solve(spread, moved)) - anywhere
     return Standpoint(merged, off, strain2, False, factor)

@@ -42,20 +42,24 @@ def readmitted(
         return out
     for graph in solver.solve(kept):
         inside = [link for link in refused if link.a in graph.rows and link.b in graph.rows]
-        here = [link for link in kept if link.a in graph.rows] if inside else []
-        if not inside or len(inside) > FEW * (len(here) + len(inside)):
+        accepted = [link for link in kept if link.a in graph.rows] if inside else []
+        if not inside or len(inside) > FEW * (len(accepted) + len(inside)):
             continue
-        log_odds = math.log((len(here) + 0.5) / (len(inside) + 0.5))
-        known = zip(inside, misfits(inside, graph, s), standpoints(inside, graph, kept=False), strict=True)
+        log_odds = math.log((len(accepted) + 0.5) / (len(inside) + 0.5))
+        rated = zip(inside, misfits(inside, graph, s), standpoints(inside, graph, kept=False), strict=True)
         tried = sorted(
-            ((link, far, found) for link, far, found in known if far < NEAR * s.gate and not found.alone),
+            (
+                (link, misfit, standpoint)
+                for link, misfit, standpoint in rated
+                if misfit < NEAR * s.gate and not standpoint.alone
+            ),
             key=lambda item: item[0].key,
         )
-        cost = _cost(solver, here) if tried else 0.0
-        for link, far, found in tried:
-            now = _cost(solver, [*here, link])
-            if log_odds + found.log_factor + 0.5 * (far - (now - cost)) > LEAST_EVIDENCE:
-                here, cost = [*here, link], now
+        cost = _cost(solver, accepted) if tried else 0.0
+        for link, misfit, standpoint in tried:
+            now = _cost(solver, [*accepted, link])
+            if log_odds + standpoint.log_factor + 0.5 * (misfit - (now - cost)) > LEAST_EVIDENCE:
+                accepted, cost = [*accepted, link], now
                 out.append(link)
     return out
 

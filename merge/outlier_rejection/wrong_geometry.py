@@ -133,39 +133,41 @@ class WrongGeometrySearch:
                 self._tie(pair, maps, links(pair))
         changed = [set(pair) for pair in stale]
         self._checked = {
-            (one, others): found
-            for (one, others), found in self._checked.items()
-            if not any(pair <= {one, *others} for pair in changed)
+            (map_id, partners): checked
+            for (map_id, partners), checked in self._checked.items()
+            if not any(pair <= {map_id, *partners} for pair in changed)
         }
         ties: dict[MapId, dict[MapId, _Tie]] = {}
         for pair, tie in self._ties.items():
             if not set(pair) & set(left_out):
-                for one, other in (pair, pair[::-1]):
-                    ties.setdefault(one, {})[other] = tie
-        doubts = {one: sum(not tie.agrees for tie in others.values()) for one, others in ties.items()}
+                for map_id, partner in (pair, pair[::-1]):
+                    ties.setdefault(map_id, {})[partner] = tie
+        doubts = {
+            map_id: sum(not tie.agrees for tie in partners.values()) for map_id, partners in ties.items()
+        }
         out: dict[MapId, WrongGeometry] = {}
-        for one in sorted(doubts, key=lambda one: (-doubts[one], one)):
-            if doubts[one] < 2:
+        for map_id in sorted(doubts, key=lambda map_id: (-doubts[map_id], map_id)):
+            if doubts[map_id] < 2:
                 break
-            agreeing = self._agreeing({k: v for k, v in ties[one].items() if k not in out}, ties)
+            agreeing = self._agreeing({k: v for k, v in ties[map_id].items() if k not in out}, ties)
             if len(agreeing) < 2:
                 continue
-            if (one, agreeing) not in self._checked:
-                self._checked[one, agreeing] = False
+            if (map_id, agreeing) not in self._checked:
+                self._checked[map_id, agreeing] = False
                 with suppress(*UNSOLVABLE):
-                    self._checked[one, agreeing] = self._is_wrong(one, agreeing, maps)
-            if self._checked[one, agreeing]:
-                out[one] = WrongGeometry(one, agreeing)
+                    self._checked[map_id, agreeing] = self._is_wrong(map_id, agreeing, maps)
+            if self._checked[map_id, agreeing]:
+                out[map_id] = WrongGeometry(map_id, agreeing)
         return out
 
-    def _main(self, map_id: MapId, one: HybridMap) -> Fragment | None:
+    def _main(self, map_id: MapId, hybrid_map: HybridMap) -> Fragment | None:
         """The largest piece of a map."""
-        pieces = self._memory.fragments({map_id: one}, self._s)
+        pieces = self._memory.fragments({map_id: hybrid_map}, self._s)
         return max(pieces, key=len, default=None)
 
     def _tie(self, pair: MapPair, maps: Mapping[MapId, HybridMap], links: Sequence[Link]) -> None:
         """Sort the links between two maps."""
-        first, second = (self._main(one, maps[one]) if one in maps else None for one in pair)
+        first, second = (self._main(map_id, maps[map_id]) if map_id in maps else None for map_id in pair)
         if first is None or second is None or first is second:
             return
         inside = [link for link in links if link.a in first.graph.rows and link.b in second.graph.rows]
@@ -185,21 +187,21 @@ class WrongGeometrySearch:
         parts = [part for part in nx.connected_components(graph) if sum(not own[k].agrees for k in part) >= 2]
         return tuple(sorted(max(parts, key=len, default=())))
 
-    def _is_wrong(self, one: MapId, agreeing: Sequence[MapId], maps: Mapping[MapId, HybridMap]) -> bool:
+    def _is_wrong(self, map_id: MapId, agreeing: Sequence[MapId], maps: Mapping[MapId, HybridMap]) -> bool:
         """Whether every placement of a map among maps that agree is refuted."""
-        placed = self._main(one, maps[one])
-        pieces = [piece for other in agreeing if (piece := self._main(other, maps[other])) is not None]
+        placed = self._main(map_id, maps[map_id])
+        pieces = [piece for partner in agreeing if (piece := self._main(partner, maps[partner])) is not None]
         assert placed is not None, "a map with links has nodes"
         pairs = [(a, b) for a in agreeing for b in agreeing if a < b and (a, b) in self._ties]
         held = [link for pair in pairs if self._ties[pair].agrees for link in self._ties[pair].best]
         graph = ComponentSolver(pieces).solve(held)[0]
         across = [
-            link if link.a.map == one else link.turned()
-            for other in agreeing
-            for link in thinned(self._ties[min(one, other), max(one, other)].links)
+            link if link.a.map == map_id else link.turned()
+            for partner in agreeing
+            for link in thinned(self._ties[min(map_id, partner), max(map_id, partner)].links)
         ]
         across = [link for link in across if link.b in graph.rows]
-        every = {k: node for which in (one, *agreeing) for k, node in maps[which].nodes.items()}
+        every = {k: node for which in (map_id, *agreeing) for k, node in maps[which].nodes.items()}
         return all_refuted(across, placed, Fragment(graph.anchor, graph, ()), every, self._s)
 
 
@@ -254,15 +256,22 @@ def all_refuted(
     if not _nodes_agree(links, fixed):
         return False
     sets = link_sets(links, placed, fixed, s)
-    sets = [one for one in sets if len(one) >= LEAST_SHARE * len(sets[0])]
+    sets = [some_links for some_links in sets if len(some_links) >= LEAST_SHARE * len(sets[0])]
     own: dict[NodeId, list[Link]] = {}
     for link in links:
         own.setdefault(link.a, []).append(link)
     # By its own links each node is at its true place, regardless of the map's geometry.
-    usual = np.concatenate([_looked_through(some, [one], placed, fixed, nodes) for one, some in own.items()])
+    usual = np.concatenate(
+        [_seen_through_shares(some, [some_links], placed, fixed, nodes) for some_links, some in own.items()]
+    )
     return all(
-        _more(_looked_through(one, sorted(own.keys() - {k.a for k in one}), placed, fixed, nodes), usual)
-        for one in sets
+        _more(
+            _seen_through_shares(
+                some_links, sorted(own.keys() - {k.a for k in some_links}), placed, fixed, nodes
+            ),
+            usual,
+        )
+        for some_links in sets
     )
 
 
@@ -276,9 +285,10 @@ def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:
     for link in sorted(links, key=lambda link: -link.weight):
         places.setdefault(link.a, []).append(fixed.graph.pose(link.b) @ link.a_from_b.mean.inverse())
     agree = [
-        best.distance(other) < SAME_XY and abs(wrap_angle(best.heading - other.heading)) < SAME_HEADING
-        for best, *others in places.values()
-        for other in others
+        best.distance(placement) < SAME_XY
+        and abs(wrap_angle(best.heading - placement.heading)) < SAME_HEADING
+        for best, *rest in places.values()
+        for placement in rest
     ]
     return len(agree) >= LEAST_NODES and sum(agree) >= AGREEING * len(agree)
 
@@ -291,8 +301,8 @@ def _more(shares: Array, usual: Array) -> bool:
     return bool(bdtrc(many - 1, len(shares), RARE) < REFUTED)
 
 
-def _looked_through(
-    story: Sequence[Link],
+def _seen_through_shares(
+    links: Sequence[Link],
     which: Sequence[NodeId],
     placed: Fragment,
     fixed: Fragment,
@@ -301,16 +311,16 @@ def _looked_through(
     """Of each node that can be placed: the share of its comparable landmarks that are seen through.
 
     Args:
-        story: links from `placed` to `fixed` that place it.
+        links: links from `placed` to `fixed` that place it.
         which: nodes of `placed`.
         placed: piece of map.
         fixed: piece of map.
         nodes: of both.
     """
-    starts, ends = [link.a for link in story], [link.b for link in story]
+    starts, ends = [link.a for link in links], [link.b for link in links]
     measured = PoseGaussians(
-        np.stack([link.a_from_b.mean.vector for link in story]),
-        np.stack([link.a_from_b.covariance for link in story]),
+        np.stack([link.a_from_b.mean.vector for link in links]),
+        np.stack([link.a_from_b.covariance for link in links]),
     ).inverse()
     means, out = fixed.graph.means, []
     for node_id in which:
@@ -326,16 +336,16 @@ def _looked_through(
         counts = np.zeros(2, np.int64)
         for k in np.argsort(away, kind="stable")[:MOST_NEAR]:
             if away[k] < REACH:
-                one, other = nodes[node_id], nodes[fixed.nodes[k]]
-                other_from_one = Pose2.from_vector(means[k]).inverse() @ at
-                counts += looked_through(one, other, other_from_one, sigma_xy, sigma_heading)
-                counts += looked_through(other, one, other_from_one.inverse(), sigma_xy, sigma_heading)
+                a, b = nodes[node_id], nodes[fixed.nodes[k]]
+                b_from_a = Pose2.from_vector(means[k]).inverse() @ at
+                counts += seen_through(a, b, b_from_a, sigma_xy, sigma_heading)
+                counts += seen_through(b, a, b_from_a.inverse(), sigma_xy, sigma_heading)
         if counts[0] >= LEAST_LANDMARKS:
             out.append(counts[1] / counts[0])
     return np.array(out)
 
 
-def looked_through(
+def seen_through(
     node: Node, view: Node, view_from_node: Pose2, sigma_xy: float, sigma_heading: float
 ) -> tuple[int, int]:
     """How many of a node's landmarks a view can confirm or refute, and how many it refutes.
@@ -351,17 +361,17 @@ def looked_through(
         sigma_xy: standard deviation of that, m,
         sigma_heading: and rad.
     """
-    marks, known = (n.landmarks.take(n.landmarks.has_depth) for n in (node, view))
+    marks, with_depth = (n.landmarks.take(n.landmarks.has_depth) for n in (node, view))
     points = view_from_node.apply(marks.points_in_robot(node.camera))
     pixels = view.camera.project(points)
     inside = view.camera.contains(pixels)
-    if not inside.any() or not len(known):
+    if not inside.any() or not len(with_depth):
         return 0, 0
     depths, pixels = points[inside, 0] - view.camera.mount_forward, pixels[inside]
     own = marks.depth_sigmas[inside].astype(np.float64) ** 2 + sigma_xy**2 + (sigma_heading * depths) ** 2
-    sigmas = np.sqrt(own[:, None] + known.depth_sigmas.astype(np.float64)[None] ** 2)
-    further = known.depths.astype(np.float64)[None] - depths[:, None]
-    off = np.linalg.norm(pixels[:, None] - known.pixels[None], axis=2) / view.camera.fx
+    sigmas = np.sqrt(own[:, None] + with_depth.depth_sigmas.astype(np.float64)[None] ** 2)
+    further = with_depth.depths.astype(np.float64)[None] - depths[:, None]
+    off = np.linalg.norm(pixels[:, None] - with_depth.pixels[None], axis=2) / view.camera.fx
     same_direction = off < AROUND + 2.0 * sigma_heading
     behind = (same_direction & (further > SIGMAS * sigmas + MARGIN)).any(axis=1)
     about = (same_direction & (np.abs(further) <= SIGMAS * sigmas + MARGIN)).any(axis=1)

@@ -72,7 +72,7 @@ class Factors:
     def of(measurements: Sequence[Measurement], a: Sequence[int], b: Sequence[int]) -> Factors:
         """Of measurements between rows."""
         covariances = np.array([m.a_from_b.covariance for m in measurements]).reshape(-1, 3, 3)
-        means = [(m.x, m.y, m.heading) for m in (one.a_from_b.mean for one in measurements)]
+        means = [(m.x, m.y, m.heading) for m in (measurement.a_from_b.mean for measurement in measurements)]
         return Factors(
             np.array(a, np.int64),
             np.array(b, np.int64),
@@ -121,15 +121,15 @@ class Factors:
             least: how many are enough.
             nodes: how many rows there are.
         """
-        found = np.zeros(nodes, np.bool_)
+        reached = np.zeros(nodes, np.bool_)
         ring = np.unique(rows)
         out = [ring]
-        found[ring] = True
+        reached[ring] = True
         while len(ring) and sum(map(len, out)) < least:
             index = self.at(ring)
             ends = np.unique(np.concatenate([self.a[index], self.b[index]]))
-            ring = ends[~found[ends]]
-            found[ring] = True
+            ring = ends[~reached[ends]]
+            reached[ring] = True
             out.append(ring)
         return np.concatenate(out)
 

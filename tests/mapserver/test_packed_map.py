@@ -80,7 +80,7 @@ def test_everything_else_is_answered_while_the_map_is_packed(served: Served) -> 
 def test_the_same_map_is_packed_once(served: Served) -> None:
     first = served.ask(MAP).payload
     assert served.ask(MAP).payload == first and served.packs == 1
-    served.server._chronicle.failed("something")
+    served.server._history.failed("something")
     told = unpack_map_file(served.ask(MAP).payload).history
     assert served.packs == 2 and "something" in told[-1].words
 

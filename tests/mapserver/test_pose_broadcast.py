@@ -48,7 +48,7 @@ def no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Told:
-    """A herald, and what it publishes."""
+    """A pose broadcast, and what it publishes."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.heard: list[PoseNews] = []

@@ -28,7 +28,7 @@ ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(0.0, ma
 
 
 def live(walls, settings: ExplorerSettings, ticks: int, told: dict[int, Answer], seed: int = 0) -> list[Step]:
-    """Let a pipeline explore a wide room with pictures ahead, with what it is told at some ticks."""
+    """Let a pipeline explore a wide room with pictures ahead, with given answers at some ticks."""
     pipeline = Pipeline(MAP, BODY, AgentSettings(exploration=settings, seed=seed))
     pipeline.set_mission(Explore())
     pose, moved, steps = Pose2(), Odometry(0.0, 0.0), []

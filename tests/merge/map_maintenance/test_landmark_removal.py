@@ -57,7 +57,7 @@ def test_presence_is_that_of_all_stories_together(story: tuple[bool | None, ...]
                 stays = 1 - removal.GOES if before else 1 - removal.COMES
                 weight *= stays if now == before else 1 - stays
                 weight *= removal.HIDDEN if veil else 1 - removal.HIDDEN
-                # Who finds by mistake what is gone finds it whatever stands there.
+                # A false detection does not depend on what is there.
                 likely = (0.0 if veil else rate) if now else removal.MISTAKEN
                 weight *= likely if seen else 1 - likely
             weights[states[-1]] += weight
@@ -165,7 +165,7 @@ def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.Monkey
 def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The wall behind has stayed, and tells where the robot stands; half of what is there is found."""
+    """The wall behind has stayed, and localizes the robot; half of what is there is found."""
     rng = np.random.default_rng(3)
     world = room(0, 0, 6, 4, 1200, rng)
     wall = np.flatnonzero(world.normals[:, 0] < -0.5)

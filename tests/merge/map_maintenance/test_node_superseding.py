@@ -205,10 +205,10 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
 def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where ways do not matter: each node has a living one that covers it, and none can be spared."""
+    """Where ways do not matter: each node has an active one that covers it, and none can be removed."""
     rng = np.random.default_rng(seed)
     world = room(0, 0, 6, 4, 1200, rng)
-    # Whoever stands in one place gets there: all the room is one.
+    # Nodes at one place reach each other: the whole room is one.
     monkeypatch.setattr(rules, "NEAR", 100.0)
     monkeypatch.setattr(rules, "DETOUR", 1000.0)
     merger = Merger()

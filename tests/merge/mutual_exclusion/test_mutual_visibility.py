@@ -159,7 +159,7 @@ def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
     # The 26 ways of a shell are even: their mean square is a third of that of each component.
     assert np.array_equal(errors.shifts[0], np.zeros((16, 2))) and len(errors.shifts) == 1 + 3 * 26
     full = errors.shifts[-26:] / rules.SIGMAS[-1]
-    # All ways together are about as wide as what they stand for.
+    # All modes together are about as wide as the covariance.
     wide = np.einsum("s,smi,smj->mij", errors.weights, errors.shifts, errors.shifts)
     assert errors.weights.sum() == pytest.approx(1.0)
     assert np.trace(wide, axis1=1, axis2=2) == pytest.approx(
