@@ -16,7 +16,7 @@ from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.map_history import BODIES, MOST_AT_ONCE, MapHistory
+from mapweave.mapserver.map_history import EXCLUSION_WORDS, MOST_AT_ONCE, MapHistory
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.ruling_history import with_rulings
 from mapweave.merge.mutual_exclusion.collision import Collision
@@ -117,7 +117,7 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
 ) -> None:
     clash = Collision("a", "b", "hall", 40, 0.1, 12.0, 99.0)
     seen = replace(clash, where="ahead")
-    assert all(any(words in one.reason for words in BODIES) for one in (clash, seen))
+    assert all(any(words in one.reason for words in EXCLUSION_WORDS) for one in (clash, seen))
     links = [link for link in one.links if {link.a.map, link.b.map} == {A, B}]
     held = replace(two, refused=tuple(refuse(link, clash.reason) for link in links))
     chronicle = MapHistory(store)
