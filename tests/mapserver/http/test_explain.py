@@ -130,13 +130,13 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(
         page.type("#a", str(start))
         page.type("#b", str(goal))
         page.run("document.querySelector('[name=route]').click()")
-        eventually(lambda: f"{start} to {goal}: the way leads so: {told.reason}" in page.run(TOLD))
+        eventually(lambda: f"{start} to {goal}: the route is: {told.reason}" in page.run(TOLD))
         assert page.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in told.hops]
         address = page.run("return location.href")
         assert address.endswith(f"/why?a={start}&b={goal}&route=1")
         page.open(f"http://127.0.0.1:{served.port}/why")
         page.open(address)
-        eventually(lambda: f"{start} to {goal}: the way leads so" in page.run(TOLD))
+        eventually(lambda: f"{start} to {goal}: the route is" in page.run(TOLD))
         page.run("document.querySelector('#told a').click()")
         eventually(lambda: f"{told.hops[0].a} and {told.hops[0].b}: " in page.run(TOLD))
 
