@@ -76,15 +76,20 @@ class OccupancyGrid:
         ends = proximity + radius
         along = self._steps[None, :] < (ends - 0.5 * s.cell)[:, None]
         points = origin + directions[:, None, :] * self._steps[None, :, None]
-        free = np.unique(self.cells(points[along]), axis=0)
         hits = proximity < self._description.ranger_reach - 0.05
-        ended = np.unique(self.cells(origin + directions[hits] * ends[hits, None]), axis=0)
-        self._odds[free[:, 0], free[:, 1]] -= MISS
-        self._odds[ended[:, 0], ended[:, 1]] += HIT + MISS
+        # A cell counts once, however many beams meet it.
+        ended = origin + directions[hits] * ends[hits, None]
+        self._odds.flat[self._numbers(points[along])] -= MISS
+        self._odds.flat[self._numbers(ended)] += HIT + MISS
         # The robot's own footprint is free.
         own = self.cells(origin + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
         self._odds[own[:, 0], own[:, 1]] = -MOST
         np.clip(self._odds, -MOST, MOST, out=self._odds)
+
+    def _numbers(self, points: Array) -> NDArray[np.int64]:
+        """Numbers of the cells, row by row, in which (N, 2) m in map lie, each once."""
+        cells = self.cells(points)
+        return np.unique(cells[:, 0] * self._odds.shape[1] + cells[:, 1])
 
     def room(self) -> Array:
         """For each cell the distance to the nearest thing seen, m."""

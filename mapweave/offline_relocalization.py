@@ -10,7 +10,7 @@ from mapweave.hybridmap.query import View
 from mapweave.mapserver.active_nodes import ActiveNodes
 from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
-from mapweave.mapserver.retrieval.place_index import PlaceIndex
+from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.storage.map_file import MapFile
 from mapweave.vision.lens import Distortion, Lens
 from mapweave.vision.sift import Sift
@@ -27,9 +27,9 @@ def relocalizer_of(content: MapFile) -> Relocalizer:
     """
     merged = merged_of(content)
     nodes = {node.id: node for one in merged.maps.values() for node in one.nodes.values()}
-    index = PlaceIndex()
-    index.extend(list(nodes.values()))
-    active = ActiveNodes(index, nodes.get, merged)
+    places = PlaceDatabase()
+    places.put(nodes.values())
+    active = ActiveNodes(places, nodes.get, merged)
     return Relocalizer(active, active.node, merged)
 
 

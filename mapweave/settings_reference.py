@@ -16,7 +16,7 @@ import msgspec
 from mapweave.settings import Settings
 
 ROLES = (
-    ("a robot: `mapweave agent`, `replay`", "`[network]`, `[agent]`"),
+    ("a robot: `mapweave agent`, `replay`", "`[network]`, `[robot]`, `[agent]`"),
     ("the server: `mapweave server`", "`[network]`, `[admission_control]`, `[merge]`"),
     ("people who ask a server: `mapweave relocalize`, `map`", "`[network]`"),
     ("people with map files: `mapweave map`", "`[merge]`"),
@@ -31,7 +31,8 @@ Made by `mapweave settings --markdown`; a test fails if it is not current.
 
 A settings file is TOML and is given to a command as `--settings FILE`. It holds only what differs from the
 defaults. A name that does not exist, or a value of the wrong kind or out of range, ends the command with one
-line that says where. `mapweave settings` prints a whole file with all defaults to start from.
+line that says where. `mapweave settings` prints a whole file with all defaults to start from. What has no
+default stands there behind a `#`.
 """
 
 BOUNDS = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
@@ -44,7 +45,7 @@ class Setting:
 
     Attributes:
         name: in its section.
-        default: as TOML.
+        default: as TOML; empty if there is none.
         text: what it is, with its unit.
         bounds: which values it may have; empty for all of its kind.
     """
@@ -63,38 +64,42 @@ class Section:
         name: as it stands in brackets.
         text: what it is about.
         settings: its lines.
+        optional: whether a file without the table is complete, though a line of the table has no default.
     """
 
     name: str
     text: str
     settings: tuple[Setting, ...]
+    optional: bool
 
 
-def sections(cls: type = Settings, name: str = "") -> Iterator[Section]:
+def sections(cls: type = Settings, name: str = "", optional: bool = False) -> Iterator[Section]:
     """All tables of a settings file that have lines of their own, the outer ones first."""
-    hints, default = typing.get_type_hints(cls, include_extras=True), cls()
+    hints = typing.get_type_hints(cls, include_extras=True)
     summary, texts = _documented(cls)
     lines, inner = [], []
     for one in dataclasses.fields(cls):
-        value = getattr(default, one.name)
-        if dataclasses.is_dataclass(value):
-            inner.append((type(value), f"{name}.{one.name}" if name else one.name))
+        hint, default = hints[one.name], _default(one)
+        kind = next((k for k in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(k)), None)
+        if isinstance(kind, type):
+            inner.append((kind, f"{name}.{one.name}" if name else one.name, default is None))
         else:
-            lines.append(Setting(one.name, _toml(value), texts[one.name], _bounds(hints[one.name])))
+            lines.append(Setting(one.name, _toml(default), texts[one.name], _bounds(hint)))
     if lines:
-        yield Section(name, summary, tuple(lines))
-    for kind, path in inner:
-        yield from sections(kind, path)
+        yield Section(name, summary, tuple(lines), optional)
+    for kind, path, absent in inner:
+        yield from sections(kind, path, absent)
 
 
 def as_toml() -> str:
     """A settings file that says what holds without one."""
     out = []
     for section in sections():
-        out.append(f"# {section.text}\n[{section.name}]")
+        out.append(f"# {section.text}\n{'#' if section.optional else ''}[{section.name}]")
         for one in section.settings:
             more = f" {one.bounds[:1].upper()}{one.bounds[1:]}." if one.bounds else ""
-            out += [_wrapped(f"{one.text}{more}"), f"{one.name} = {one.default}"]
+            off = "#" if section.optional or not one.default else ""
+            out += [_wrapped(f"{one.text}{more}"), f"{off}{one.name} = {one.default}".rstrip()]
         out.append("")
     return "\n".join(out).rstrip() + "\n"
 
@@ -111,7 +116,7 @@ def as_markdown() -> str:
             "| name | default | range | meaning |\n|---|---|---|---|",
         ]
         for one in section.settings:
-            cells = (f"`{one.name}`", f"`{one.default}`", one.bounds, one.text)
+            cells = (f"`{one.name}`", f"`{one.default}`" if one.default else "", one.bounds, one.text)
             out.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return "\n".join(out) + "\n"
 
@@ -140,9 +145,14 @@ def _bounds(hint: Any) -> str:
     return ", ".join(words)
 
 
+def _default(one: dataclasses.Field[Any]) -> Any:
+    """What a field holds without a file; `MISSING` if the file must give it."""
+    return one.default if one.default_factory is dataclasses.MISSING else one.default_factory()
+
+
 def _toml(value: Any) -> str:
-    """A plain value as TOML, whose texts, lists and flags are written as in JSON."""
-    return json.dumps(value)
+    """A plain value as TOML, whose texts, lists and flags are written as in JSON; empty if there is none."""
+    return "" if value is None or value is dataclasses.MISSING else json.dumps(value)
 
 
 def _wrapped(text: str) -> str:

@@ -2,21 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.recordings.mcap_writer import McapWriter
+from mapweave.agent.recordings.mcap_writer import McapWriter, check_new
 
 
 class RecordedRobot:
     """The Robot protocol around another robot."""
 
-    def __init__(self, robot: Robot, writer: McapWriter) -> None:
-        """Both become this one's to close."""
-        self._robot, self._writer, self._applied = robot, writer, Command()
+    def __init__(
+        self,
+        robot: Robot,
+        folder: Path,
+        lossless: bool = False,
+        print_line: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """Check where the recording goes. It begins when the robot has been described.
+
+        Args:
+            robot: becomes this one's to close.
+            folder: new or empty.
+            lossless: images as PNG instead of JPEG.
+            print_line: takes lines for people.
+
+        Raises:
+            DeviceError: the folder cannot be made, or holds something.
+        """
+        check_new(folder)
+        self._robot, self._folder, self._lossless, self._print = robot, folder, lossless, print_line
+        self._writer: McapWriter | None = None
+        self._applied = Command()
+
+    @property
+    def written(self) -> int:
+        """Observations that are on the disk."""
+        return 0 if self._writer is None else self._writer.written
 
     def describe(self) -> RobotDescription:
-        """The other robot's."""
-        return self._robot.describe()
+        """Description of the other robot."""
+        description = self._robot.describe()
+        if self._writer is None:
+            self._writer = McapWriter(self._folder, description, self._lossless, self._print)
+        return description
 
     def sense(self) -> Observation | None:
         """The other robot's next observation; see Robot.
@@ -25,7 +55,7 @@ class RecordedRobot:
             DeviceError: the robot cannot be read.
         """
         observation = self._robot.sense()
-        if observation is not None:
+        if observation is not None and self._writer is not None:
             self._writer.write(observation, self._applied)
         return observation
 
@@ -39,4 +69,5 @@ class RecordedRobot:
         try:
             self._robot.close()
         finally:
-            self._writer.close()
+            if self._writer is not None:
+                self._writer.close()

@@ -20,14 +20,14 @@ class CameraSettings:
     """Source of the images and calibration of the camera. Names as in the `camera.toml` of recordings.
 
     Attributes:
-        width: px.
-        height: px.
-        fx: focal length, px.
-        fy: focal length, px.
-        cx: principal point, px.
-        cy: principal point, px.
-        height_m: of the optical centre above the floor.
-        forward_m: how far the optical centre stands ahead of the axle.
+        width: width of the image, px.
+        height: height of the image, px.
+        fx: horizontal focal length, px.
+        fy: vertical focal length, px.
+        cx: column of the principal point, px.
+        cy: row of the principal point, px.
+        height_m: height of the optical centre above the floor, m.
+        forward_m: how far the optical centre stands ahead of the axle, m.
         distortion: (k1, k2, p1, p2, k3) of the lens, OpenCV's order.
         source: number or path of a video device, a video file, or the URL of an RTSP or HTTP stream.
         delay: time from the middle of the exposure until the frame is here, s; subtracted from the stamps.
@@ -60,12 +60,12 @@ class Geometry:
     """Dimensions and limits of a robot. The settings file overrides the driver's values; None is not given.
 
     Attributes:
-        radius: of the footprint, m.
+        radius: radius of the footprint, m.
         axle: distance between the wheels, m.
         wheel_noise: standard deviation of a wheel's way, as a share of the way.
         max_forward: speed limit, m/s.
         max_turn: rate limit, rad/s.
-        ranger_bearings_deg: directions of the proximity sensors, 0 ahead, positive to the left.
+        ranger_bearings_deg: directions of the proximity sensors, 0 ahead, positive to the left, degrees.
         ranger_reach: the proximity sensors' maximum, m.
     """
 

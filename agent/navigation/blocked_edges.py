@@ -12,7 +12,7 @@ class BlockedEdges:
     """Blocked pairs, in the order of their last block."""
 
     def __init__(self, settings: NavigatorSettings | None = None) -> None:
-        """Nothing is in the way."""
+        """Start without blocks."""
         self._settings = settings or NavigatorSettings()
         self._until: dict[Pair, float] = {}
         self._times: dict[Pair, int] = {}

@@ -33,7 +33,7 @@ class LocalPlanner:
     """
 
     def __init__(self, description: RobotDescription, settings: NavigatorSettings | None = None) -> None:
-        """Know nothing of the floor yet."""
+        """Start with an unknown grid."""
         self._settings = settings or NavigatorSettings()
         self._description = description
         self._floor = OccupancyGrid(description, AROUND)

@@ -25,6 +25,20 @@ BASE, OPTICAL, ODOM = "base_footprint", "camera_optical_frame", "odom"
 """Frames of REP 105 and REP 103."""
 
 
+def check_new(folder: Path) -> None:
+    """Make the folder of a recording, unless it is there and empty.
+
+    Raises:
+        DeviceError: it cannot be made, or holds something.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise DeviceError(f"{folder}: not empty; a recording overwrites nothing, give another folder")
+    except OSError as error:
+        raise DeviceError(f"{folder}: {error.strerror}") from None
+
+
 class McapWriter:
     """Writes what a robot senses and what it is told to do, in a thread of its own.
 
@@ -49,12 +63,7 @@ class McapWriter:
         Raises:
             DeviceError: the folder cannot be made, or holds something.
         """
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()):
-                raise DeviceError(f"{folder}: not empty; a recording overwrites nothing, give another folder")
-        except OSError as error:
-            raise DeviceError(f"{folder}: {error.strerror}") from None
+        check_new(folder)
         self._folder, self._description, self._lossless, self._say = folder, description, lossless, say
         self._waiting: queue.Queue[tuple[Observation, Command, Pose2] | None] = queue.Queue(WAITING)
         self._part: _Part | None = None
@@ -76,6 +85,8 @@ class McapWriter:
 
     def close(self) -> None:
         """Write what waits and finish the file."""
+        if not self._thread.is_alive():
+            return
         self._waiting.put(None)
         self._thread.join()
         if self.dropped:

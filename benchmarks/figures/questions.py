@@ -165,28 +165,21 @@ LOST = Question(
     "Are lost robots answered rightly?",
     (
         Row(
-            "a view up to 0.3 m and 10 degrees off a node, among 1 000 and 100 000 places: right within "
-            "0.25 m and 5 degrees",
-            "{sizes/1000/recall_at_1:.0%}, {sizes/100000/recall_at_1:.0%}",
-            "relocalize",
+            "a view up to 0.3 m and 10 degrees off a node, among 1 000 places: right in 0.25 m, 5 degrees",
+            "{places/all rules/recall_at_1:.0%}",
+            "rules_places",
         ),
         Row(
-            "views of twin rooms and of unknown buildings that are told a place, among 1 000 and 100 000",
-            "{sizes/1000/false_accept:.1%}, {sizes/100000/false_accept:.1%} of twice {queries}",
-            "relocalize",
+            "views of twin rooms, and of unknown buildings, that are told a place (200 each)",
+            "{places/all rules/wrong/twins:.1%}, {places/all rules/wrong/nowhere:.1%}",
+            "rules_places",
             "none",
         ),
         Row(
-            "features in, answer out, median among 1 000 places: by the clock, of the processor",
-            "{sizes/1000/p50_ms:.0f}, {sizes/1000/cpu_p50_ms:.0f} ms",
-            "relocalize",
+            "features in, answer out, median of processor time, with nothing prepared",
+            "{places/all rules/cpu_p50_ms:.0f} ms",
+            "rules_places",
             "at most 15 ms",
-        ),
-        Row(
-            "the same among 100 000 places",
-            "{sizes/100000/p50_ms:.0f}, {sizes/100000/cpu_p50_ms:.0f} ms",
-            "relocalize",
-            "at most 30 ms",
         ),
     ),
 )
@@ -364,6 +357,17 @@ RULES = (
         "aliased regions",
         "mapserver/relocalization/aliased_regions.py",
         (_places("aliased regions"),),
+    ),
+    Rule(
+        "lonely recognition",
+        "mapserver/relocalization/place_hypotheses.py",
+        (
+            (
+                "views of known places that are told another one: "
+                "{places/lonely recognition/wrong_place:.2%} instead of {places/all rules/wrong_place:.2%}",
+                "rules_places",
+            ),
+        ),
     ),
     Rule(
         "wrong geometry",

@@ -13,9 +13,9 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.mapserver.relocalization import relocalizer
+from mapweave.mapserver.relocalization import view_registration
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
-from mapweave.mapserver.relocalization.relocalizer import Relocalizer
+from mapweave.mapserver.relocalization.perceptual_aliasing import PerceptualAliasing
 from mapweave.merge import merging
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency
@@ -56,8 +56,8 @@ TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
 """Rules on links, for robots with images and bodies."""
 PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "aliased regions": ((AliasedRegions, "counterpart", lambda *_: None),),
-    "nodes that look alike": ((Relocalizer, "doubled", _nothing),),
-    "lonely recognition": ((relocalizer, "is_lonely", lambda *_: False),),
+    "nodes that look alike": ((PerceptualAliasing, "matches", _nothing),),
+    "lonely recognition": ((view_registration, "is_lonely", lambda *_: False),),
 }
 """Rules on answers to lost robots."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -34,11 +35,7 @@ def add_to(commands: Any) -> None:
         "Without a network it goes on mapping; what it mapped is sent when a server can be reached.",
     )
     parser.add_argument("name", help="the robot's name in the fleet, for example r0")
-    parser.add_argument(
-        "--robot", metavar="DRIVER",
-        help="a driver as `mapweave robots` lists them, or your own class, FILE.py:CLASS (default: [robot] "
-        "driver of the settings, else remote, a base behind Zenoh keys such as the simulator's)",
-    )  # fmt: skip
+    add_robot(parser)
     parser.add_argument(
         "--mission", choices=["idle", "explore", "carried"], default="explore", help="what to do at the start"
     )
@@ -51,9 +48,7 @@ def add_to(commands: Any) -> None:
         "--fresh", action="store_true", help="begin a new map; else the newest map of the journal goes on"
     )
     which.add_argument("--resume", metavar="MAP", help="go on with this map of the journal, for example r0.3")
-    parser.add_argument(
-        "--body", metavar="ENDPOINT", help="Zenoh endpoint of the robot's body (default: the fleet's)"
-    )
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record what the robot senses, as MCAP")
     parser.add_argument("--seed", type=int, default=0, help="of the random choices in exploration")
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
@@ -62,10 +57,23 @@ def add_to(commands: Any) -> None:
     parser.set_defaults(run=run)
 
 
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Declare which robot it is, and where it is reached."""
+    parser.add_argument(
+        "--robot", metavar="DRIVER",
+        help="a driver as `mapweave robots` lists them, or your own class, FILE.py:CLASS (default: [robot] "
+        "driver of the settings, else remote, a base behind Zenoh keys such as the simulator's)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--body", metavar="ENDPOINT", help="Zenoh endpoint of the robot's body (default: the fleet's)"
+    )
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its body ends or the process is told to stop."""
     from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.claim import Claim
+    from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.agent.mission import Carried, Explore, Idle, Mission
     from mapweave.commands.map_ends import map_of
     from mapweave.hybridmap.errors import InvalidValue
@@ -83,16 +91,21 @@ def run(arguments: argparse.Namespace) -> int:
     network = network_of(arguments, settings)
     stop = stop_on_signals()
     bus, keys = connect(network)
-    body, claim, robot = bus, None, None
+    body, claim = bus, None
+    robot: Robot | None = None
     try:
         warn_without_router(bus, name)
         if arguments.body:
             body, _ = connect(replace(network, endpoints=(arguments.body,)))
         if body.wait_connected(SOON):
             claim = Claim(body, keys, name)
-        robot, synchronization = _robot(arguments, settings.robot, body, network.fleet, name)
+        robot, synchronization = open_robot(
+            arguments, settings.robot, body, network.fleet, name, arguments.lockstep
+        )
+        if arguments.record is not None:
+            robot = RecordedRobot(robot, arguments.record, print_line=print_error)
         # Who is told to stop while it waits for its body stops waiting.
-        threading.Thread(target=_close_on, args=(stop, robot), name="stop", daemon=True).start()
+        threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
         missions: dict[str, Mission] = {"explore": Explore(), "carried": Carried(), "idle": Idle()}
         options = AgentOptions(
             name=name,
@@ -117,8 +130,18 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _robot(
-    arguments: argparse.Namespace, settings: RobotSettings, bus: Bus, fleet: str, name: str
+def print_error(line: str) -> None:
+    """Print a line for people, beside the output proper."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def open_robot(
+    arguments: argparse.Namespace,
+    settings: RobotSettings,
+    bus: Bus,
+    fleet: str,
+    name: str,
+    lockstep: bool = False,
 ) -> tuple[Robot, Synchronization]:
     """The robot, and how the loop is synchronised: a simulation may run in lock-step."""
     from mapweave.agent.drivers.registry import find_driver
@@ -128,18 +151,19 @@ def _robot(
     from mapweave.hybridmap.errors import SettingsError
 
     driver = arguments.robot or settings.driver
-    if driver == REMOTE and not arguments.lockstep:
+    if driver == REMOTE and not lockstep:
         return RemoteRobot(bus, fleet, name), FreeRunning()
     if driver == REMOTE:
         from mapweave.sim.lockstep_robot import LockstepRobot
 
         robot = LockstepRobot(bus, fleet, name)
         return robot, Lockstep(robot.rendezvous)
-    if arguments.lockstep or arguments.body:
+    if lockstep or arguments.body:
         raise SettingsError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
     return find_driver(driver)(settings), FreeRunning()
 
 
-def _close_on(stop: threading.Event, robot: Robot) -> None:
+def close_on(stop: threading.Event, robot: Robot) -> None:
+    """Close a robot once the process is told to stop: who waits for an observation stops waiting."""
     stop.wait()
     robot.close()

@@ -155,7 +155,7 @@ def test_a_mission_can_be_changed_at_any_time(walls, drive):
     pipeline.set_mission(GoTo(NodeId("r1", 1, 1)))
     step = pipeline.step(still(walls, tick=32))
     assert step.status.mission == "goto"
-    assert "looking around" in step.status.doing
+    assert step.status.doing == "turning to localize"
     # There is no map yet that it could have been carried away from: it begins one here.
     pipeline.set_mission(Carried())
     step = pipeline.step(still(walls, tick=33))

@@ -192,6 +192,8 @@ def test_questions_and_answers_come_through_the_wire(router: Router) -> None:
     with pytest.raises(InvalidValue, match="from node to node"):
         ExplainRequest((ME, OTHER), True)
     with pytest.raises(InvalidMessage, match="from node to node"):
-        decode(pack({"e": [list(ME), list(OTHER)], "w": 1}), ExplainRequest)
-    with pytest.raises(InvalidMessage):
-        decode(pack({"a": list(one), "b": list(two), "f": 1, "r": "", "h": [[1]], "g": []}), RouteExplanation)
+        decode(pack({"ends": [list(ME), list(OTHER)], "route": True}), ExplainRequest)
+    fields = {"start": list(one), "goal": list(two), "found": True, "reason": ""}
+    with pytest.raises(InvalidMessage, match="hops"):
+        decode(pack({**fields, "hops": [[1]]}), RouteExplanation)
+    assert decode(pack({**fields, "hops": []}), RouteExplanation).found

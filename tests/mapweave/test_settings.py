@@ -54,8 +54,8 @@ def test_given_values_replace_the_defaults(tmp_path):
     default = Settings()
     agent = default.agent
     expected = Settings(
-        dataclasses.replace(default.network, endpoints=("tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447")),
-        dataclasses.replace(
+        network=dataclasses.replace(default.network, endpoints=("tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447")),
+        agent=dataclasses.replace(
             agent,
             seed=7,
             navigation=dataclasses.replace(agent.navigation, speed=1.0),

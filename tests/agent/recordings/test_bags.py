@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter
+from mapweave.agent.recordings.mcap_writer import PART_S
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
@@ -193,7 +193,8 @@ class Driven:
 
 def record(drive: Drive, folder: Path, lossless: bool = True) -> Driven:
     robot = Driven(drive)
-    recorded = RecordedRobot(robot, McapWriter(folder, robot.describe(), lossless))
+    recorded = RecordedRobot(robot, folder, lossless)
+    recorded.describe()
     while recorded.sense() is not None:
         assert recorded.act(Command(0.5, 0.1)) == Command(0.3, 0.1)
     recorded.close()
@@ -253,4 +254,4 @@ def test_a_recording_overwrites_nothing(drive: Drive, tmp_path: Path) -> None:
     (tmp_path / "walk").mkdir()
     (tmp_path / "walk" / "notes.txt").write_text("mine")
     with pytest.raises(DeviceError, match="not empty; a recording overwrites nothing"):
-        McapWriter(tmp_path / "walk", Driven(drive).describe())
+        RecordedRobot(Driven(drive), tmp_path / "walk")

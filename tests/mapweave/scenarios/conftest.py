@@ -109,8 +109,7 @@ def drive(centre: tuple[float, float], phase: float, ticks: int = 600) -> Trajec
     return Trajectory(np.arange(ticks, dtype=np.int64) * TICK_NS, np.stack([x, y, heading], axis=1))
 
 
-@pytest.fixture
-def staged() -> Staged:
+def stage() -> Staged:
     """Two robots in the corridor and one in room 1; the corridor's maps are linked, all is true to 1 cm."""
     rng = np.random.default_rng(7)
     staged = Staged(noise=0.01)
@@ -132,8 +131,7 @@ def staged() -> Staged:
     return staged
 
 
-@pytest.fixture
-def eventful(staged: Staged) -> Staged:
+def stage_events(staged: Staged) -> Staged:
     """The same, and r1 is carried into room 1, finds out where it is, and drives to r2's third place."""
     goal, known = NodeId("r2", 1, 3), NodeId("r2", 1, 5)
     put = Pose2(7.5, 3.0, 0.5)
@@ -162,3 +160,15 @@ def eventful(staged: Staged) -> Staged:
         Moment(420 * TICK_NS, "r1 is put down at (7.50, 3.00)"),
     ]
     return staged
+
+
+@pytest.fixture
+def staged() -> Staged:
+    """Two robots in the corridor and one in room 1."""
+    return stage()
+
+
+@pytest.fixture
+def eventful(staged: Staged) -> Staged:
+    """The same, and r1 is carried into room 1."""
+    return stage_events(staged)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,7 @@ from mapweave.scenarios.recording import Moment
 from mapweave.scenarios.report_folder import write_folder
 from mapweave.scenarios.score import score
 from mapweave.storage.map_file import read_map_file
+from tests.mapweave.scenarios.conftest import stage, stage_events
 
 SCENARIO = 'name = "staged"\n[expect]\ncomponents = 2\nlink_recall = 0.99\n'
 WANTED = parse_expectations({"components": 2, "link_recall": 0.99})
@@ -32,14 +34,22 @@ FILES = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def written(eventful, tmp_path):
-    """Folder, recording and figures of a trial."""
-    recording = eventful.recording()
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    """Folder, recording and figures of a trial. Nobody may change them."""
+    recording = stage_events(stage()).recording()
     figures = score(recording)
-    out = tmp_path / "made for" / "it"
+    out = tmp_path_factory.mktemp("reported") / "made for" / "it"
     write_folder(out, recording, figures, check(figures, WANTED), SCENARIO)
     return out, recording, figures
+
+
+@pytest.fixture
+def written(reported, tmp_path):
+    """The same with a folder of one's own."""
+    out = tmp_path / "made for" / "it"
+    shutil.copytree(reported[0], out)
+    return out, *reported[1:]
 
 
 def evo(program: str, *arguments: str, report_folder: Path, home: Path) -> float:

@@ -1,0 +1,62 @@
+"""`mapweave record`: what a robot senses, as MCAP."""
+
+from __future__ import annotations
+
+import argparse
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mapweave.commands.agent import add_robot, close_on, open_robot, print_error
+from mapweave.commands.network import add_network, connect, network_of, settings_of, stop_on_signals
+
+
+def add_to(commands: Any) -> None:
+    """Declare the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "record",
+        help="record what a robot senses",
+        description="Write a robot's images, odometry and proximity to MCAP files with standard messages, "
+        "until it is interrupted. The robot gets no commands: drive it by other means, or let "
+        "`mapweave agent --record DIR` drive. `mapweave replay DIR` maps the recording.",
+    )
+    parser.add_argument("name", help="the robot's name in the fleet, for example r0")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new or empty folder")
+    parser.add_argument("--lossless", action="store_true", help="images as PNG instead of JPEG")
+    add_robot(parser)
+    add_network(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Record until the robot ends or the process is told to stop."""
+    from rich.console import Console
+
+    from mapweave.agent.drivers.checked import CheckedRobot
+    from mapweave.agent.drivers.recorded import RecordedRobot
+    from mapweave.hybridmap.node import check_name
+
+    name = check_name(arguments.name)
+    settings = settings_of(arguments)
+    network = network_of(arguments, settings)
+    stop = stop_on_signals()
+    if arguments.body:
+        network = replace(network, endpoints=(arguments.body,))
+    bus, _ = connect(network)
+    try:
+        robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
+        threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
+        recorded = RecordedRobot(robot, arguments.out, arguments.lossless, print_error)
+        try:
+            with Console(stderr=True).status(f"{name}: waits for its robot") as status:
+                checked = CheckedRobot(recorded)
+                checked.describe()
+                while not stop.is_set() and checked.sense() is not None:
+                    status.update(f"{name}: {recorded.written} observations in {arguments.out}")
+        finally:
+            recorded.close()
+    finally:
+        bus.close()
+    print(f"{name}: {recorded.written} observations in {arguments.out}")
+    return 0
