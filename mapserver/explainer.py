@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.explanation import (
-    MAX_MAPS_TOLD,
+    MAX_MAPS_LISTED,
     Explanation,
     FleetExplanation,
     MapsExplanation,
@@ -38,7 +38,7 @@ from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
 
-Told = TypeVar("Told", PairExplanation, MapsExplanation, RouteExplanation)
+AnyExplanation = TypeVar("AnyExplanation", PairExplanation, MapsExplanation, RouteExplanation)
 
 
 class RulingBook:
@@ -145,7 +145,7 @@ class Explainer:
         answers = self._answers()
         merged = answers.merged
         if request.ends is None:
-            maps = explain_fleet(merged, MAX_MAPS_TOLD)
+            maps = explain_fleet(merged, MAX_MAPS_LISTED)
             return FleetExplanation(tuple(_still(pair, settled) for pair in maps))
         first, second = request.ends
         if isinstance(first, NodeId) and isinstance(second, NodeId):
@@ -171,7 +171,7 @@ class Explainer:
         return encode_record({"said": event})
 
 
-def _still(explanation: Told, settled: bool) -> Told:
+def _still(explanation: AnyExplanation, settled: bool) -> AnyExplanation:
     """Mark an explanation as preliminary while the server merges."""
     return (
         explanation

@@ -170,7 +170,7 @@ LOST = Question(
             "rules_places",
         ),
         Row(
-            "views of twin rooms, and of unknown buildings, that are told a place (200 each)",
+            "views of twin rooms, and of unknown buildings, that are answered with a place (200 each)",
             "{places/all rules/wrong/twins:.1%}, {places/all rules/wrong/nowhere:.1%}",
             "rules_places",
             "none",
@@ -289,12 +289,12 @@ def _trials(rule: str, scenario: str) -> tuple[str, str]:
 
 
 def _places(rule: str) -> tuple[str, str]:
-    """What lost robots are told without a rule, and with all."""
-    told = (
+    """Answers to lost robots without a rule, and with all."""
+    kinds = (
         "{places/WAY/wrong/twins:.1%} of twin rooms, {places/WAY/wrong/nowhere:.1%} of unknown buildings, "
         "recall {places/WAY/recall_at_1:.1%}"
     )
-    words = f"told a place: {told.replace('WAY', rule)} instead of {told.replace('WAY', 'all rules')}"
+    words = f"answered: {kinds.replace('WAY', rule)} instead of {kinds.replace('WAY', 'all rules')}"
     return words, "rules_places"
 
 

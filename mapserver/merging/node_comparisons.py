@@ -79,7 +79,7 @@ class NodeComparisons:
         """Look which nodes are like one that is in the place database.
 
         Args:
-            node: has come, or come anew.
+            node: was added, or written again.
             before: its pairs as it was.
         """
         self._pairs.put(node.id, self._places.overlaps(node, self._node_of, before))
@@ -182,7 +182,7 @@ class NodeComparisons:
             known = before.get(node.id)
             same = known is not None and known[0] is node
             self._prints[node.id] = known if known and same else (node, fingerprint_of(node))
-        prints = {n: told for n, (_, told) in self._prints.items() if n not in self._uncompared}
+        prints = {n: fingerprint for n, (_, fingerprint) in self._prints.items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._verdicts.items() for b, v in known.items() if a < b}
         return VerificationCache(prints, self._pairs.overlaps(), verdicts)
 

@@ -65,8 +65,8 @@ def overlaps(
     rows, columns, which = rows[enough], columns[enough], which[enough]
     weights = 1.0 - np.asarray(squared[enough], np.float64) / alike**2
     sums = np.minimum(*(_best(which, side, weights, len(nodes)) for side in (rows, columns)))
-    told = np.flatnonzero(sums >= least)
-    return nodes[told], sums[told]
+    kept = np.flatnonzero(sums >= least)
+    return nodes[kept], sums[kept]
 
 
 def pair_overlap(codes: NDArray[np.uint8], other_codes: NDArray[np.uint8], alike: float) -> float:

@@ -88,7 +88,7 @@ def explained_nodes(arguments: argparse.Namespace, a: NodeId, b: NodeId) -> Pair
 def explained_maps(arguments: argparse.Namespace, ends: tuple[MapId, MapId] | None) -> FleetExplanation:
     """Two maps of a map file, or of what a server has; each two of them without ends."""
     from mapweave.commands.map_ends import ask
-    from mapweave.hybridmap.explanation import MAX_MAPS_TOLD, FleetExplanation
+    from mapweave.hybridmap.explanation import MAX_MAPS_LISTED, FleetExplanation
     from mapweave.hybridmap.query import ExplainRequest
     from mapweave.wire.keys import Keys
     from mapweave.wire.messages import decode, encode
@@ -100,7 +100,7 @@ def explained_maps(arguments: argparse.Namespace, ends: tuple[MapId, MapId] | No
 
     merged, _ = _merged(arguments)
     if ends is None:
-        return FleetExplanation(explain_fleet(merged, MAX_MAPS_TOLD))
+        return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED))
     return FleetExplanation((explain_maps(merged, *ends),))
 
 

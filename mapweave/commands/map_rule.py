@@ -50,7 +50,7 @@ def _login() -> str:
     try:
         return getpass.getuser()
     except (OSError, KeyError):  # no user of that number
-        return "somebody"
+        return "a person"
 
 
 def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:

@@ -75,8 +75,8 @@ def explain_nodes(
     explanation = replace(explanation, standing=standing, reason=reason, witnesses=witnesses)
     if geometry is None:
         return explanation
-    misfit, credence = _judged(merged, geometry, kept=link is not None or own is not None)
-    return replace(explanation, misfit=misfit, probability=credence if verified else None)
+    misfit, link_probability_ = _judged(merged, geometry, kept=link is not None or own is not None)
+    return replace(explanation, misfit=misfit, probability=link_probability_ if verified else None)
 
 
 def _verdict(

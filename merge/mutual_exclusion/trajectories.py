@@ -133,9 +133,9 @@ class Stay:
 
 
 LONGEST_GAP = 5.2
-"""Between moments that are further apart in time nobody knows where the robot was, s."""
+"""Between moments further apart in time the robot's pose is unknown, s."""
 LONGEST_WAY = 1.0
-"""Between moments that are further apart in space nobody knows where the robot was, m."""
+"""Between moments further apart in space the robot's pose is unknown, m."""
 ALONG = 0.15
 """How far ahead or behind on the line between two moments a robot may be midway, as a share of the line,
 standard deviation: it stops and goes. In the simulator it is within 1 cm of the straight line, but up to a

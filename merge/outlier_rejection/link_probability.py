@@ -1,4 +1,4 @@
-"""Credence: how probable it is that a link is right, by the rest of the map.
+"""Link probability: how probable it is that a link is right, by the rest of the map.
 
 Two images cannot distinguish two places that look the same. So the prior odds are those of this merge's
 verified links. The rest of the merged map then predicts the relative pose of the two nodes: a right link
