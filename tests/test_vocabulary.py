@@ -63,7 +63,7 @@ def pages() -> list[Path]:
 def test_code_and_pages_use_the_words_of_the_field() -> None:
     word = re.compile(r"(?<![A-Za-z])(?:" + "|".join(PLAIN) + r")(?![A-Za-z])", re.IGNORECASE)
     phrase = re.compile(r"\b(?:" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
-    found = []
+    collected = []
     for path in pages():
         name = path.relative_to(ROOT).as_posix()
         if path == Path(__file__):
@@ -72,9 +72,9 @@ def test_code_and_pages_use_the_words_of_the_field() -> None:
             # Names in camel case count word by word.
             plain = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", APART.sub("", line))
             hits = {m.group().lower() for m in (*word.finditer(plain), *phrase.finditer(line))}
-            found += [
+            collected += [
                 f"{name}:{number}: {hit}"
                 for hit in sorted(hits)
                 if not name.startswith(EXCEPTIONS.get(hit, ("\0",)))
             ]
-    assert not found, "see PLAIN for other words:\n" + "\n".join(found)
+    assert not collected, "see PLAIN for other words:\n" + "\n".join(collected)

@@ -218,8 +218,8 @@ def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
             if number % 3 == 2:
                 index.remove(NodeId("x", 1, number - 1))
         stop.set()
-        for one in searches:
-            one.result(20)
+        for searche in searches:
+            searche.result(20)
     alone = PlaceIndex()
     for number in range(120):
         if number % 3 != 1:

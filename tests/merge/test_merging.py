@@ -177,10 +177,10 @@ def test_links_that_contradict_a_better_supported_way_round_are_refused() -> Non
     """a-b and b-c are well supported, all along; a-c says something else at one place, and agrees on it."""
     maps = {MapId(agent, 1): chain(agent, 14) for agent in "abc"}
 
-    def links(one: str, two: str, shift: float, inliers: int, apart: int = 4) -> list[Link]:
+    def links(first: str, second: str, shift: float, inliers: int, apart: int = 4) -> list[Link]:
         collected = []
         for k in range(0, 4 * apart, apart):
-            a, b = NodeId(one, 1, 2 * k + 1), NodeId(two, 1, 2 * k + 1)
+            a, b = NodeId(first, 1, 2 * k + 1), NodeId(second, 1, 2 * k + 1)
             true = (
                 maps[a.map].nodes[a].map_from_robot.mean.inverse() @ maps[b.map].nodes[b].map_from_robot.mean
             )

@@ -280,7 +280,7 @@ def test_any_table_makes_a_world_or_one_line(lists: dict[str, Any], top: dict[st
         table = {**lists, **top}
         for name, cls in ITEMS.items():
             if isinstance(table.get(name), list):
-                table[name] = tuple(build(cls, one, name) for one in table[name] if isinstance(one, dict))
+                table[name] = tuple(build(cls, item, name) for item in table[name] if isinstance(item, dict))
         world = build_world(build(Design, table, "file"), "file")
         assert all(np.isfinite(p.corner).all() and np.isfinite(p.along).all() for p in world.panels)
         for panel in world.panels[-2:]:

@@ -38,7 +38,7 @@ def logged() -> Log:
     for map_id, rooms in ((A, (0, 5)), (B, (5, 10))):
         stops = [Pose2(x + 2.2 + 0.1 * k, 1.8, 0.9 * k) for x in rooms for k in range(7)]
         nodes, edges = take_map(world, map_id, stops, rng)
-        log += [(map_id, body) for body in (*map(NodePut, nodes), *map(EdgePut, edges))]
+        log += [(map_id, change) for change in (*map(NodePut, nodes), *map(EdgePut, edges))]
     return log
 
 

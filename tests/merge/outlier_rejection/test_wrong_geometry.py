@@ -67,10 +67,10 @@ def corridor(agent: str, scale: float = 1.0, gap: float = 0.0, count: int = 18) 
     return out
 
 
-def links_of(one: HybridMap, other: HybridMap) -> list[Link]:
+def links_of(hybrid_map: HybridMap, other: HybridMap) -> list[Link]:
     """True links between all views whose distances from the wall are alike."""
     out = []
-    for a in one.nodes.values():
+    for a in hybrid_map.nodes.values():
         for b in other.nodes.values():
             between = float(a.landmarks.depths[0] - b.landmarks.depths[0])
             if abs(between) < 0.8:
@@ -110,5 +110,5 @@ def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.
         return real(links, *rest)
 
     monkeypatch.setattr(wrong_geometry, "link_sets", fails)
-    found = WrongGeometrySearch(ConsistencySettings()).wrong(maps, links.__getitem__, links.keys())
-    assert found.keys() == {ids[2]}
+    result = WrongGeometrySearch(ConsistencySettings()).wrong(maps, links.__getitem__, links.keys())
+    assert result.keys() == {ids[2]}
