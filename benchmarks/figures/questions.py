@@ -363,7 +363,7 @@ RULES = (
         "mapserver/relocalization/place_hypotheses.py",
         (
             (
-                "views of known places that are told another one: "
+                "views of known places that are answered with another one: "
                 "{places/lonely recognition/wrong_place:.2%} instead of {places/all rules/wrong_place:.2%}",
                 "rules_places",
             ),

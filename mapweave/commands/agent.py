@@ -164,6 +164,6 @@ def open_robot(
 
 
 def close_on(stop: threading.Event, robot: Robot) -> None:
-    """Close a robot once the process is told to stop: who waits for an observation stops waiting."""
+    """Close a robot once the process is stopped, which ends a wait for an observation."""
     stop.wait()
     robot.close()

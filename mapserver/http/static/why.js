@@ -88,7 +88,7 @@ function ruled(r) {
   const when = new Date(r.stamp_ns / 1e6).toISOString().slice(0, 16).replace("T", " ");
   const what = r.ends[0] === r.ends[1] ? (r.apart ? "is retired" : "is in use again")
     : r.apart ? "shall not be linked" : "may be linked again";
-  return `${when} UTC ${r.who || "somebody"} ruled: ${[...new Set(r.ends)].join(" and ")} ${what}` +
+  return `${when} UTC ${r.who || "a person"} decided: ${[...new Set(r.ends)].join(" and ")} ${what}` +
     (r.because ? `: \u201c${r.because}\u201d` : "");
 }
 function showMaps(maps) {

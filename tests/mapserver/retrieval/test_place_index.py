@@ -189,7 +189,7 @@ def test_a_removed_node_stays_removed_despite_its_landmarks(
 def test_dropped_landmarks_are_removed_at_any_number(
     building: tuple[World, list[Node], list[Pose2]], few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(place_index, "FEW_GONE", few)
+    monkeypatch.setattr(place_index, "FEW_REMOVED", few)
     searched: list[bool] = []
     real = InvertedFile.remove
 
